@@ -1,0 +1,61 @@
+"""The environment interface: unbatched, pure, of fixed horizon."""
+
+from __future__ import annotations
+
+import abc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mjx_dher.types import Array, GoalObs, PRNGKey, PyTree
+
+
+@struct.dataclass
+class State:
+    """Everything that an episode in progress is made of."""
+
+    physics: PyTree  # the engine's state
+    obs: GoalObs  # observation [D], achieved_goal [G], desired_goal [G]
+    reward: Array  # [] of the step that led here; 0 after a reset
+    success: Array  # [] 1.0 where the achieved goal is within reach of the desired goal, else 0.0
+    step: Array  # [] steps taken, int32
+
+
+class GoalEnv(abc.ABC):
+    """A goal-conditioned environment.
+
+    `reset` and `step` are pure functions of their arguments and take no batch: use `jax.vmap`. An episode has
+    `episode_length` steps and never ends early, so nothing resets itself and no last observation is lost.
+    """
+
+    name: str
+    observation_size: int  # D
+    goal_size: int  # G
+    action_size: int  # A
+    episode_length: int  # T
+
+    @abc.abstractmethod
+    def reset(self, key: PRNGKey) -> State:
+        """A first state, drawn with `key`."""
+
+    @abc.abstractmethod
+    def step(self, state: State, action: Array) -> State:
+        """The state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
+
+    @abc.abstractmethod
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """The reward for `achieved_goal` [..., G] under `desired_goal` [..., G], as [...]."""
+
+    def check_action(self, action: Array) -> Array:
+        """`action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
+        shape = jnp.shape(action)
+        if shape != (self.action_size,):
+            raise ValueError(
+                f"action has shape {shape}; {self.name} takes ({self.action_size},)"
+                " (step is unbatched: use jax.vmap for a batch)"
+            )
+        if not isinstance(action, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(action, np.float32))):
+            raise ValueError(f"action must be finite; got {np.asarray(action)}")
+        return jnp.asarray(action, jnp.float32)

@@ -1,0 +1,44 @@
+"""The engines that can advance the physics, one file each, behind `make_engine`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+
+from mjx_dher.config import ENGINES, check_name
+from mjx_dher.envs.engines.base import Engine, Physics
+
+__all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]
+
+
+def resolve_engine(name: str) -> str:
+    """The engine that `name` stands for here: `auto` is `native` on a CPU and `jax` elsewhere.
+
+    Raises:
+      ValueError: `name` is no engine.
+    """
+    check_name("engine", name, ENGINES)
+    if name != "auto":
+        return name
+    import jax
+
+    return "native" if jax.default_backend() == "cpu" else "jax"
+
+
+def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
+    """An engine for `model` that advances `substeps` timesteps a call.
+
+    Args:
+      name: "native", "jax" or "auto".
+      model: the compiled MJCF, with exactly one mocap body.
+      substeps: MuJoCo timesteps an environment step.
+      **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver.
+    """
+    if resolve_engine(name) == "native":
+        from mjx_dher.envs.engines.native import NativeEngine
+
+        return NativeEngine(model, substeps, **options)
+    from mjx_dher.envs.engines.mjx import MjxEngine
+
+    return MjxEngine(model, substeps, **options)

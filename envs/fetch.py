@@ -1,0 +1,233 @@
+"""What the Fetch tasks share: action, observation, goals, reward and reset, as functions of (qpos, qvel).
+
+The tasks follow gymnasium-robotics 1.4.2, version v4 of its Fetch environments, run on mujoco 3.11.0; constants named
+"settled" were measured there after the environment's own set-up (docs/fidelity.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import resources
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.base import GoalEnv, State
+from mjx_dher.envs.engines import Physics, make_engine
+from mjx_dher.types import Array, GoalObs, PRNGKey
+
+SUBSTEPS = 20  # of 2 ms: 25 actions a second
+ACTION_SCALE = 0.05  # m that an action of 1 asks for
+RESET_CANDIDATES = 64  # object positions drawn at once; all lie too close with probability < 1e-6 in any task
+DT = SUBSTEPS * 0.002  # s; the observation gives velocities as displacements per step
+
+
+@dataclasses.dataclass(frozen=True)
+class FetchTask:
+    """The numbers that set one task apart from another (all lengths in m)."""
+
+    xml: str  # file in envs/assets
+    initial_grip_pos: tuple[float, float, float]  # settled
+    initial_grip_vel: tuple[float, float, float]  # settled, m/s
+    object_height: float  # settled height of the object's centre; also the height of goals on the table
+    object_range: float  # the object starts within this of the gripper, along x and along y
+    target_range: float  # the goal lies within this of the gripper plus target_offset
+    target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    min_object_distance: float = 0.1  # the object starts at least this far from the gripper in the plane
+
+
+class FetchEnv(GoalEnv):
+    """A gripper on a Cartesian carriage, an object, and a goal for the object's position.
+
+    Args:
+      engine: "auto", "native" or "jax".
+      reward_type: "sparse" (0 where the goal is reached, else -1) or "dense" (minus the distance).
+      distance_threshold: how close, in m, counts as reached.
+      episode_length: steps of an episode.
+      **engine_options: handed to the engine; see `make_engine`.
+    """
+
+    task: ClassVar[FetchTask]
+    observation_size = 25
+    goal_size = 3
+    action_size = 4
+
+    def __init__(
+        self,
+        engine: str = "auto",
+        reward_type: str = "sparse",
+        distance_threshold: float = 0.05,
+        episode_length: int = 50,
+        **engine_options: Any,
+    ):
+        if reward_type not in ("sparse", "dense"):
+            raise ValueError(f"reward_type must be 'sparse' or 'dense'; got {reward_type!r}")
+        if not distance_threshold > 0:
+            raise ValueError(f"distance_threshold must be greater than 0; got {distance_threshold!r}")
+        if episode_length < 1:
+            raise ValueError(f"episode_length must be at least 1; got {episode_length!r}")
+        self.reward_type = reward_type
+        self.distance_threshold = distance_threshold
+        self.episode_length = episode_length
+        self.model = mujoco.MjModel.from_xml_string(
+            (resources.files("mjx_dher.envs") / "assets" / self.task.xml).read_text()
+        )
+        self.engine = make_engine(engine, self.model, SUBSTEPS, **engine_options)
+        self._grip_qpos, self._grip_qvel = _joint_slices(self.model, "grip_x", width=3)
+        self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
+
+    def reset(self, key: PRNGKey) -> State:
+        """A start drawn as in the original: gripper at its settled place, object on the table near it, random goal."""
+        object_key, goal_key = jax.random.split(key)
+        object_pos = self._sample_object(object_key)
+        object_qpos = jnp.concatenate([object_pos, jnp.array([1.0, 0.0, 0.0, 0.0])])
+        task = self.task
+        return self.init_state(jnp.array(task.initial_grip_pos), object_qpos, self._sample_goal(goal_key))
+
+    def init_state(
+        self, grip_pos: Array, object_qpos: Array, desired_goal: Array, grip_vel: Array | None = None
+    ) -> State:
+        """A given start, as for replaying a recorded episode.
+
+        Args:
+          grip_pos: [3] grip point in world coordinates, m.
+          object_qpos: [7] object position, m, and orientation (w, x, y, z).
+          desired_goal: [3] m.
+          grip_vel: [3] m/s; the settled velocity of the original (a few cm/s at most) unless given.
+        """
+        grip_vel = jnp.array(self.task.initial_grip_vel) if grip_vel is None else grip_vel
+        qpos = jnp.zeros(self.model.nq).at[self._grip_qpos].set(grip_pos).at[self._object_qpos].set(object_qpos)
+        qvel = jnp.zeros(self.model.nv).at[self._grip_qvel].set(grip_vel)
+        physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
+        obs = self._observe(physics, jnp.asarray(desired_goal, jnp.float32))
+        return State(
+            physics=physics,
+            obs=obs,
+            reward=jnp.zeros(()),
+            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
+            step=jnp.zeros((), jnp.int32),
+        )
+
+    def step(self, state: State, action: Array) -> State:
+        """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
+
+        `action[3]` opens and closes the fingers where the task has any that move.
+        """
+        action = jnp.clip(self.check_action(action), -1.0, 1.0)
+        grip_pos = state.physics.qpos[self._grip_qpos]
+        # As in the original, the request is relative to where the gripper is, not to where it was asked to be.
+        physics = self.engine.advance(state.physics, grip_pos + ACTION_SCALE * action[:3], jnp.zeros(self.model.nu))
+        obs = self._observe(physics, state.obs["desired_goal"])
+        return State(
+            physics=physics,
+            obs=obs,
+            reward=self.compute_reward(obs["achieved_goal"], obs["desired_goal"]),
+            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
+            step=state.step + 1,
+        )
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """Sparse: 0 within `distance_threshold`, else -1. Dense: minus the distance, m. [..., 3], [..., 3] -> [...]."""
+        distance = goal_distance(achieved_goal, desired_goal)
+        return -distance if self.reward_type == "dense" else -(distance > self.distance_threshold).astype(jnp.float32)
+
+    def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        # Strict, unlike the reward: the original differs at a distance of exactly the threshold, so we do.
+        return (goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
+
+    def _sample_object(self, key: PRNGKey) -> Array:
+        """[3] uniform in the square around the gripper, but not within `min_object_distance` of it."""
+        task = self.task
+        offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), minval=-task.object_range, maxval=task.object_range)
+        distance = jnp.linalg.norm(offsets, axis=-1)
+        # The first one far enough; were there none, the farthest.
+        index = jnp.argmax(jnp.where(distance >= task.min_object_distance, jnp.inf, distance))
+        xy = jnp.array(task.initial_grip_pos[:2]) + offsets[index]
+        return jnp.append(xy, task.object_height)
+
+    def _sample_goal(self, key: PRNGKey) -> Array:
+        """[3] uniform in the square around the gripper plus the task's offset, at the object's height."""
+        task = self.task
+        offset = jax.random.uniform(key, (3,), minval=-task.target_range, maxval=task.target_range)
+        goal = jnp.array(task.initial_grip_pos) + offset + jnp.array(task.target_offset)
+        return goal.at[2].set(task.object_height)
+
+    def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
+        grip_pos, grip_vel = physics.qpos[self._grip_qpos], physics.qvel[self._grip_qvel]
+        object_qpos, object_qvel = physics.qpos[self._object_qpos], physics.qvel[self._object_qvel]
+        fingers = jnp.zeros(4)  # positions, m, and velocities of the right and the left finger: blocked
+        observation = fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, fingers[:2], fingers[2:])
+        return GoalObs(observation=observation, achieved_goal=object_qpos[:3], desired_goal=desired_goal)
+
+
+def goal_distance(achieved_goal: Array, desired_goal: Array) -> Array:
+    """Euclidean distance, m: [..., G], [..., G] -> [...]."""
+    return jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+def fetch_observation(
+    grip_pos: Array, grip_vel: Array, object_qpos: Array, object_qvel: Array, finger_pos: Array, finger_vel: Array
+) -> Array:
+    """The original's observation vector [25].
+
+    0-2 grip position, 3-5 object position, 6-8 object minus grip, 9-10 finger positions (right, left), 11-13 object Euler
+    angles, 14-16 object velocity minus grip velocity, 17-19 object angular velocity (world axes), 20-22 grip velocity,
+    23-24 finger velocities. Positions in m, angles in rad, velocities as displacement per step (x 0.04 s).
+
+    Args:
+      grip_pos, grip_vel: [3] m, m/s.
+      object_qpos: [7] position and quaternion (w, x, y, z).
+      object_qvel: [6] linear velocity in world axes, angular velocity in the object's own axes (MuJoCo's free joint).
+      finger_pos, finger_vel: [2] right, left; m, m/s.
+    """
+    rotation = quat_to_matrix(object_qpos[3:])
+    object_pos, object_vel = object_qpos[:3], object_qvel[:3]
+    return jnp.concatenate(
+        [
+            grip_pos,
+            object_pos,
+            object_pos - grip_pos,
+            finger_pos,
+            matrix_to_euler(rotation),
+            (object_vel - grip_vel) * DT,
+            jnp.sum(rotation * object_qvel[3:], axis=-1) * DT,
+            grip_vel * DT,
+            finger_vel * DT,
+        ]
+    )
+
+
+def quat_to_matrix(quat: Array) -> Array:
+    """Rotation matrix [3, 3] of a quaternion [4] (w, x, y, z) of any length but 0."""
+    w, x, y, z = quat / jnp.linalg.norm(quat)
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_to_euler(matrix: Array) -> Array:
+    """Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
+
+    Where b is a right angle, a and c turn about one axis; then a is 0, as in the original.
+    """
+    cos_b = jnp.hypot(matrix[2, 2], matrix[1, 2])
+    regular = cos_b > 4 * np.finfo(np.float32).eps
+    a = jnp.where(regular, jnp.arctan2(-matrix[1, 2], matrix[2, 2]), 0.0)
+    b = jnp.arctan2(matrix[0, 2], cos_b)
+    c = jnp.where(
+        regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1])
+    )
+    return jnp.stack([a, b, c])
+
+
+def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:
+    """Where `width` consecutive coordinates from `joint` on sit in qpos and in qvel (a free joint: 7 and 6)."""
+    qpos, qvel = int(model.joint(joint).qposadr[0]), int(model.joint(joint).dofadr[0])
+    return slice(qpos, qpos + width), slice(qvel, qvel + (6 if width == 7 else width))

@@ -1,0 +1,1 @@
+__path__.append(__import__("os").path.dirname(__path__[0]))

@@ -1,0 +1,227 @@
+"""What a training run is made of: `Config` (static) and `HParams` (traced), the presets, and all validation.
+
+This module imports neither JAX nor MuJoCo, so that a wrong argument is refused before either has been loaded.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import sys
+from collections.abc import Iterable
+from typing import NamedTuple
+
+ENGINES = ("auto", "native", "jax")
+SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
+WEIGHT_KERNELS = ("linear", "inverse", "softmax")
+METRICS = ("position",)
+PRESETS = ("default", "paper")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that shapes the compiled program. Two runs with equal Configs share one compilation.
+
+    A cycle rolls out `num_envs` whole episodes, adds them to the replay ring and makes `updates_per_cycle` updates; an
+    epoch is `cycles_per_epoch` cycles and an evaluation.
+    """
+
+    env: str = "push"
+    """Environment: a name from `envs.list_envs()`."""
+    sampler: str = "future"
+    """How hindsight goals are chosen: random, episode, future, final, closest, epsilon_closest or weighted."""
+    weight_kernel: str = "linear"
+    """For the weighted sampler, how weights fall with distance: linear, inverse or softmax."""
+    metric: str = "position"
+    """The distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by."""
+    engine: str = "auto"
+    """Physics: native (MuJoCo C on all cores), jax (MJX) or auto (native on a CPU, jax elsewhere)."""
+    num_envs: int = 16
+    """Environments in parallel, and episodes a cycle."""
+    cycles_per_epoch: int = 50
+    """Cycles an epoch."""
+    updates_per_cycle: int = 40
+    """Gradient steps, of critic and actor both, a cycle."""
+    target_period: int = 40
+    """Gradient steps from one soft update of the targets to the next; divides updates_per_cycle."""
+    batch_size: int = 256
+    """Transitions a gradient step."""
+    total_steps: int = 1_000_000
+    """Environment steps of the whole run, rounded up to whole epochs."""
+    replay_size: int = 1_000_000
+    """Transitions that the replay ring holds."""
+    hidden_sizes: tuple[int, ...] = (256, 256, 256)
+    """Units of the hidden layers, of actor and critic both."""
+    eval_episodes: int = 100
+    """Episodes of the deterministic evaluation that ends each epoch."""
+
+
+class HParams(NamedTuple):
+    """Every number of the algorithm: a pytree, traced, so that a sweep over numbers compiles once.
+
+    The defaults are those of the original HER code line (Plappert et al. 2018, arXiv 1802.09464) and of the paper.
+    """
+
+    actor_lr: float = 1e-3
+    """Adam's step size for the actor."""
+    critic_lr: float = 1e-3
+    """Adam's step size for the critic."""
+    gamma: float = 0.98
+    """Discount; target values are clipped to [-1/(1-gamma), 0]."""
+    polyak: float = 0.95
+    """Share of the old target that a soft update keeps."""
+    action_l2: float = 1.0
+    """Weight of the mean squared action in the actor's loss."""
+    random_eps: float = 0.3
+    """Probability of a uniformly random action while exploring."""
+    noise_std: float = 0.2
+    """Standard deviation of the Gaussian noise on the other actions."""
+    her_k: float = 4.0
+    """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
+    epsilon: float = 0.2
+    """For epsilon_closest: probability of a uniform future goal instead of the closest."""
+    temperature: float = 1.0
+    """For weighted: the larger, the more even the weights (infinite: the same as future)."""
+    obs_clip: float = 200.0
+    """Observations and goals are clipped to +- this before they are normalized."""
+    norm_clip: float = 5.0
+    """Normalized observations and goals are clipped to +- this."""
+    norm_eps: float = 0.01
+    """Least standard deviation that the normalizers divide by."""
+
+
+def episodes_capacity(config: Config, episode_length: int) -> int:
+    """Whole episodes that the replay ring holds."""
+    return config.replay_size // episode_length
+
+
+def steps_per_epoch(config: Config, episode_length: int) -> int:
+    """Environment steps an epoch, evaluation not counted."""
+    return config.num_envs * config.cycles_per_epoch * episode_length
+
+
+def num_epochs(config: Config, episode_length: int) -> int:
+    """Whole epochs that `total_steps` takes."""
+    return math.ceil(config.total_steps / steps_per_epoch(config, episode_length))
+
+
+def preset(name: str, env: str) -> tuple[Config, HParams]:
+    """The Config and HParams of a preset for an environment.
+
+    `default` is tuned for wall-clock time to success on a CPU (docs/design.md says how). `paper` is the set-up of
+    "Distance Based Replay Sampling in Hindsight Experience Replay": its workers' episodes are rolled out side by side,
+    and their averaged gradients are one gradient of the joint batch.
+
+    Raises:
+      ValueError: no such preset.
+    """
+    check_name("preset", name, PRESETS)
+    if name == "default":
+        return Config(env=env), HParams()
+    workers = 16 if env == "pick_and_place" else 8
+    epochs = 200 if env == "slide" else 50
+    config = Config(
+        env=env,
+        num_envs=2 * workers,
+        cycles_per_epoch=50,
+        updates_per_cycle=40,
+        target_period=40,
+        batch_size=256 * workers,
+        total_steps=epochs * 50 * 2 * workers * 50,
+    )
+    return config, HParams()
+
+
+def check_name(field: str, value: str, allowed: Iterable[str]) -> None:
+    """Raises ValueError, naming the nearest, unless `value` is one of `allowed`."""
+    allowed = tuple(allowed)
+    if value in allowed:
+        return
+    nearest = difflib.get_close_matches(str(value), allowed, n=2, cutoff=0.5)
+    hint = f" (did you mean {' or '.join(map(repr, nearest))}?)" if nearest else ""
+    raise ValueError(f"{field} must be one of {', '.join(allowed)}; got {value!r}{hint}")
+
+
+def validate(config: Config, hparams: HParams, episode_length: int = 50) -> None:
+    """Refuses what cannot run.
+
+    Raises:
+      ValueError: names every field at fault, its value and what is allowed.
+    """
+    problems = [*_config_problems(config, episode_length), *_hparam_problems(hparams)]
+    if problems:
+        raise ValueError("\n".join(problems))
+
+
+def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
+    for field, value, allowed in (
+        ("sampler", c.sampler, _sampler_names()),
+        ("weight_kernel", c.weight_kernel, WEIGHT_KERNELS),
+        ("engine", c.engine, ENGINES),
+    ):
+        try:
+            check_name(field, value, allowed)
+        except ValueError as error:
+            yield str(error)
+    positive = ("num_envs", "cycles_per_epoch", "updates_per_cycle", "target_period", "batch_size", "total_steps")
+    wrong = False
+    for field in (*positive, "replay_size", "eval_episodes"):
+        value = getattr(c, field)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            wrong = True
+            yield f"{field} must be an integer of at least 1; got {value!r}"
+    sizes = c.hidden_sizes
+    if not (isinstance(sizes, tuple) and sizes and all(isinstance(n, int) and n >= 1 for n in sizes)):
+        yield f"hidden_sizes must be one or more integers of at least 1; got {sizes!r}"
+    if wrong:
+        return
+    if c.updates_per_cycle % c.target_period:
+        yield (
+            f"target_period must divide updates_per_cycle ({c.updates_per_cycle}); got {c.target_period},"
+            f" allowed: {', '.join(str(n) for n in range(1, c.updates_per_cycle + 1) if c.updates_per_cycle % n == 0)}"
+        )
+    cycle = c.num_envs * episode_length
+    if c.replay_size < cycle:
+        yield (
+            f"replay_size must hold at least one cycle of {c.num_envs} episodes x {episode_length} steps = {cycle}"
+            f" transitions; got {c.replay_size}"
+        )
+    if c.batch_size > c.replay_size:
+        yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
+
+
+def _sampler_names() -> tuple[str, ...]:
+    """The samplers known so far: users can have registered more only once the module has been imported."""
+    module = sys.modules.get("mjx_dher.samplers")
+    return module.list_samplers() if module else SAMPLERS
+
+
+# field -> (least value, may it be least, greatest value, may it be greatest)
+_HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
+    "actor_lr": (0, True, 1, True),
+    "critic_lr": (0, True, 1, True),
+    "gamma": (0, True, 1, False),
+    "polyak": (0, True, 1, True),
+    "action_l2": (0, True, math.inf, False),
+    "random_eps": (0, True, 1, True),
+    "noise_std": (0, True, math.inf, False),
+    "her_k": (0, True, math.inf, False),
+    "epsilon": (0, True, 1, True),
+    "temperature": (0, False, math.inf, False),
+    "obs_clip": (0, False, math.inf, False),
+    "norm_clip": (0, False, math.inf, False),
+    "norm_eps": (0, False, math.inf, False),
+}
+
+
+def _hparam_problems(hparams: HParams) -> Iterable[str]:
+    for field, (least, least_too, greatest, greatest_too) in _HPARAM_RANGES.items():
+        value = getattr(hparams, field)
+        if not isinstance(value, (int, float)):
+            continue  # an array: one value a seed, made by a program
+        above = value >= least if least_too else value > least
+        below = value <= greatest if greatest_too else value < greatest
+        if not (above and below):
+            brackets = "[("[not least_too], "])"[not greatest_too]
+            yield f"{field} must lie in {brackets[0]}{least:g}, {greatest:g}{brackets[1]}; got {value!r}"

@@ -1,0 +1,159 @@
+"""DDPG (Lillicrap et al. 2016) as HER uses it (Andrychowicz et al. 2017): losses, one update, and how to act."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from mjx_dher import normalizer
+from mjx_dher.config import HParams
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.normalizer import NormalizerState
+from mjx_dher.types import Array, Batch, GoalObs, PRNGKey, PyTree
+
+_ADAM = optax.scale_by_adam()  # the step size is applied apart, because it is traced
+
+
+class Networks(NamedTuple):
+    """The two modules; static."""
+
+    actor: Actor
+    critic: Critic
+
+
+@struct.dataclass
+class Params:
+    """Parameters of both networks."""
+
+    actor: PyTree
+    critic: PyTree
+
+
+@struct.dataclass
+class DDPGState:
+    """Everything that learning changes."""
+
+    params: Params
+    target: Params
+    opt_state: Params  # Adam's moments, one optimizer a network
+    observation_norm: NormalizerState  # [D]
+    goal_norm: NormalizerState  # [G]
+    num_updates: Array  # [] int32
+
+
+class Losses(NamedTuple):
+    """What one update saw; all []."""
+
+    critic_loss: Array  # mean squared Bellman error
+    actor_loss: Array  # minus the mean Q value, plus the action penalty
+    q_mean: Array  # mean Q value of the critic on the batch
+
+
+def init(
+    key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int
+) -> DDPGState:
+    """Fresh networks, targets equal to them, normalizers that have seen nothing."""
+    actor_key, critic_key = jax.random.split(key)
+    obs, goal, action = jnp.zeros(observation_size), jnp.zeros(goal_size), jnp.zeros(action_size)
+    params = Params(
+        actor=networks.actor.init(actor_key, obs, goal), critic=networks.critic.init(critic_key, obs, goal, action)
+    )
+    return DDPGState(
+        params=params,
+        target=jax.tree.map(jnp.copy, params),
+        opt_state=Params(actor=_ADAM.init(params.actor), critic=_ADAM.init(params.critic)),
+        observation_norm=normalizer.init(observation_size),
+        goal_norm=normalizer.init(goal_size),
+        num_updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def act(networks: Networks, state: DDPGState, obs: GoalObs, hparams: HParams) -> Array:
+    """The policy's actions [..., A] in [-1, 1], without exploration."""
+    observation = _normalize(state.observation_norm, obs["observation"], hparams)
+    goal = _normalize(state.goal_norm, obs["desired_goal"], hparams)
+    return networks.actor.apply(state.params.actor, observation, goal)  # type: ignore[return-value]
+
+
+def explore(key: PRNGKey, action: Array, hparams: HParams) -> Array:
+    """`action` [N, A] with Gaussian noise, or, with probability `random_eps` a row, a uniformly random one instead."""
+    noise_key, uniform_key, coin_key = jax.random.split(key, 3)
+    noisy = jnp.clip(action + hparams.noise_std * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
+    uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
+    coin = jax.random.uniform(coin_key, action.shape[:-1]) < hparams.random_eps
+    return jnp.where(coin[..., None], uniform, noisy)
+
+
+def update_normalizers(state: DDPGState, observation: Array, goal: Array, hparams: HParams) -> DDPGState:
+    """The state after its normalizers saw observations [..., D] and goals [..., G]."""
+    return state.replace(  # type: ignore[attr-defined]
+        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip),
+        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip),
+    )
+
+
+def target_value(networks: Networks, target: Params, batch: Batch, hparams: HParams) -> Array:
+    """[B] reward + gamma Q'(s', pi'(s')), clipped to what returns can be: [-1/(1-gamma), 0]. `batch` is normalized.
+
+    Episodes end by the clock alone, so every next state has a value.
+    """
+    next_action = networks.actor.apply(target.actor, batch.next_observation, batch.desired_goal)
+    next_q = networks.critic.apply(target.critic, batch.next_observation, batch.desired_goal, next_action)
+    return jnp.clip(batch.reward + hparams.gamma * next_q, -1.0 / (1.0 - hparams.gamma), 0.0)
+
+
+def critic_loss(networks: Networks, critic: PyTree, batch: Batch, target: Array) -> tuple[Array, Array]:
+    """Mean squared difference of Q to `target` [B], and the mean Q. `batch` is normalized."""
+    q = networks.critic.apply(critic, batch.observation, batch.desired_goal, batch.action)
+    return jnp.mean(jnp.square(q - target)), jnp.mean(q)
+
+
+def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, hparams: HParams) -> Array:
+    """Minus the mean Q of the policy's actions plus `action_l2` times their mean square. `batch` is normalized."""
+    action = networks.actor.apply(actor, batch.observation, batch.desired_goal)
+    q = networks.critic.apply(critic, batch.observation, batch.desired_goal, action)
+    return -jnp.mean(q) + hparams.action_l2 * jnp.mean(jnp.square(action))
+
+
+def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Losses]:
+    """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`."""
+    batch = batch.replace(  # type: ignore[attr-defined]
+        observation=_normalize(state.observation_norm, batch.observation, hparams),
+        next_observation=_normalize(state.observation_norm, batch.next_observation, hparams),
+        desired_goal=_normalize(state.goal_norm, batch.desired_goal, hparams),
+    )
+    params = state.params
+    target = target_value(networks, state.target, batch, hparams)
+    (c_loss, q_mean), c_grad = jax.value_and_grad(
+        lambda critic: critic_loss(networks, critic, batch, target), has_aux=True
+    )(params.critic)
+    a_loss, a_grad = jax.value_and_grad(
+        lambda actor: actor_loss(networks, actor, params.critic, batch, hparams)
+    )(params.actor)
+    critic, critic_opt = _adam_step(c_grad, state.opt_state.critic, params.critic, hparams.critic_lr)
+    actor, actor_opt = _adam_step(a_grad, state.opt_state.actor, params.actor, hparams.actor_lr)
+    state = state.replace(  # type: ignore[attr-defined]
+        params=Params(actor=actor, critic=critic),
+        opt_state=Params(actor=actor_opt, critic=critic_opt),
+        num_updates=state.num_updates + 1,
+    )
+    return state, Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
+
+
+def update_target(state: DDPGState, hparams: HParams) -> DDPGState:
+    """Soft update: the targets keep a share `polyak` of themselves and take the rest from the networks."""
+    target = optax.incremental_update(state.params, state.target, 1.0 - hparams.polyak)
+    return state.replace(target=target)  # type: ignore[attr-defined]
+
+
+def _adam_step(grad: PyTree, opt_state: PyTree, params: PyTree, lr: Array | float) -> tuple[PyTree, PyTree]:
+    direction, opt_state = _ADAM.update(grad, opt_state)
+    return jax.tree.map(lambda p, d: p - lr * d, params, direction), opt_state
+
+
+def _normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:
+    return normalizer.normalize(state, values, hparams.norm_eps, hparams.norm_clip, hparams.obs_clip)

@@ -1,0 +1,46 @@
+"""Running mean and standard deviation, merged batch by batch (Chan, Golub & LeVeque 1983)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_dher.types import Array
+
+
+@struct.dataclass
+class NormalizerState:
+    """Moments of all that was seen. Kept as mean and variance: float32 sums of squares would cancel."""
+
+    count: Array  # []
+    mean: Array  # [D]
+    var: Array  # [D] biased (divided by count)
+
+
+def init(size: int) -> NormalizerState:
+    """Nothing seen: mean 0, variance 1."""
+    return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
+
+
+def update(state: NormalizerState, values: Array, clip: Array | float) -> NormalizerState:
+    """The moments with `values` [..., D] added, after clipping them to +- `clip`."""
+    values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
+    batch_mean = jnp.mean(values, axis=0)
+    batch_var = jnp.mean(jnp.square(values - batch_mean), axis=0)
+    count = state.count + values.shape[0]
+    share = values.shape[0] / count
+    delta = batch_mean - state.mean
+    return NormalizerState(
+        count=count,
+        mean=state.mean + delta * share,
+        var=state.var * (1.0 - share) + batch_var * share + jnp.square(delta) * share * (1.0 - share),
+    )
+
+
+def normalize(
+    state: NormalizerState, values: Array, eps: Array | float, clip: Array | float, input_clip: Array | float
+) -> Array:
+    """`values` [..., D] clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`."""
+    values = jnp.clip(values, -input_clip, input_clip)
+    std = jnp.maximum(jnp.sqrt(state.var), eps)
+    return jnp.clip((values - state.mean) / std, -clip, clip)

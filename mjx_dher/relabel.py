@@ -1,0 +1,53 @@
+"""Hindsight: transitions whose goal is replaced by an achieved one, with the reward computed anew."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher import replay, samplers
+from mjx_dher.config import HParams
+from mjx_dher.replay import ReplayState, Sample
+from mjx_dher.samplers import Sampler
+from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
+
+
+def hindsight_goals(
+    state: ReplayState, sample: Sample, sampler: Sampler, hparams: HParams, key: PRNGKey
+) -> Array:
+    """[B, G] one achieved goal for each transition of `sample`, chosen by `sampler`."""
+    pool_key, draw_key = jax.random.split(key)
+    batch_size = sample.step.shape[0]
+    pool = replay.sample_episode_goals(state, pool_key, batch_size) if sampler.whole_ring else sample.episode_goals
+    log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(
+        pool, sample.desired_goal, sample.step, hparams
+    )
+    index = samplers.draw(draw_key, log_weights)
+    return pool[jnp.arange(batch_size), index]
+
+
+def relabel(
+    state: ReplayState,
+    sample: Sample,
+    sampler: Sampler,
+    compute_reward: RewardFn,
+    hparams: HParams,
+    key: PRNGKey,
+) -> Batch:
+    """`sample` as a batch in which each transition was relabelled with probability k/(k+1), k = `hparams.her_k`.
+
+    The reward is that of the goal achieved at the transition's end: `compute_reward(achieved at step+1, goal)`.
+    """
+    coin_key, goal_key = jax.random.split(key)
+    batch_size = sample.step.shape[0]
+    relabelled = jax.random.uniform(coin_key, (batch_size,)) < hparams.her_k / (hparams.her_k + 1.0)
+    goals = hindsight_goals(state, sample, sampler, hparams, goal_key)
+    desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
+    achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
+    return Batch(
+        observation=sample.observation,
+        next_observation=sample.next_observation,
+        desired_goal=desired_goal,
+        action=sample.action,
+        reward=compute_reward(achieved_goal, desired_goal),
+    )

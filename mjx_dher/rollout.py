@@ -1,0 +1,53 @@
+"""Whole episodes, many at once: a reset and a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey
+
+# policy(key, obs with leading [N]) -> actions [N, A]
+PolicyFn = Callable[[PRNGKey, GoalObs], Array]
+
+
+class Outcome(NamedTuple):
+    """How episodes went; all [N]."""
+
+    success: Array  # 1.0 where the goal is reached at the last step
+    reset_success: Array  # 1.0 where it was reached at the reset, before any action
+    ret: Array  # undiscounted sum of rewards
+
+
+def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int) -> tuple[Episode, Outcome]:
+    """`num_envs` episodes side by side.
+
+    Returns:
+      The episodes (leaves lead with [N]) and their outcomes.
+    """
+    reset_key, policy_key = jax.random.split(key)
+    first = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+
+    def step(state, step_key):
+        action = policy(step_key, state.obs)
+        following = jax.vmap(env.step)(state, action)
+        played = (state.obs["observation"], state.obs["achieved_goal"], action, following.reward)
+        return following, played
+
+    last, (observation, achieved_goal, action, reward) = jax.lax.scan(
+        step, first, jax.random.split(policy_key, env.episode_length)
+    )
+
+    def whole(steps, end):  # [T, N, ...] and [N, ...] -> [N, T+1, ...]
+        return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)
+
+    episodes = Episode(
+        observation=jax.tree.map(whole, observation, last.obs["observation"]),
+        achieved_goal=whole(achieved_goal, last.obs["achieved_goal"]),
+        desired_goal=first.obs["desired_goal"],
+        action=jnp.moveaxis(action, 0, 1),
+    )
+    return episodes, Outcome(success=last.success, reset_success=first.success, ret=jnp.sum(reward, axis=0))

@@ -1,0 +1,210 @@
+"""Goal samplers: which achieved goal takes the place of the desired one.
+
+Every sampler is a probability over the T+1 achieved goals of one episode, given as unnormalized log weights: -inf marks what
+it may not choose. `draw` makes a choice from them. So a sampler is a pure function that a test can compare with a table.
+
+    log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
+
+The transition under relabelling leads from `step` to `step + 1`; its *future* is the goals at step+1 ... T, never `step`
+itself.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_dher import config as config_lib
+from mjx_dher.config import HParams
+from mjx_dher.types import Array, PRNGKey
+
+# log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
+LogWeightsFn = Callable[[Array, Array, Array, HParams], Array]
+# metric(achieved [T+1, G], desired [G]) -> [T+1], not negative
+MetricFn = Callable[[Array, Array], Array]
+# kernel(relative distance [T+1], temperature []) -> log weight [T+1]
+KernelFn = Callable[[Array, Array | float], Array]
+
+
+@struct.dataclass
+class Sampler:
+    """A goal sampler: its log weights, and whose achieved goals they choose from."""
+
+    log_weights: LogWeightsFn = struct.field(pytree_node=False)
+    whole_ring: bool = struct.field(pytree_node=False, default=False)  # goals of any episode, not of its own
+
+
+def position(achieved: Array, desired: Array) -> Array:
+    """The metric `position`: Euclidean distance of [T+1, G] to [G]."""
+    return jnp.linalg.norm(achieved - desired, axis=-1)
+
+
+def future_mask(num_goals: int, step: Array) -> Array:
+    """[T+1] true at the goals that come after `step`."""
+    return jnp.arange(num_goals) > step
+
+
+def _uniform(mask: Array) -> Array:
+    return jnp.where(mask, 0.0, -jnp.inf)
+
+
+def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """Any goal of the episode, each with the same probability."""
+    del desired, step, hparams
+    return jnp.zeros(achieved.shape[0])
+
+
+def future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """Any goal after the step, each with the same probability (Andrychowicz et al. 2017, the paper's baseline)."""
+    del desired, hparams
+    return _uniform(future_mask(achieved.shape[0], step))
+
+
+def final(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """The episode's last goal."""
+    del desired, step, hparams
+    return _uniform(jnp.arange(achieved.shape[0]) == achieved.shape[0] - 1)
+
+
+def closest(
+    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position
+) -> Array:
+    """The future goal nearest to the desired one (the paper's method 1); equally near ones share."""
+    del hparams
+    distance = jnp.where(future_mask(achieved.shape[0], step), metric(achieved, desired), jnp.inf)
+    return _uniform(distance == jnp.min(distance))
+
+
+def epsilon_closest(
+    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position
+) -> Array:
+    """With probability `epsilon` any future goal, else the closest (the paper's method 2)."""
+    any_future = jax.nn.softmax(future(achieved, desired, step, hparams))
+    nearest = jax.nn.softmax(closest(achieved, desired, step, hparams, metric))
+    return jnp.log(hparams.epsilon * any_future + (1.0 - hparams.epsilon) * nearest)
+
+
+def weighted(
+    achieved: Array,
+    desired: Array,
+    step: Array,
+    hparams: HParams,
+    kernel: KernelFn,
+    metric: MetricFn = position,
+) -> Array:
+    """Future goals, the likelier the nearer they are to the desired goal (the paper's method 3).
+
+    The weight of a candidate depends on its *normalized distance*: its distance to the goal that the episode was played
+    for, divided by the mean of that distance over the candidates of the same transition,
+
+        r_i = d_i / mean_j d_j,   d_i = metric(achieved_i, desired),   i, j in step+1 ... T,
+
+    so weights do not depend on the scale of the task, and equal distances (r_i = 1 for all) give `future` exactly. With
+    temperature tau the kernels are, in r,
+
+        linear    w = max(1 - (r - 1) / tau, 0)    at tau = 1: 2 - r, from 2 at the goal to 0 at twice the mean distance
+        inverse   w = r^(-1/tau)
+        softmax   w = exp(-(r - 1) / tau)
+
+    They agree to first order around the mean distance and differ in what they do far from it: `inverse` all but always
+    takes a candidate that lies on the goal, `linear` at tau = 1 never makes one more than twice as likely as one at the mean
+    distance and drops those beyond twice the mean. `linear` at tau = 1 is the default: the plainest reading of the paper's
+    words, with no number to tune and no single candidate able to crowd out the others. (Normalizing by the *sum* of
+    the n candidates' distances, w = 1 - d_i / sum_j d_j, is this linear kernel at tau = n - 1: for most transitions
+    all but uniform.)
+    """
+    mask = future_mask(achieved.shape[0], step)
+    distance = jnp.where(mask, metric(achieved, desired), 0.0)
+    mean = jnp.sum(distance) / jnp.sum(mask)
+    # Where every candidate lies on the goal, all are equally near.
+    relative = jnp.where(mask & (mean > 0), distance / jnp.where(mean > 0, mean, 1.0), 1.0)
+    return jnp.where(mask, kernel(relative, hparams.temperature), -jnp.inf)
+
+
+def linear(relative: Array, temperature: Array | float) -> Array:
+    """log max(1 - (r - 1) / temperature, 0)."""
+    return jnp.log(jnp.maximum(1.0 - (relative - 1.0) / temperature, 0.0))
+
+
+def inverse(relative: Array, temperature: Array | float) -> Array:
+    """log r^(-1/temperature); a candidate on the goal counts as one at a thousandth of the mean distance."""
+    return -jnp.log(jnp.maximum(relative, 1e-3)) / temperature
+
+
+def softmax(relative: Array, temperature: Array | float) -> Array:
+    """-(r - 1) / temperature."""
+    return -(relative - 1.0) / temperature
+
+
+KERNELS: dict[str, KernelFn] = {"linear": linear, "inverse": inverse, "softmax": softmax}
+METRICS: dict[str, MetricFn] = {"position": position}
+_PLAIN: dict[str, Sampler] = {
+    "random": Sampler(episode, whole_ring=True),
+    "episode": Sampler(episode),
+    "future": Sampler(future),
+    "final": Sampler(final),
+}
+
+
+def list_samplers() -> tuple[str, ...]:
+    """The names that `make` takes."""
+    return (*config_lib.SAMPLERS, *(name for name in _PLAIN if name not in config_lib.SAMPLERS))
+
+
+def register(name: str, sampler: Sampler) -> None:
+    """Makes a sampler available to `make` and to the command line.
+
+    Raises:
+      ValueError: the name is taken.
+    """
+    if name in list_samplers():
+        raise ValueError(f"sampler {name!r} is already registered")
+    _PLAIN[name] = sampler
+
+
+def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
+    """The sampler called `name`.
+
+    Args:
+      name: one of `list_samplers()`. `random` chooses as `episode` does, but from a random episode of the ring.
+      kernel: for `weighted`, one of linear, inverse, softmax, or a function (relative distance, temperature) -> log weight.
+      metric: for closest, epsilon_closest and weighted: "position", or a function (achieved [T+1, G], desired [G]) -> [T+1].
+
+    Raises:
+      ValueError: no such sampler, kernel or metric; the message names the nearest.
+    """
+    config_lib.check_name("sampler", name, list_samplers())
+    if isinstance(kernel, str):
+        config_lib.check_name("weight_kernel", kernel, KERNELS)
+        kernel = KERNELS[kernel]
+    if isinstance(metric, str):
+        config_lib.check_name("metric", metric, METRICS)
+        metric = METRICS[metric]
+    by_distance: dict[str, LogWeightsFn] = {
+        "closest": functools.partial(closest, metric=metric),
+        "epsilon_closest": functools.partial(epsilon_closest, metric=metric),
+        "weighted": functools.partial(weighted, kernel=kernel, metric=metric),
+    }
+    return Sampler(by_distance[name]) if name in by_distance else _PLAIN[name]
+
+
+def probabilities(log_weights: Array) -> Array:
+    """[..., T+1] the probabilities that log weights [..., T+1] stand for."""
+    return jax.nn.softmax(log_weights, axis=-1)
+
+
+def draw(key: PRNGKey, log_weights: Array) -> Array:
+    """[B] one index each from log weights [B, T+1], by inverting the cumulative distribution: one random number a row.
+
+    What has no weight is never drawn, whatever the rounding of the cumulative sum. At least one weight must be positive.
+    """
+    weights = jnp.exp(log_weights - jnp.max(log_weights, axis=-1, keepdims=True))
+    cumulative = jnp.cumsum(weights, axis=-1)
+    threshold = jax.random.uniform(key, log_weights.shape[:-1]) * cumulative[..., -1]
+    reached = (cumulative > threshold[..., None]) & (weights > 0)
+    last = log_weights.shape[-1] - 1 - jnp.argmax(weights[..., ::-1] > 0, axis=-1)
+    return jnp.where(jnp.any(reached, axis=-1), jnp.argmax(reached, axis=-1), last).astype(jnp.int32)

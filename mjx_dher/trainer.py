@@ -1,0 +1,163 @@
+"""The training loop as two pure functions, `init` and `epoch`, that compile and vmap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_dher import config as config_lib
+from mjx_dher import ddpg, evaluate, replay, samplers
+from mjx_dher.config import Config, HParams
+from mjx_dher.ddpg import DDPGState, Losses, Networks
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.relabel import relabel
+from mjx_dher.replay import ReplayState
+from mjx_dher.rollout import rollout
+from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, PRNGKey
+
+
+@struct.dataclass
+class TrainState:
+    """A run in progress, whole: the next epoch depends on nothing else."""
+
+    learner: DDPGState
+    replay: ReplayState
+    hparams: HParams
+    key: PRNGKey
+    env_steps: Array  # [] int32
+
+
+# Scalars of an epoch, by name; see `make_train`.
+Metrics = dict[str, Array]
+
+
+class Train(NamedTuple):
+    """What `make_train` returns."""
+
+    init: Callable[[PRNGKey, HParams], TrainState]
+    epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
+    networks: Networks
+    replay_bytes: int  # of one run's ring
+
+
+def make_train(env: Env, config: Config) -> Train:
+    """The training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
+
+    `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
+    and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
+    evaluation; train_success_rate and train_return_mean of the exploring policy; critic_loss, actor_loss and q_mean.
+
+    Raises:
+      ValueError: a Config that cannot run, or an observation that is not one vector.
+    """
+    config_lib.validate(config, HParams(), env.episode_length)
+    sampler = samplers.make(config.sampler, config.weight_kernel, config.metric)
+    networks = Networks(
+        actor=Actor(env.action_size, config.hidden_sizes), critic=Critic(config.hidden_sizes)
+    )
+    template = episode_template(env)
+    num_episodes = config_lib.episodes_capacity(config, env.episode_length)
+    updates_per_target = config.target_period
+    targets_per_cycle = config.updates_per_cycle // updates_per_target
+
+    def init(key: PRNGKey, hparams: HParams) -> TrainState:
+        key, learner_key = jax.random.split(key)
+        return TrainState(
+            learner=ddpg.init(
+                learner_key,
+                networks,
+                observation_size=template.observation.shape[-1],
+                goal_size=template.desired_goal.shape[-1],
+                action_size=env.action_size,
+            ),
+            replay=replay.init(template, num_episodes),
+            hparams=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams),
+            key=key,
+            env_steps=jnp.zeros((), jnp.int32),
+        )
+
+    def draw_batch(ring: ReplayState, hparams: HParams, key: PRNGKey, batch_size: int) -> Batch:
+        sample_key, relabel_key = jax.random.split(key)
+        sample = replay.sample(ring, sample_key, batch_size)
+        return relabel(ring, sample, sampler, env.compute_reward, hparams, relabel_key)
+
+    def see(learner: DDPGState, episodes: Episode, hparams: HParams, key: PRNGKey) -> DDPGState:
+        """Shows the new episodes to the normalizers, with goals distributed as the learner will meet them."""
+        num_new, num_steps = episodes.action.shape[:2]
+        fresh = replay.add(replay.init(template, num_new), episodes)
+        batch = draw_batch(fresh, hparams, key, num_new * num_steps)
+        return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams)
+
+    def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
+        def update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
+            batch = draw_batch(ring, hparams, key, config.batch_size)
+            return ddpg.update(networks, learner, batch, hparams)
+
+        def update_with_target(learner: DDPGState, keys: PRNGKey) -> tuple[DDPGState, Losses]:
+            learner, losses = jax.lax.scan(update, learner, keys)
+            return ddpg.update_target(learner, hparams), losses
+
+        keys = jax.random.split(key, (targets_per_cycle, updates_per_target))
+        learner, losses = jax.lax.scan(update_with_target, learner, keys)
+        return learner, jax.tree.map(jnp.mean, losses)
+
+    def cycle(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
+        key, rollout_key, see_key, learn_key = jax.random.split(state.key, 4)
+        hparams = state.hparams
+
+        def policy(key: PRNGKey, obs: GoalObs) -> Array:
+            return ddpg.explore(key, ddpg.act(networks, state.learner, obs, hparams), hparams)
+
+        episodes, outcome = rollout(env, policy, rollout_key, config.num_envs)
+        ring = replay.add(state.replay, episodes)
+        learner = see(state.learner, episodes, hparams, see_key)
+        learner, losses = learn(learner, ring, hparams, learn_key)
+        metrics = {
+            "train_success_rate": jnp.mean(outcome.success),
+            "train_return_mean": jnp.mean(outcome.ret),
+            **losses._asdict(),
+        }
+        state = TrainState(
+            learner=learner,
+            replay=ring,
+            hparams=hparams,
+            key=key,
+            env_steps=state.env_steps + config.num_envs * env.episode_length,
+        )
+        return state, metrics
+
+    def epoch(state: TrainState) -> tuple[TrainState, Metrics]:
+        state, cycles = jax.lax.scan(cycle, state, length=config.cycles_per_epoch)
+        key, eval_key = jax.random.split(state.key)
+        outcome = evaluate.evaluate(env, networks, state.learner, state.hparams, eval_key, config.eval_episodes)
+        metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles)
+        return state.replace(key=key), metrics  # type: ignore[attr-defined]
+
+    return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def episode_template(env: Env) -> Episode:
+    """The shapes and types of one episode of `env`, without running it.
+
+    Raises:
+      ValueError: the observation is not a single vector.
+    """
+    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    observation = obs["observation"]
+    if not (hasattr(observation, "shape") and len(observation.shape) == 1):
+        raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")
+
+    def repeat(x, times):
+        return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
+
+    num_steps = env.episode_length
+    return Episode(
+        observation=repeat(observation, num_steps + 1),
+        achieved_goal=repeat(obs["achieved_goal"], num_steps + 1),
+        desired_goal=obs["desired_goal"],
+        action=jax.ShapeDtypeStruct((num_steps, env.action_size), jnp.float32),
+    )

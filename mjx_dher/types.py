@@ -1,0 +1,82 @@
+"""The vocabulary of the library: the data that its parts hand to each other.
+
+Dimension letters, used in every shape comment:
+
+    B  batch of transitions      E  episodes in the replay ring     A  action size
+    N  environments in parallel  T  steps of an episode             D  observation size
+    S  seeds                     G  goal size
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypedDict
+
+import jax
+from flax import struct
+
+Array = jax.Array
+PRNGKey = jax.Array
+PyTree = Any
+
+
+class GoalObs(TypedDict):
+    """What a goal-conditioned agent sees; the keys are those of gymnasium-robotics' goal environments."""
+
+    observation: PyTree  # [..., D], or a pytree of arrays
+    achieved_goal: Array  # [..., G]
+    desired_goal: Array  # [..., G]
+
+
+@struct.dataclass
+class Episode:
+    """A whole episode: every observation once, the last one included. Batched forms lead with [N] or [E]."""
+
+    observation: PyTree  # [T+1, D], or a pytree of arrays that all lead with T+1
+    achieved_goal: Array  # [T+1, G]
+    desired_goal: Array  # [G]
+    action: Array  # [T, A]
+
+
+@struct.dataclass
+class Batch:
+    """Transitions as the learner takes them, hindsight goals already in place."""
+
+    observation: PyTree  # [B, D]
+    next_observation: PyTree  # [B, D]
+    desired_goal: Array  # [B, G]
+    action: Array  # [B, A]
+    reward: Array  # [B]
+
+
+# compute_reward(achieved_goal [..., G], desired_goal [..., G]) -> reward [...]
+RewardFn = Callable[[Array, Array], Array]
+
+
+class EnvState(Protocol):
+    """What the trainer reads of an environment's state; the rest belongs to the environment."""
+
+    @property
+    def obs(self) -> GoalObs: ...
+
+    @property
+    def reward(self) -> Array: ...  # []
+
+    @property
+    def success(self) -> Array: ...  # [], 1.0 where the goal is reached
+
+
+class Env(Protocol):
+    """An unbatched, pure, goal-conditioned environment of fixed horizon; `jax.vmap` is the batch."""
+
+    @property
+    def action_size(self) -> int: ...
+
+    @property
+    def episode_length(self) -> int: ...
+
+    def reset(self, key: PRNGKey) -> Any: ...  # -> EnvState
+
+    def step(self, state: Any, action: Array) -> Any: ...  # -> EnvState
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array: ...
