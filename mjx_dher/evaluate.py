@@ -1,25 +1,18 @@
-"""How good is the policy without exploration?"""
+"""How good is a policy without exploration?"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 
-from mjx_dher import ddpg
-from mjx_dher.config import HParams
-from mjx_dher.ddpg import DDPGState, Networks
 from mjx_dher.rollout import Outcome, rollout
 from mjx_dher.types import Array, Env, GoalObs, PRNGKey
 
 
-def evaluate(
-    env: Env, networks: Networks, state: DDPGState, hparams: HParams, key: PRNGKey, num_episodes: int
-) -> Outcome:
-    """The outcomes [num_episodes] of the deterministic policy."""
-
-    def policy(_: PRNGKey, obs: GoalObs) -> Array:
-        return ddpg.act(networks, state, obs, hparams)
-
-    return rollout(env, policy, key, num_episodes)[1]
+def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
+    """The outcomes [num_episodes] of a deterministic policy; `act` takes observations that lead with [num_episodes]."""
+    return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
 def summary(outcome: Outcome) -> dict[str, Array]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import concurrent.futures
+import time
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -10,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mjx_dher import config as config_lib
-from mjx_dher import ddpg, evaluate, replay, samplers
+from mjx_dher import ddpg, evaluate, memory, replay, samplers
 from mjx_dher.config import Config, HParams
 from mjx_dher.ddpg import DDPGState, Losses, Networks
 from mjx_dher.networks import Actor, Critic
@@ -133,7 +135,9 @@ def make_train(env: Env, config: Config) -> Train:
     def epoch(state: TrainState) -> tuple[TrainState, Metrics]:
         state, cycles = jax.lax.scan(cycle, state, length=config.cycles_per_epoch)
         key, eval_key = jax.random.split(state.key)
-        outcome = evaluate.evaluate(env, networks, state.learner, state.hparams, eval_key, config.eval_episodes)
+        outcome = evaluate.evaluate(
+            env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), eval_key, config.eval_episodes
+        )
         metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles)
         return state.replace(key=key), metrics  # type: ignore[attr-defined]
 
@@ -161,3 +165,84 @@ def episode_template(env: Env) -> Episode:
         desired_goal=obs["desired_goal"],
         action=jax.ShapeDtypeStruct((num_steps, env.action_size), jnp.float32),
     )
+
+
+class Progress(NamedTuple):
+    """Where a run is after an epoch."""
+
+    epoch: int  # from 1
+    num_epochs: int
+    env_steps: int
+    updates: int
+    wall_seconds: float  # since the first epoch began: compilation is not counted
+    epoch_seconds: float
+    metrics: dict[str, float]
+    state: TrainState  # valid until the next epoch begins, which takes over its memory
+
+
+def train(
+    env: Env,
+    config: Config,
+    hparams: HParams | None = None,
+    seed: int = 0,
+    on_compile: Callable[[float | None], None] = lambda seconds: None,
+) -> Iterator[Progress]:
+    """Trains, yielding after every epoch. Stop by not asking for more.
+
+    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way.
+
+    Args:
+      env: the environment; `config.env` is not read.
+      config: shapes and choices.
+      hparams: numbers; the defaults where None.
+      seed: of everything random.
+      on_compile: called with None when compilation begins and with its seconds when it has ended.
+
+    Raises:
+      ValueError: a Config or HParams that cannot run, or a replay ring larger than the memory that is free.
+    """
+    hparams = HParams() if hparams is None else hparams
+    config_lib.validate(config, hparams, env.episode_length)
+    program = make_train(env, config)
+    check_memory(program.replay_bytes, config)
+    on_compile(None)
+    started = time.perf_counter()
+    state = jax.jit(program.init)(jax.random.key(seed), hparams)
+    epoch = jax.jit(program.epoch, donate_argnums=0).lower(state).compile()
+    on_compile(time.perf_counter() - started)
+
+    num_epochs = config_lib.num_epochs(config, env.episode_length)
+    started = previous = time.perf_counter()
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        for number in range(1, num_epochs + 1):
+            running = pool.submit(lambda state: jax.block_until_ready(epoch(state)), state)
+            while not running.done():
+                concurrent.futures.wait([running], timeout=0.1)
+            state, metrics = running.result()
+            now = time.perf_counter()
+            yield Progress(
+                epoch=number,
+                num_epochs=num_epochs,
+                env_steps=int(state.env_steps),
+                updates=int(state.learner.num_updates),
+                wall_seconds=now - started,
+                epoch_seconds=now - previous,
+                metrics={name: float(value) for name, value in metrics.items()},
+                state=state,
+            )
+            previous = time.perf_counter()
+
+
+def check_memory(replay_bytes: int, config: Config) -> None:
+    """Refuses a replay ring that cannot fit.
+
+    Raises:
+      ValueError: says what the ring needs, what is free and which replay_size would fit.
+    """
+    available = memory.available_bytes()
+    if available is not None and replay_bytes > available:
+        fitting = int(config.replay_size * available / replay_bytes)
+        raise ValueError(
+            f"replay_size {config.replay_size} needs {memory.format_bytes(replay_bytes)}, but only"
+            f" {memory.format_bytes(available)} of memory is free; at most {fitting} transitions fit"
+        )

@@ -1,0 +1,270 @@
+"""The command line: `train` (the default command) and `eval`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import platform
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import __version__, config, envs, run_folder, stats
+from mjx_dher.config import Config, HParams
+from mjx_dher.run_folder import RunConfig
+
+if TYPE_CHECKING:
+    from mjx_dher.envs import GoalEnv
+    from mjx_dher.policy import Policy
+    from mjx_dher.rollout import Outcome
+    from mjx_dher.trainer import Progress
+
+FINAL_EPISODES = 500
+EVAL_CHUNK = 500  # episodes evaluated at once
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainArgs:
+    """Train a policy with DDPG and Hindsight Experience Replay.
+
+    Other commands: `eval RUN` evaluates a run again (see `eval --help`).
+    """
+
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    hparams: Annotated[HParams, tyro.conf.arg(name="")]
+    preset: str = "default"
+    """default (tuned for time to success on a CPU) or paper (the paper's settings); other options override it."""
+    seed: int = 0
+    """Of everything random."""
+    out: Path | None = None
+    """Run folder to write; a fresh one under runs/ unless given. Never overwrites."""
+    final_episodes: int = FINAL_EPISODES
+    """Episodes of the last evaluation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvalArgs:
+    """Evaluate the policy of a run folder again."""
+
+    run: tyro.conf.Positional[Path]
+    """The run folder."""
+    episodes: int = FINAL_EPISODES
+    """Episodes to play."""
+    seed: int = 1
+    """Of the starts and goals."""
+    engine: str | None = None
+    """Physics: native, jax or auto; the run's own unless given."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit status (2: the arguments were refused)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    commands: dict[str, Callable[[list[str], Console], int]] = {"train": train_command, "eval": eval_command}
+    name = argv.pop(0) if argv and argv[0] in commands else "train"
+    try:
+        if name == "train" and argv and not argv[0].startswith("-"):
+            config.check_name("command", argv[0], commands)
+        return commands[name](argv, Console(highlight=False))
+    except ValueError as error:
+        for line in str(error).splitlines():
+            print(f"error: {line}", file=sys.stderr)
+        return 2
+
+
+def train_command(argv: list[str], console: Console) -> int:
+    args = parse_train_args(argv)
+    folder = run_folder.choose(args.out, args.config, args.seed)
+    run = _Training(args, folder, console)
+    return run()
+
+
+def parse_train_args(argv: list[str]) -> TrainArgs:
+    """The arguments of `train`, checked without loading JAX or MuJoCo.
+
+    Raises:
+      ValueError: one or more of them cannot be used.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default="default")
+    early.add_argument("--env", default="push")
+    chosen, _ = early.parse_known_args(argv)
+    base, hparams = config.preset(chosen.preset, chosen.env)
+    args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=TrainArgs(config=base, hparams=hparams))
+    config.check_name("env", args.config.env, envs.list_envs())
+    config.validate(args.config, args.hparams)
+    _check_count("final_episodes", args.final_episodes)
+    return args
+
+
+class _Training:
+    """One run of the `train` command, with what its signal handler needs to see."""
+
+    def __init__(self, args: TrainArgs, folder: Path, console: Console):
+        self.args, self.folder, self.console = args, folder, console
+        self.stop_asked = False
+
+    def __call__(self) -> int:
+        import jax
+
+        from mjx_dher import memory, policy, trainer
+
+        args, console = self.args, self.console
+        env = envs.make(args.config.env, engine=args.config.engine)
+        engine = _engine_name(env)
+        program = trainer.make_train(env, args.config)
+        trainer.check_memory(program.replay_bytes, args.config)
+        run = RunConfig(config=args.config, hparams=args.hparams, seed=args.seed, engine=engine)
+        run_folder.create(self.folder, run, {"preset": args.preset, "versions": _versions()})
+        device = jax.devices()[0]
+        console.print(
+            f"{args.config.env}, sampler {args.config.sampler}, seed {args.seed}; physics {engine}, learner on"
+            f" {device.device_kind}; replay ring {memory.format_bytes(program.replay_bytes)}; writing to {self.folder}",
+            soft_wrap=True,
+        )
+        previous_handler = signal.signal(signal.SIGINT, self._on_interrupt)
+        last: Progress | None = None
+        learned: Policy | None = None
+        sinks: list[Any] = []
+        try:
+            for progress in trainer.train(env, args.config, args.hparams, args.seed, self._on_compile):
+                if not sinks:
+                    sinks = self._open_sinks(progress.num_epochs)
+                row = _row(progress, last)
+                last = progress
+                learned = policy.from_learner(progress.state.learner, args.hparams)
+                learned.save(self.folder / run_folder.POLICY_FILE)
+                for sink in sinks:
+                    sink.write(row)
+                if self.stop_asked:
+                    break
+        finally:
+            for sink in sinks:
+                sink.close()
+            signal.signal(signal.SIGINT, previous_handler)
+        if last is None or learned is None:
+            return 1
+        if self.stop_asked:
+            console.print(
+                f"stopped after epoch {last.epoch} of {last.num_epochs}; the policy so far is in {self.folder}",
+                soft_wrap=True,
+            )
+        outcome = play(env, learned, args.final_episodes, args.seed + 1)
+        result = report(outcome, console)
+        run_folder.write_json(
+            self.folder / run_folder.RESULT_FILE,
+            {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result},
+        )
+        console.print(f"run folder: {self.folder}", soft_wrap=True)
+        return 130 if self.stop_asked else 0
+
+    def _open_sinks(self, num_epochs: int) -> list[Any]:
+        from mjx_dher.metrics import ConsoleSink, CsvSink
+
+        return [CsvSink(self.folder / run_folder.METRICS_FILE), ConsoleSink(self.console, num_epochs)]
+
+    def _on_compile(self, seconds: float | None) -> None:
+        if seconds is None:
+            self.console.print("compiling the training loop (physics, replay, learner, evaluation) ...")
+        else:
+            self.console.print(f"compiled in {seconds:.1f} s")
+
+    def _on_interrupt(self, signum: int, frame: Any) -> None:
+        if self.stop_asked:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            raise KeyboardInterrupt
+        self.stop_asked = True
+        self.console.print("stopping when this epoch has ended; Ctrl-C again stops at once, keeping the last saved policy")
+
+
+def eval_command(argv: list[str], console: Console) -> int:
+    args = tyro.cli(EvalArgs, prog="train.py eval", args=argv)
+    _check_count("episodes", args.episodes)
+    if args.engine is not None:
+        config.check_name("engine", args.engine, config.ENGINES)
+    run = run_folder.read_config(args.run)
+    from mjx_dher.policy import load_policy
+
+    policy = load_policy(args.run)
+    env = envs.make(run.config.env, engine=args.engine or run.config.engine)
+    console.print(f"{run.config.env}: {args.episodes} episodes, seed {args.seed}, physics {_engine_name(env)} ...")
+    report(play(env, policy, args.episodes, args.seed), console)
+    return 0
+
+
+def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
+    """The outcomes [num_episodes] of `policy` in `env`, as NumPy arrays."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from mjx_dher.evaluate import evaluate
+
+    chunk = min(num_episodes, EVAL_CHUNK)
+
+    @jax.jit
+    def run(key):
+        return evaluate(env, lambda obs: policy.forward(obs["observation"], obs["desired_goal"], jnp), key, chunk)
+
+    keys = jax.random.split(jax.random.key(seed), -(-num_episodes // chunk))
+    outcomes = [jax.device_get(run(key)) for key in keys]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
+
+
+def report(outcome: Outcome, console: Console) -> dict[str, Any]:
+    """Prints success with its interval, success at reset and mean return; returns them."""
+    trials = len(outcome.success)
+    low, high = stats.wilson_interval(int(outcome.success.sum()), trials)
+    result = {
+        "episodes": trials,
+        "success_rate": float(outcome.success.mean()),
+        "success_low": low,
+        "success_high": high,
+        "reset_success_rate": float(outcome.reset_success.mean()),
+        "return_mean": float(outcome.ret.mean()),
+    }
+    console.print(
+        f"success {result['success_rate']:.3f} (95 % interval {low:.3f} to {high:.3f}, {trials} episodes);"
+        f" already at reset {result['reset_success_rate']:.3f}; mean return {result['return_mean']:.2f}",
+        soft_wrap=True,
+    )
+    return result
+
+
+def _row(progress: Progress, previous: Progress | None) -> dict[str, Any]:
+    """What the sinks take, in the order of metrics.csv."""
+    steps = progress.env_steps - (previous.env_steps if previous else 0)
+    updates = progress.updates - (previous.updates if previous else 0)
+    metrics = dict(progress.metrics)
+    return {
+        "epoch": progress.epoch,
+        "env_steps": progress.env_steps,
+        "updates": progress.updates,
+        "wall_seconds": progress.wall_seconds,
+        "success_rate": metrics.pop("success_rate"),
+        "return_mean": metrics.pop("return_mean"),
+        "reset_success_rate": metrics.pop("reset_success_rate"),
+        **metrics,
+        "steps_per_second": steps / progress.epoch_seconds,
+        "updates_per_second": updates / progress.epoch_seconds,
+    }
+
+
+def _check_count(field: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{field} must be an integer of at least 1; got {value}")
+
+
+def _engine_name(env: Any) -> str:
+    return getattr(getattr(env, "engine", None), "name", "none")
+
+
+def _versions() -> dict[str, str]:
+    from importlib import metadata
+
+    names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}

@@ -1,0 +1,46 @@
+"""How much memory there is to allocate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+
+
+def available_bytes() -> int | None:
+    """Bytes that the default device can still allocate, None where it does not tell.
+
+    On a CPU: the free memory of the machine, or of the container if that is less (Linux only).
+    """
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats()
+        return stats["bytes_limit"] - stats["bytes_in_use"] if stats and "bytes_limit" in stats else None
+    found = [amount for amount in (_meminfo_available(), _container_available()) if amount is not None]
+    return min(found, default=None)
+
+
+def format_bytes(amount: float) -> str:
+    """For a reader: "130.5 MB"."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if amount < 1000:
+            return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"
+        amount /= 1000
+    return f"{amount:.1f} TB"
+
+
+def _meminfo_available() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+def _container_available() -> int | None:
+    try:
+        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
+        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
+    except (OSError, ValueError):
+        return None
+    return None if limit == "max" else int(limit) - used

@@ -1,0 +1,131 @@
+"""A trained policy as a file, and as a function of NumPy arrays that needs nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher.run_folder import POLICY_FILE, RunFolderError, read_config
+
+_SCALARS = ("norm_clip", "obs_clip")
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A deterministic policy: normalize, four linear layers, tanh.
+
+    Call it with a mapping that has "observation" [..., D] and "desired_goal" [..., G] (others are ignored, so a gymnasium
+    goal environment's observation fits as it is); it returns actions [..., A] in [-1, 1], float32.
+    """
+
+    layers: tuple[tuple[Any, Any], ...]  # (kernel [in, out], bias [out]) of each linear layer
+    observation_mean: Any  # [D]
+    observation_std: Any  # [D] not below norm_eps
+    goal_mean: Any  # [G]
+    goal_std: Any  # [G]
+    norm_clip: float
+    obs_clip: float
+
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
+        """Actions [..., A] for observations of one state or a batch.
+
+        Raises:
+          ValueError: a key is missing, a last axis has the wrong size, or a value is not finite.
+        """
+        values = []
+        for key, mean in (("observation", self.observation_mean), ("desired_goal", self.goal_mean)):
+            if key not in obs:
+                raise ValueError(f"the policy needs {key!r}; got {sorted(obs)}")
+            value = np.asarray(obs[key], np.float32)
+            if value.ndim == 0 or value.shape[-1] != mean.shape[0]:
+                raise ValueError(f"{key} must end in an axis of {mean.shape[0]}; got shape {value.shape}")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{key} must be finite")
+            values.append(value)
+        if values[0].shape[:-1] != values[1].shape[:-1]:
+            raise ValueError(f"batch shapes differ: observation {values[0].shape}, desired_goal {values[1].shape}")
+        return self.forward(values[0], values[1], np)
+
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any:
+        """Actions for observations [..., D] and goals [..., G], in NumPy or (xp=jax.numpy) traced by JAX."""
+
+        def normalize(value, mean, std):
+            value = xp.clip(value, -self.obs_clip, self.obs_clip)
+            return xp.clip((value - mean) / std, -self.norm_clip, self.norm_clip)
+
+        x = xp.concatenate(
+            [
+                normalize(observation, self.observation_mean, self.observation_std),
+                normalize(goal, self.goal_mean, self.goal_std),
+            ],
+            axis=-1,
+        )
+        for index, (kernel, bias) in enumerate(self.layers):
+            x = x @ kernel + bias
+            if index < len(self.layers) - 1:
+                x = xp.maximum(x, 0)
+        return xp.tanh(x)
+
+    def save(self, path: Path) -> None:
+        """Writes the policy to `path`; what was there stays whole until the new file is."""
+        arrays = {f"layer{i}_{part}": a for i, l in enumerate(self.layers) for part, a in zip(("kernel", "bias"), l)}
+        for field in ("observation_mean", "observation_std", "goal_mean", "goal_std", *_SCALARS):
+            arrays[field] = np.asarray(getattr(self, field), np.float32)
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez(file, **arrays)
+        partial.replace(path)
+
+
+def from_learner(learner: Any, hparams: Any) -> Policy:
+    """The policy of a `DDPGState` under `HParams`, with normalizers folded in."""
+    dense = learner.params.actor["params"]
+    layers = tuple(
+        (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
+    )
+
+    def std(norm):
+        return np.maximum(np.sqrt(np.asarray(norm.var)), np.float32(hparams.norm_eps))
+
+    return Policy(
+        layers=layers,
+        observation_mean=np.asarray(learner.observation_norm.mean),
+        observation_std=std(learner.observation_norm),
+        goal_mean=np.asarray(learner.goal_norm.mean),
+        goal_std=std(learner.goal_norm),
+        norm_clip=float(hparams.norm_clip),
+        obs_clip=float(hparams.obs_clip),
+    )
+
+
+def load_policy(run_dir: str | Path) -> Policy:
+    """The policy of a run folder. Imports NumPy only: no JAX, no MuJoCo, no environment.
+
+    Raises:
+      RunFolderError: `run_dir` is no run folder of this program, or its policy is missing or damaged.
+    """
+    run_dir = Path(run_dir)
+    read_config(run_dir)
+    path = run_dir / POLICY_FILE
+    if not path.is_file():
+        raise RunFolderError(f"{path} is missing: the run was stopped before its first epoch ended")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        num_layers = sum(name.endswith("_kernel") for name in arrays)
+        return Policy(
+            layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
+            observation_mean=arrays["observation_mean"],
+            observation_std=arrays["observation_std"],
+            goal_mean=arrays["goal_mean"],
+            goal_std=arrays["goal_std"],
+            norm_clip=float(arrays["norm_clip"]),
+            obs_clip=float(arrays["obs_clip"]),
+        )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise RunFolderError(f"{path} is damaged or not a policy of this program ({error})") from error

@@ -1,0 +1,102 @@
+"""A run on disk: config.json, metrics.csv, policy.npz, result.json."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+from mjx_dher.config import Config, HParams
+
+SCHEMA = 1
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.csv"
+POLICY_FILE = "policy.npz"
+RESULT_FILE = "result.json"
+
+
+class RunFolderError(ValueError):
+    """A folder that is no run of this program, is damaged, or must not be written to."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """What a run was started with."""
+
+    config: Config
+    hparams: HParams
+    seed: int
+    engine: str  # the one that ran, where config.engine may say auto
+
+
+def choose(out: Path | None, config: Config, seed: int) -> Path:
+    """The folder a new run will be written to: `out`, else a fresh one under runs/. Nothing is created.
+
+    Raises:
+      RunFolderError: `out` is there already and not an empty folder.
+    """
+    if out is None:
+        now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+        name = f"{config.env.replace(':', '-')}-{config.sampler}-s{seed}-{now}"
+        paths = (Path("runs") / (name + suffix) for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
+        return next(path for path in paths if not path.exists())
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RunFolderError(f"out: {out} is there already and is never overwritten; name a new or empty folder")
+    return out
+
+
+def create(path: Path, run: RunConfig, extra: dict[str, Any]) -> None:
+    """Makes the folder and writes config.json; `extra` is added to it for the reader (versions, machine)."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"out: cannot create {path} ({error.strerror})") from error
+    content = {
+        "schema": SCHEMA,
+        "seed": run.seed,
+        "engine": run.engine,
+        "config": dataclasses.asdict(run.config),
+        "hparams": run.hparams._asdict(),
+        **extra,
+    }
+    write_json(path / CONFIG_FILE, content)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes `content`; what was there stays whole until the new file is."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.replace(path)
+
+
+def read_config(path: Path) -> RunConfig:
+    """What the run in `path` was started with.
+
+    Raises:
+      RunFolderError: no run folder, or one of another schema; the message says which.
+    """
+    file = path / CONFIG_FILE
+    if not path.is_dir():
+        raise RunFolderError(f"{path} is not a run folder: no such folder")
+    try:
+        content = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise RunFolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{file} cannot be read ({error})") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        found = content.get("schema") if isinstance(content, dict) else None
+        raise RunFolderError(f"{file} is not of this program's schema {SCHEMA} (found {found!r})")
+    try:
+        config = dict(content["config"])
+        config["hidden_sizes"] = tuple(config["hidden_sizes"])
+        return RunConfig(
+            config=Config(**config),
+            hparams=HParams(**content["hparams"]),
+            seed=int(content["seed"]),
+            engine=str(content["engine"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunFolderError(f"{file} does not describe a run ({error})") from error

@@ -1,0 +1,8 @@
+"""`python train.py --help`"""
+
+import sys
+
+from mjx_dher.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())
