@@ -26,7 +26,7 @@ class MjxEngine:
 
     name = "jax"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 4, ls_iterations: int = 8):
+    def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 4, ls_iterations: int = 5):
         model = copy.copy(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations

@@ -1,0 +1,19 @@
+"""Fixtures shared by the tests; run from a checkout, installed or not."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+
+@pytest.fixture(scope="session")
+def recorded():
+    """Episodes of the original FetchPush; see tests/data/README.md."""
+    with np.load(ROOT / "tests" / "data" / "fetch_push.npz") as file:
+        return {name: file[name] for name in file.files}

@@ -1,0 +1,153 @@
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher import ddpg
+from mjx_dher.config import HParams
+from mjx_dher.ddpg import Networks, Params
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.types import Batch
+
+HP = HParams(gamma=0.5, action_l2=0.25)
+
+
+class LinearActor(nn.Module):
+    """tanh(w * observation): one number in, one out."""
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        return jnp.tanh(self.param("w", nn.initializers.constant(1.0), ()) * observation)
+
+
+class LinearCritic(nn.Module):
+    """a * observation + b * goal + c * action."""
+
+    @nn.compact
+    def __call__(self, observation, goal, action):
+        abc = self.param("abc", lambda _: jnp.array([-0.5, 0.25, 0.5]))
+        return (abc[0] * observation + abc[1] * goal + abc[2] * action)[..., 0]
+
+
+NETWORKS = Networks(actor=LinearActor(), critic=LinearCritic())
+
+
+@pytest.fixture
+def state():
+    return ddpg.init(jax.random.key(0), NETWORKS, 1, 1, 1)
+
+
+BATCH = Batch(
+    observation=jnp.array([[1.0], [0.0]]),
+    next_observation=jnp.array([[0.0], [2.0]]),
+    desired_goal=jnp.array([[-1.0], [-4.0]]),
+    action=jnp.array([[1.0], [-1.0]]),
+    reward=jnp.array([-1.0, 0.0]),
+)
+
+
+def test_target_value_by_hand(state):
+    # Q' of the next states: -0.5 * 0 - 0.25 + 0.5 * tanh(0) = -0.25 and -1 - 1 + 0.5 * tanh(2).
+    q = np.array([-0.25, -2 + 0.5 * np.tanh(2)])
+    got = ddpg.target_value(NETWORKS, state.target, BATCH, HP)
+    np.testing.assert_allclose(got, [-1 + 0.5 * q[0], 0.5 * q[1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
+def test_target_value_is_clipped_to_what_returns_can_be(state, reward, clipped):
+    batch = BATCH.replace(reward=jnp.full(2, reward))
+    np.testing.assert_allclose(ddpg.target_value(NETWORKS, state.target, batch, HP), [clipped, clipped])
+
+
+def test_losses_by_hand(state):
+    # Q of the batch: -0.5 - 0.25 + 0.5 = -0.25 and 0 - 1 - 0.5 = -1.5.
+    loss, q_mean = ddpg.critic_loss(NETWORKS, state.params.critic, BATCH, jnp.array([-1.25, -1.0]))
+    np.testing.assert_allclose([loss, q_mean], [(1 + 0.25) / 2, -0.875], rtol=1e-6)
+    # pi: tanh(1) and 0; Q: -0.75 + tanh(1) / 2 and -1.
+    a = np.tanh(1.0)
+    loss = ddpg.actor_loss(NETWORKS, state.params.actor, state.params.critic, BATCH, HP)
+    np.testing.assert_allclose(loss, -((-0.75 + a / 2) - 1) / 2 + 0.25 * a * a / 2, rtol=1e-6)
+
+
+def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
+    updated, losses = ddpg.update(NETWORKS, state, BATCH, HP._replace(critic_lr=0.1, actor_lr=0.01))
+    target = ddpg.target_value(NETWORKS, state.target, BATCH, HP)
+    c_grad = jax.grad(lambda p: ddpg.critic_loss(NETWORKS, p, BATCH, target)[0])(state.params.critic)
+    a_grad = jax.grad(lambda p: ddpg.actor_loss(NETWORKS, p, state.params.critic, BATCH, HP))(state.params.actor)
+    # Adam's first step moves each parameter by the step size, against the sign of its gradient.
+    for new, old, grad, lr in (
+        (updated.params.critic, state.params.critic, c_grad, 0.1),
+        (updated.params.actor, state.params.actor, a_grad, 0.01),
+    ):
+        jax.tree.map(lambda n, o, g, lr=lr: np.testing.assert_allclose(n, o - lr * np.sign(g), rtol=1e-4), new, old, grad)
+    jax.tree.map(np.testing.assert_array_equal, updated.target, state.target)
+    assert updated.num_updates == 1
+    np.testing.assert_allclose(losses.q_mean, -0.875, rtol=1e-6)
+
+
+def test_update_normalizes_what_the_networks_see(state):
+    state = ddpg.update_normalizers(state, jnp.array([[-2.0], [6.0]]), jnp.array([[1.0], [1.0]]), HP)
+    np.testing.assert_allclose(state.observation_norm.mean, [2.0])
+    action = ddpg.act(NETWORKS, state, {"observation": jnp.array([4.0]), "desired_goal": jnp.array([1.0])}, HP)
+    np.testing.assert_allclose(action, [np.tanh(0.5)], rtol=1e-6)  # (4 - 2) / 4
+    _, losses = ddpg.update(NETWORKS, state, BATCH, HP)
+    # Observations (1 - 2) / 4 and -2 / 4; goals (-1 - 1) / 0.01 and -5 / 0.01, both clipped to -5.
+    q = [-0.5 * -0.25 + 0.25 * -5 + 0.5, -0.5 * -0.5 + 0.25 * -5 - 0.5]
+    np.testing.assert_allclose(losses.q_mean, np.mean(q), rtol=1e-6)
+
+
+def test_soft_update(state):
+    moved = state.replace(params=jax.tree.map(lambda x: x + 1.0, state.params))
+    target = ddpg.update_target(moved, HP._replace(polyak=0.75)).target
+    jax.tree.map(lambda new, old: np.testing.assert_allclose(new, old + 0.25, rtol=1e-6), target, state.target)
+
+
+def test_exploration_is_a_mixture_of_uniform_and_clipped_gaussian():
+    policy = jnp.tile(jnp.array([0.0, 0.9]), (100_000, 1))
+    key = jax.random.key(1)
+    noisy = ddpg.explore(key, policy, HParams(random_eps=0.0, noise_std=0.2))
+    assert abs(float(noisy[:, 0].std()) - 0.2) < 0.002
+    assert abs(float(noisy[:, 0].mean())) < 0.002
+    assert float(noisy.max()) == 1.0
+    uniform = ddpg.explore(key, policy, HParams(random_eps=1.0, noise_std=0.2))
+    assert abs(float(uniform.mean())) < 0.005
+    assert abs(float(uniform.std()) - 1 / np.sqrt(3)) < 0.005
+    mixed = ddpg.explore(key, policy, HParams(random_eps=0.3, noise_std=0.0))
+    random_rows = ~np.asarray(mixed == policy).all(-1)
+    assert abs(random_rows.mean() - 0.3) < 0.006
+    np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), random_rows)  # a row is random as a whole
+
+
+def test_paper_networks():
+    actor, critic = Actor(4), Critic()
+    obs, goal, action = jnp.zeros((7, 25)), jnp.zeros((7, 3)), jnp.zeros((7, 4))
+    actor_params = actor.init(jax.random.key(0), obs, goal)
+    critic_params = critic.init(jax.random.key(1), obs, goal, action)
+    assert actor.apply(actor_params, obs, goal).shape == (7, 4)
+    assert critic.apply(critic_params, obs, goal, action).shape == (7,)
+
+    def kernels(params):
+        return [params["params"][f"Dense_{i}"]["kernel"].shape for i in range(4)]
+
+    assert kernels(actor_params) == [(28, 256), (256, 256), (256, 256), (256, 4)]
+    assert kernels(critic_params) == [(32, 256), (256, 256), (256, 256), (256, 1)]
+    assert float(jnp.abs(actor.apply(actor_params, obs + 1e6, goal)).max()) <= 1.0
+
+
+def test_critic_learns_a_known_value():
+    """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma), whatever the action."""
+    networks = Networks(actor=Actor(1, (16,)), critic=Critic((16,)))
+    state = ddpg.init(jax.random.key(0), networks, 1, 1, 1)
+    hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.01)
+    ones = jnp.ones((32, 1))
+
+    @jax.jit
+    def step(state, key):
+        action = jax.random.uniform(key, (32, 1), minval=-1, maxval=1)
+        state, losses = ddpg.update(networks, state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+        return ddpg.update_target(state, hparams), losses
+
+    state, losses = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
+    np.testing.assert_allclose(losses.q_mean[-100:].mean(), -5.0, atol=0.1)
+    assert isinstance(state.params, Params)

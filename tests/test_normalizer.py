@@ -1,0 +1,46 @@
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher import normalizer
+
+
+def test_moments_are_those_of_all_values():
+    rng = np.random.default_rng(0)
+    batches = [rng.normal([1.3, -50, 0], [0.05, 2, 0], (n, 5, 3)).astype(np.float32) for n in (1, 7, 100, 3)]
+    state = normalizer.init(3)
+    for batch in batches:
+        state = normalizer.update(state, jnp.asarray(batch), 200.0)
+    values = np.concatenate(batches).reshape(-1, 3).astype(np.float64)
+    assert state.count == len(values)
+    np.testing.assert_allclose(state.mean, values.mean(0), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(state.var, values.var(0), rtol=1e-4, atol=1e-9)
+
+
+def test_no_cancellation_after_many_batches():
+    """A narrow value far from zero, ten million samples: sums of squares in float32 would have lost the variance."""
+    rng = np.random.default_rng(1)
+    batch = jnp.asarray(rng.normal(100.0, 0.01, (1000, 1)), jnp.float32)
+    state = normalizer.init(1).replace(count=jnp.array(1e7), mean=jnp.array([100.0]), var=jnp.array([1e-4]))
+    for _ in range(50):
+        state = normalizer.update(state, batch, 200.0)
+    np.testing.assert_allclose(state.var, [1e-4], rtol=0.02)
+
+
+def test_normalize_by_hand():
+    state = normalizer.NormalizerState(
+        count=jnp.array(4.0), mean=jnp.array([1.0, 0.0, 0.0]), var=jnp.array([4.0, 1e-8, 1.0])
+    )
+    got = normalizer.normalize(state, jnp.array([[3.0, 0.02, 1000.0]]), eps=0.01, clip=5.0, input_clip=4.5)
+    # (3 - 1) / 2; 0.02 / max(1e-4, 0.01); 1000 clipped to 4.5
+    np.testing.assert_allclose(got, [[1.0, 2.0, 4.5]], rtol=1e-6)
+    got = normalizer.normalize(state, jnp.array([[99.0, -9.0, 0.0]]), eps=0.01, clip=5.0, input_clip=200.0)
+    np.testing.assert_allclose(got, [[5.0, -5.0, 0.0]])
+
+
+def test_values_are_clipped_before_they_count():
+    state = normalizer.update(normalizer.init(1), jnp.array([[1e9], [0.0]]), 200.0)
+    np.testing.assert_allclose(state.mean, [100.0])
+
+
+def test_nothing_seen_is_the_identity():
+    np.testing.assert_allclose(normalizer.normalize(normalizer.init(2), jnp.array([0.5, -2.0]), 0.01, 5.0, 200.0), [0.5, -2])

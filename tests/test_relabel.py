@@ -1,0 +1,89 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Clock
+
+from mjx_dher import config, replay, samplers
+from mjx_dher.config import HParams
+from mjx_dher.relabel import hindsight_goals, relabel
+from mjx_dher.rollout import rollout
+
+HP = HParams()
+ENV = Clock(episode_length=12)
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """Episodes of a random walk: no two achieved goals are alike, but for the origin where all begin."""
+
+    def policy(key, obs):
+        return jax.random.normal(key, (*obs["desired_goal"].shape[:-1], 2))
+
+    episodes, _ = rollout(ENV, policy, jax.random.key(0), 64)
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 80), episodes)
+
+
+def index_of(goal, episode_goals):
+    """[B] where each goal stands in its episode, -1 if nowhere."""
+    equal = np.all(np.asarray(episode_goals) == np.asarray(goal)[:, None], axis=-1)
+    return np.where(equal.any(-1), equal.argmax(-1), -1)
+
+
+@pytest.mark.parametrize("name", config.SAMPLERS)
+def test_goals_come_from_where_the_sampler_may_look(ring, name):
+    sample = replay.sample(ring, jax.random.key(1), 5000)
+    goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(2))
+    index, step = index_of(goals, sample.episode_goals), np.asarray(sample.step)
+    if name == "random":
+        anywhere = np.asarray(ring.episodes.achieved_goal[:64]).reshape(-1, 2)
+        assert set(map(tuple, np.asarray(goals))) <= set(map(tuple, anywhere))
+        assert (index == -1).mean() > 0.9  # 63 of 64 come from another episode
+        return
+    assert np.all(index >= 0), "a goal that is not of the transition's own episode"
+    if name == "episode":
+        assert np.any(index <= step)
+    elif name == "final":
+        assert np.all(index == ENV.episode_length)
+    else:
+        assert np.all(index > step), "a future goal must be strictly later than the step"
+        assert np.any(index == step + 1)
+
+
+@pytest.mark.parametrize("k", [0.0, 1.0, 4.0])
+def test_relabelled_share(ring, k):
+    sample = replay.sample(ring, jax.random.key(3), 20_000)
+    batch = relabel(ring, sample, samplers.make("future"), ENV.compute_reward, HP._replace(her_k=k), jax.random.key(4))
+    kept = np.all(np.asarray(batch.desired_goal == sample.desired_goal), axis=-1)
+    expected = k / (k + 1)
+    assert abs((1 - kept.mean()) - expected) <= 4 * np.sqrt(expected * (1 - expected) / 20_000)
+
+
+def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
+    count = 1_000_000
+
+    @jax.jit
+    def draw(key):
+        keys = jax.random.split(key, 3)
+        sample = replay.sample(ring, keys[0], count)
+        return sample, relabel(ring, sample, samplers.make("weighted"), ENV.compute_reward, HP, keys[1])
+
+    sample, batch = draw(jax.random.key(5))
+    achieved = np.asarray(batch.next_observation)  # the probe observes just its achieved goal
+    distance = np.linalg.norm(achieved - np.asarray(batch.desired_goal), axis=-1)
+    sure = np.abs(distance - 0.1) > 1e-6  # float32 may fall on either side at the threshold itself
+    np.testing.assert_array_equal(np.asarray(batch.reward)[sure], np.where(distance > 0.1, -1.0, 0.0)[sure])
+    assert sure.mean() > 0.9999
+    assert 0.01 < np.mean(np.asarray(batch.reward) == 0) < 0.99
+    np.testing.assert_array_equal(batch.action, sample.action)
+    np.testing.assert_array_equal(batch.observation, sample.observation)
+
+
+def test_weighted_prefers_goals_near_the_desired_one(ring):
+    sample = replay.sample(ring, jax.random.key(6), 20_000)
+
+    def mean_distance(name):
+        goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(7))
+        return float(jnp.mean(jnp.linalg.norm(goals - sample.desired_goal, axis=-1)))
+
+    assert mean_distance("closest") < mean_distance("epsilon_closest") < mean_distance("weighted") < mean_distance("future")

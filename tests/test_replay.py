@@ -1,0 +1,84 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher import replay
+from mjx_dher.types import Episode
+
+T = 4
+
+
+def make_episodes(ids, num_steps=T):
+    """Episodes in which every number says whose it is: episode id x 1000 + step (the goal: id x 1000 + 500)."""
+    base = jnp.asarray(ids, jnp.float32)[:, None, None] * 1000
+    steps = base + jnp.arange(num_steps + 1, dtype=jnp.float32)[None, :, None]
+    return Episode(
+        observation={"vector": jnp.tile(steps, (1, 1, 3)), "scalar": steps[..., 0]},
+        achieved_goal=jnp.tile(steps, (1, 1, 2)),
+        desired_goal=jnp.tile(base[:, 0] + 500, (1, 2)),
+        action=steps[:, :-1],
+    )
+
+
+def make_ring(num_rows):
+    return replay.init(jax.tree.map(lambda x: x[0], make_episodes([0])), num_rows)
+
+
+@pytest.mark.parametrize(
+    ("num_rows", "num_new"), [(rows, new) for rows in (1, 2, 3, 5, 8) for new in (1, 2, 3, 5) if new <= rows]
+)
+def test_wrap_around_never_mixes_episodes(num_rows, num_new):
+    ring, added = make_ring(num_rows), 0
+    add = jax.jit(replay.add)
+    for _ in range(7):
+        ring = add(ring, make_episodes(np.arange(added, added + num_new)))
+        added += num_new
+        size = int(ring.size)
+        assert size == min(added, num_rows)
+        rows = ring.episodes
+        ids = np.asarray(rows.action[:size, 0, 0]) // 1000
+        # Exactly the newest episodes are there ...
+        assert sorted(ids) == list(range(added - size, added))
+        # ... each whole: every leaf of a row carries the row's id and its own step.
+        expected = make_episodes(ids)
+        jax.tree.map(lambda got, want: np.testing.assert_array_equal(got[:size], want), rows, expected)
+
+
+def test_samples_are_transitions_of_one_episode_and_cover_all():
+    ring = replay.add(make_ring(6), make_episodes([1, 2, 3]))  # half full: the empty rows must not be drawn
+    sample = replay.sample(ring, jax.random.key(0), 4000)
+    ids = np.asarray(sample.desired_goal[:, 0] - 500)
+    step = np.asarray(sample.step)
+    np.testing.assert_array_equal(sample.observation["vector"][:, 2], ids + step)
+    np.testing.assert_array_equal(sample.observation["scalar"], ids + step)
+    np.testing.assert_array_equal(sample.next_observation["vector"][:, 0], ids + step + 1)
+    np.testing.assert_array_equal(sample.action[:, 0], ids + step)
+    np.testing.assert_array_equal(sample.episode_goals[:, :, 1], ids[:, None] + np.arange(T + 1))
+    assert set(zip(ids // 1000, step)) == {(i, t) for i in (1, 2, 3) for t in range(T)}
+
+
+def test_can_sample_from_the_first_add_on():
+    ring = make_ring(2)
+    assert not replay.can_sample(ring)
+    assert replay.can_sample(replay.add(ring, make_episodes([7])))
+
+
+def test_nbytes_is_what_the_arrays_take():
+    template = jax.tree.map(lambda x: x[0], make_episodes([0]))
+    ring = replay.init(template, 11)
+    assert replay.nbytes(template, 11) == sum(leaf.nbytes for leaf in jax.tree.leaves(ring.episodes))
+    assert replay.capacity(ring) == 11
+
+
+def test_refuses_more_than_it_holds():
+    with pytest.raises(ValueError, match="cannot add 3 episodes at once to a ring of 2"):
+        replay.add(make_ring(2), make_episodes([1, 2, 3]))
+
+
+def test_refuses_an_empty_ring_and_lengths_that_disagree():
+    template = jax.tree.map(lambda x: x[0], make_episodes([0]))
+    with pytest.raises(ValueError, match="num_episodes must be at least 1; got 0"):
+        replay.init(template, 0)
+    with pytest.raises(ValueError, match=r"scalar.*T\+1 = 5"):
+        replay.init(template.replace(observation=template.observation | {"scalar": jnp.zeros(4)}), 2)
