@@ -72,9 +72,7 @@ class FetchEnv(GoalEnv):
         self.reward_type = reward_type
         self.distance_threshold = distance_threshold
         self.episode_length = episode_length
-        self.model = mujoco.MjModel.from_xml_string(
-            (resources.files("mjx_dher.envs") / "assets" / self.task.xml).read_text()
-        )
+        self.model = mujoco.MjModel.from_xml_string((resources.files("mjx_dher.envs") / "assets" / self.task.xml).read_text())
         self.engine = make_engine(engine, self.model, SUBSTEPS, **engine_options)
         self._grip_qpos, self._grip_qvel = _joint_slices(self.model, "grip_x", width=3)
         self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
@@ -87,9 +85,7 @@ class FetchEnv(GoalEnv):
         task = self.task
         return self.init_state(jnp.array(task.initial_grip_pos), object_qpos, self._sample_goal(goal_key))
 
-    def init_state(
-        self, grip_pos: Array, object_qpos: Array, desired_goal: Array, grip_vel: Array | None = None
-    ) -> State:
+    def init_state(self, grip_pos: Array, object_qpos: Array, desired_goal: Array, grip_vel: Array | None = None) -> State:
         """A given start, as for replaying a recorded episode.
 
         Args:
@@ -221,9 +217,7 @@ def matrix_to_euler(matrix: Array) -> Array:
     regular = cos_b > 4 * np.finfo(np.float32).eps
     a = jnp.where(regular, jnp.arctan2(-matrix[1, 2], matrix[2, 2]), 0.0)
     b = jnp.arctan2(matrix[0, 2], cos_b)
-    c = jnp.where(
-        regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1])
-    )
+    c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
     return jnp.stack([a, b, c])
 
 

@@ -77,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def train_command(argv: list[str], console: Console) -> int:
+    """`train`: trains a policy and writes a run folder."""
     args = parse_train_args(argv)
     folder = run_folder.choose(args.out, args.config, args.seed)
     run = _Training(args, folder, console)
@@ -182,6 +183,7 @@ class _Training:
 
 
 def eval_command(argv: list[str], console: Console) -> int:
+    """`eval RUN`: evaluates the policy of a run folder."""
     args = tyro.cli(EvalArgs, prog="train.py eval", args=argv)
     _check_count("episodes", args.episodes)
     if args.engine is not None:

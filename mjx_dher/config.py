@@ -77,8 +77,12 @@ class HParams(NamedTuple):
     """Probability of a uniformly random action while exploring."""
     noise_std: float = 0.2
     """Standard deviation of the Gaussian noise on the other actions."""
+    random_hold: float = 1.0
+    """Steps that a random action, or the policy's turn, lasts on average; 1: each step tosses anew, as in the paper."""
     her_k: float = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
+    eventful_share: float = 0.0
+    """Share of each batch drawn from episodes that moved the achieved goal out of reach of where it was; 0 in the paper."""
     epsilon: float = 0.2
     """For epsilon_closest: probability of a uniform future goal instead of the closest."""
     temperature: float = 1.0
@@ -206,7 +210,9 @@ _HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
     "action_l2": (0, True, math.inf, False),
     "random_eps": (0, True, 1, True),
     "noise_std": (0, True, math.inf, False),
+    "random_hold": (1, True, math.inf, False),
     "her_k": (0, True, math.inf, False),
+    "eventful_share": (0, True, 1, True),
     "epsilon": (0, True, 1, True),
     "temperature": (0, False, math.inf, False),
     "obs_clip": (0, False, math.inf, False),

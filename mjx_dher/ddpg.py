@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import dataclasses
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -53,15 +54,11 @@ class Losses(NamedTuple):
     q_mean: Array  # mean Q value of the critic on the batch
 
 
-def init(
-    key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int
-) -> DDPGState:
+def init(key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int) -> DDPGState:
     """Fresh networks, targets equal to them, normalizers that have seen nothing."""
     actor_key, critic_key = jax.random.split(key)
     obs, goal, action = jnp.zeros(observation_size), jnp.zeros(goal_size), jnp.zeros(action_size)
-    params = Params(
-        actor=networks.actor.init(actor_key, obs, goal), critic=networks.critic.init(critic_key, obs, goal, action)
-    )
+    params = Params(actor=networks.actor.init(actor_key, obs, goal), critic=networks.critic.init(critic_key, obs, goal, action))
     return DDPGState(
         params=params,
         target=jax.tree.map(jnp.copy, params),
@@ -76,21 +73,50 @@ def act(networks: Networks, state: DDPGState, obs: GoalObs, hparams: HParams) ->
     """The policy's actions [..., A] in [-1, 1], without exploration."""
     observation = _normalize(state.observation_norm, obs["observation"], hparams)
     goal = _normalize(state.goal_norm, obs["desired_goal"], hparams)
-    return networks.actor.apply(state.params.actor, observation, goal)  # type: ignore[return-value]
+    return _pi(networks, state.params.actor, observation, goal)
 
 
-def explore(key: PRNGKey, action: Array, hparams: HParams) -> Array:
-    """`action` [N, A] with Gaussian noise, or, with probability `random_eps` a row, a uniformly random one instead."""
-    noise_key, uniform_key, coin_key = jax.random.split(key, 3)
-    noisy = jnp.clip(action + hparams.noise_std * jax.random.normal(noise_key, action.shape), -1.0, 1.0)
-    uniform = jax.random.uniform(uniform_key, action.shape, minval=-1.0, maxval=1.0)
-    coin = jax.random.uniform(coin_key, action.shape[:-1]) < hparams.random_eps
-    return jnp.where(coin[..., None], uniform, noisy)
+class Noise(NamedTuple):
+    """What exploration adds to the actions of whole episodes; drawn at once, because it does not depend on them."""
+
+    gaussian: Array  # [T, N, A] added to the policy's action
+    is_random: Array  # [T, N] where the policy's action gives way to a uniformly random one
+    uniform: Array  # [T, N, A] that one, in [-1, 1]
+
+
+def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
+    """Noise for `num_envs` episodes of `num_steps` steps.
+
+    A share `random_eps` of the actions is uniformly random. With `random_hold` = 1 each step tosses its own coin, as in the
+    original HER code line. With h > 1 a toss, and the random action if it comes to that, is kept for 1, 2, ... steps, h on
+    average (a geometric time): temporally extended epsilon-greedy exploration (Dabney et al. 2021). A random action
+    that lasts carries the gripper somewhere, and what is in the way along with it.
+    """
+    gaussian_key, uniform_key, coin_key, renew_key = jax.random.split(key, 4)
+    shape = (num_steps, num_envs)
+    gaussian = hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size))
+    uniform = jax.random.uniform(uniform_key, (*shape, action_size), minval=-1.0, maxval=1.0)
+    coin = jax.random.uniform(coin_key, shape) < hparams.random_eps
+    renew = jax.random.uniform(renew_key, shape) * hparams.random_hold < 1.0
+    # The step whose toss each step goes by: the last one renewed.
+    steps = jnp.arange(num_steps)[:, None]
+    source = jax.lax.cummax(jnp.where(renew, steps, 0), axis=0)
+    return Noise(
+        gaussian=gaussian,
+        is_random=jnp.take_along_axis(coin, source, axis=0),
+        uniform=jnp.take_along_axis(uniform, source[..., None], axis=0),
+    )
+
+
+def explore(noise: Noise, action: Array) -> Array:
+    """`action` [N, A] with the noise of one step (leaves lead with [N])."""
+    return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
 
 
 def update_normalizers(state: DDPGState, observation: Array, goal: Array, hparams: HParams) -> DDPGState:
     """The state after its normalizers saw observations [..., D] and goals [..., G]."""
-    return state.replace(  # type: ignore[attr-defined]
+    return dataclasses.replace(
+        state,
         observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip),
         goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip),
     )
@@ -101,42 +127,42 @@ def target_value(networks: Networks, target: Params, batch: Batch, hparams: HPar
 
     Episodes end by the clock alone, so every next state has a value.
     """
-    next_action = networks.actor.apply(target.actor, batch.next_observation, batch.desired_goal)
-    next_q = networks.critic.apply(target.critic, batch.next_observation, batch.desired_goal, next_action)
+    next_action = _pi(networks, target.actor, batch.next_observation, batch.desired_goal)
+    next_q = _q(networks, target.critic, batch.next_observation, batch.desired_goal, next_action)
     return jnp.clip(batch.reward + hparams.gamma * next_q, -1.0 / (1.0 - hparams.gamma), 0.0)
 
 
 def critic_loss(networks: Networks, critic: PyTree, batch: Batch, target: Array) -> tuple[Array, Array]:
     """Mean squared difference of Q to `target` [B], and the mean Q. `batch` is normalized."""
-    q = networks.critic.apply(critic, batch.observation, batch.desired_goal, batch.action)
+    q = _q(networks, critic, batch.observation, batch.desired_goal, batch.action)
     return jnp.mean(jnp.square(q - target)), jnp.mean(q)
 
 
 def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, hparams: HParams) -> Array:
     """Minus the mean Q of the policy's actions plus `action_l2` times their mean square. `batch` is normalized."""
-    action = networks.actor.apply(actor, batch.observation, batch.desired_goal)
-    q = networks.critic.apply(critic, batch.observation, batch.desired_goal, action)
+    action = _pi(networks, actor, batch.observation, batch.desired_goal)
+    q = _q(networks, critic, batch.observation, batch.desired_goal, action)
     return -jnp.mean(q) + hparams.action_l2 * jnp.mean(jnp.square(action))
 
 
 def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Losses]:
     """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`."""
-    batch = batch.replace(  # type: ignore[attr-defined]
+    batch = dataclasses.replace(
+        batch,
         observation=_normalize(state.observation_norm, batch.observation, hparams),
         next_observation=_normalize(state.observation_norm, batch.next_observation, hparams),
         desired_goal=_normalize(state.goal_norm, batch.desired_goal, hparams),
     )
     params = state.params
     target = target_value(networks, state.target, batch, hparams)
-    (c_loss, q_mean), c_grad = jax.value_and_grad(
-        lambda critic: critic_loss(networks, critic, batch, target), has_aux=True
-    )(params.critic)
-    a_loss, a_grad = jax.value_and_grad(
-        lambda actor: actor_loss(networks, actor, params.critic, batch, hparams)
-    )(params.actor)
+    (c_loss, q_mean), c_grad = jax.value_and_grad(lambda critic: critic_loss(networks, critic, batch, target), has_aux=True)(
+        params.critic
+    )
+    a_loss, a_grad = jax.value_and_grad(lambda actor: actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
     critic, critic_opt = _adam_step(c_grad, state.opt_state.critic, params.critic, hparams.critic_lr)
     actor, actor_opt = _adam_step(a_grad, state.opt_state.actor, params.actor, hparams.actor_lr)
-    state = state.replace(  # type: ignore[attr-defined]
+    state = dataclasses.replace(
+        state,
         params=Params(actor=actor, critic=critic),
         opt_state=Params(actor=actor_opt, critic=critic_opt),
         num_updates=state.num_updates + 1,
@@ -147,7 +173,15 @@ def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams)
 def update_target(state: DDPGState, hparams: HParams) -> DDPGState:
     """Soft update: the targets keep a share `polyak` of themselves and take the rest from the networks."""
     target = optax.incremental_update(state.params, state.target, 1.0 - hparams.polyak)
-    return state.replace(target=target)  # type: ignore[attr-defined]
+    return dataclasses.replace(state, target=target)
+
+
+def _pi(networks: Networks, actor: PyTree, observation: Array, goal: Array) -> Array:
+    return cast(Array, networks.actor.apply(actor, observation, goal))
+
+
+def _q(networks: Networks, critic: PyTree, observation: Array, goal: Array, action: Array) -> Array:
+    return cast(Array, networks.critic.apply(critic, observation, goal, action))
 
 
 def _adam_step(grad: PyTree, opt_state: PyTree, params: PyTree, lr: Array | float) -> tuple[PyTree, PyTree]:

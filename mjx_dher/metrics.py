@@ -48,9 +48,7 @@ class ConsoleSink:
         self._num_epochs = num_epochs
         self._live: Progress | None = None
         if console.is_terminal:
-            self._live = Progress(
-                SpinnerColumn(), BarColumn(bar_width=20), TextColumn("{task.description}"), console=console
-            )
+            self._live = Progress(SpinnerColumn(), BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
             self._task = self._live.add_task("first epoch ...", total=num_epochs)
             self._live.start()
 

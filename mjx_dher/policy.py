@@ -73,7 +73,7 @@ class Policy:
 
     def save(self, path: Path) -> None:
         """Writes the policy to `path`; what was there stays whole until the new file is."""
-        arrays = {f"layer{i}_{part}": a for i, l in enumerate(self.layers) for part, a in zip(("kernel", "bias"), l)}
+        arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
         for field in ("observation_mean", "observation_std", "goal_mean", "goal_std", *_SCALARS):
             arrays[field] = np.asarray(getattr(self, field), np.float32)
         partial = path.with_suffix(".partial")

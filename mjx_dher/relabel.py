@@ -9,21 +9,27 @@ from mjx_dher import replay, samplers
 from mjx_dher.config import HParams
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.samplers import Sampler
-from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
+from mjx_dher.types import Array, Batch, Episode, PRNGKey, RewardFn
 
 
-def hindsight_goals(
-    state: ReplayState, sample: Sample, sampler: Sampler, hparams: HParams, key: PRNGKey
-) -> Array:
+def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparams: HParams, key: PRNGKey) -> Array:
     """[B, G] one achieved goal for each transition of `sample`, chosen by `sampler`."""
     pool_key, draw_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
     pool = replay.sample_episode_goals(state, pool_key, batch_size) if sampler.whole_ring else sample.episode_goals
-    log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(
-        pool, sample.desired_goal, sample.step, hparams
-    )
+    log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
     index = samplers.draw(draw_key, log_weights)
     return pool[jnp.arange(batch_size), index]
+
+
+def is_eventful(episodes: Episode, compute_reward: RewardFn) -> Array:
+    """[N] whether an episode's last achieved goal, as a goal, was not yet reached at its start.
+
+    Where it was, all hindsight goals are much the same, reached from the first step on, and say nothing of how to reach any.
+    Asking the environment's own (sparse) reward needs no scale and no threshold. Cf. the filter for misleading samples of
+    Manela & Biess 2021 and the energy-based prioritization of Zhao & Tresp 2018.
+    """
+    return compute_reward(episodes.achieved_goal[:, 0], episodes.achieved_goal[:, -1]) < 0
 
 
 def relabel(

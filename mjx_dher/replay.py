@@ -18,6 +18,7 @@ class ReplayState:
     """The ring and its write position."""
 
     episodes: Episode  # every leaf leads with [E]
+    eventful: Array  # [E] whether the episode is worth drawing more often, bool; see `draw_rows`
     cursor: Array  # [] row that is written next, int32
     size: Array  # [] rows that hold an episode, int32
 
@@ -49,6 +50,7 @@ def init(episode: Episode, num_episodes: int) -> ReplayState:
             raise ValueError(f"leaf {name} must lead with T+1 = {length + 1} (T actions); got shape {leaf.shape}")
     return ReplayState(
         episodes=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape), x.dtype), episode),
+        eventful=jnp.zeros(num_episodes, bool),
         cursor=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
     )
@@ -64,8 +66,13 @@ def capacity(state: ReplayState) -> int:
     return state.episodes.action.shape[0]
 
 
-def add(state: ReplayState, episodes: Episode) -> ReplayState:
+def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False) -> ReplayState:
     """The ring with `episodes` (leaves lead with [N]) written over its oldest.
+
+    Args:
+      state: the ring.
+      episodes: N of them.
+      eventful: [N], or one for all: whether an episode belongs to those that `draw_rows` can draw more often.
 
     Raises:
       ValueError: more episodes at once than the ring holds.
@@ -75,9 +82,8 @@ def add(state: ReplayState, episodes: Episode) -> ReplayState:
         raise ValueError(f"cannot add {num_new} episodes at once to a ring of {num_rows}")
     rows = (state.cursor + jnp.arange(num_new, dtype=jnp.int32)) % num_rows
     return ReplayState(
-        episodes=jax.tree.map(
-            lambda ring, new: ring.at[rows].set(new, unique_indices=True), state.episodes, episodes
-        ),
+        episodes=jax.tree.map(lambda ring, new: ring.at[rows].set(new, unique_indices=True), state.episodes, episodes),
+        eventful=state.eventful.at[rows].set(eventful, unique_indices=True),
         cursor=(state.cursor + num_new) % num_rows,
         size=jnp.minimum(state.size + num_new, num_rows),
     )
@@ -88,11 +94,36 @@ def can_sample(state: ReplayState) -> Array:
     return state.size > 0
 
 
-def sample(state: ReplayState, key: PRNGKey, batch_size: int) -> Sample:
-    """`batch_size` transitions, uniform over those in the ring, with replacement. The ring must not be empty."""
+def count_eventful(state: ReplayState) -> Array:
+    """[E] how many eventful episodes there are up to and with each row, int32. `draw_rows` takes it, so that a loop of draws
+    from one ring makes it once.
+    """
+    return jnp.cumsum(state.eventful, dtype=jnp.int32)
+
+
+def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, eventful_share: Array | float, counts: Array) -> Array:
+    """[B] rows of the ring: with probability `eventful_share` one of the eventful episodes, else any; uniform among each.
+
+    While there is no eventful episode, any. `counts` is `count_eventful(state)`. The ring must not be empty.
+    """
+    any_key, rank_key, coin_key = jax.random.split(key, 3)
+    total = counts[-1]
+    rank = jax.random.randint(rank_key, (batch_size,), 1, jnp.maximum(total, 1) + 1)
+    eventful = jnp.searchsorted(counts, rank).astype(jnp.int32)
+    anyone = jax.random.randint(any_key, (batch_size,), 0, state.size)
+    coin = jax.random.uniform(coin_key, (batch_size,)) < eventful_share
+    return jnp.where(coin & (total > 0), eventful, anyone)
+
+
+def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
+    """`batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
+
+    Without `rows`, uniform over all transitions in the ring, which must not be empty.
+    """
     row_key, step_key = jax.random.split(key)
+    if rows is None:
+        rows = jax.random.randint(row_key, (batch_size,), 0, state.size)
     num_steps = state.episodes.action.shape[1]
-    rows = jax.random.randint(row_key, (batch_size,), 0, state.size)
     steps = jax.random.randint(step_key, (batch_size,), 0, num_steps)
     episodes = state.episodes
     return Sample(

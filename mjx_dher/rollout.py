@@ -8,10 +8,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey
+from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree
 
-# policy(key, obs with leading [N]) -> actions [N, A]
-PolicyFn = Callable[[PRNGKey, GoalObs], Array]
+# policy(noise of one step, obs with leading [N]) -> actions [N, A]
+PolicyFn = Callable[[PyTree, GoalObs], Array]
 
 
 class Outcome(NamedTuple):
@@ -22,24 +22,28 @@ class Outcome(NamedTuple):
     ret: Array  # undiscounted sum of rewards
 
 
-def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int) -> tuple[Episode, Outcome]:
+def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, noise: PyTree = None) -> tuple[Episode, Outcome]:
     """`num_envs` episodes side by side.
+
+    Args:
+      env: an unbatched environment.
+      policy: called with one step of `noise` and the observations of all environments.
+      key: of the first states.
+      num_envs: episodes, N.
+      noise: a pytree whose leaves lead with [T]; None for a policy that takes none.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
     """
-    reset_key, policy_key = jax.random.split(key)
-    first = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
+    first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
 
-    def step(state, step_key):
-        action = policy(step_key, state.obs)
+    def step(state, noise):
+        action = policy(noise, state.obs)
         following = jax.vmap(env.step)(state, action)
         played = (state.obs["observation"], state.obs["achieved_goal"], action, following.reward)
         return following, played
 
-    last, (observation, achieved_goal, action, reward) = jax.lax.scan(
-        step, first, jax.random.split(policy_key, env.episode_length)
-    )
+    last, (observation, achieved_goal, action, reward) = jax.lax.scan(step, first, noise, length=env.episode_length)
 
     def whole(steps, end):  # [T, N, ...] and [N, ...] -> [N, T+1, ...]
         return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)

@@ -70,18 +70,14 @@ def final(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Arr
     return _uniform(jnp.arange(achieved.shape[0]) == achieved.shape[0] - 1)
 
 
-def closest(
-    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position
-) -> Array:
+def closest(achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position) -> Array:
     """The future goal nearest to the desired one (the paper's method 1); equally near ones share."""
     del hparams
     distance = jnp.where(future_mask(achieved.shape[0], step), metric(achieved, desired), jnp.inf)
     return _uniform(distance == jnp.min(distance))
 
 
-def epsilon_closest(
-    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position
-) -> Array:
+def epsilon_closest(achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position) -> Array:
     """With probability `epsilon` any future goal, else the closest (the paper's method 2)."""
     any_future = jax.nn.softmax(future(achieved, desired, step, hparams))
     nearest = jax.nn.softmax(closest(achieved, desired, step, hparams, metric))

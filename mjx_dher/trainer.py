@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import concurrent.futures
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,10 @@ from mjx_dher import ddpg, evaluate, memory, replay, samplers
 from mjx_dher.config import Config, HParams
 from mjx_dher.ddpg import DDPGState, Losses, Networks
 from mjx_dher.networks import Actor, Critic
-from mjx_dher.relabel import relabel
+from mjx_dher.relabel import is_eventful, relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, PRNGKey
+from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey
 
 
 @struct.dataclass
@@ -51,16 +52,15 @@ def make_train(env: Env, config: Config) -> Train:
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
     and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
-    evaluation; train_success_rate and train_return_mean of the exploring policy; critic_loss, actor_loss and q_mean.
+    evaluation; train_success_rate and train_return_mean of the exploring policy, and the eventful_share of its episodes;
+    critic_loss, actor_loss and q_mean.
 
     Raises:
       ValueError: a Config that cannot run, or an observation that is not one vector.
     """
     config_lib.validate(config, HParams(), env.episode_length)
     sampler = samplers.make(config.sampler, config.weight_kernel, config.metric)
-    networks = Networks(
-        actor=Actor(env.action_size, config.hidden_sizes), critic=Critic(config.hidden_sizes)
-    )
+    networks = Networks(actor=Actor(env.action_size, config.hidden_sizes), critic=Critic(config.hidden_sizes))
     template = episode_template(env)
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
     updates_per_target = config.target_period
@@ -82,21 +82,23 @@ def make_train(env: Env, config: Config) -> Train:
             env_steps=jnp.zeros((), jnp.int32),
         )
 
-    def draw_batch(ring: ReplayState, hparams: HParams, key: PRNGKey, batch_size: int) -> Batch:
-        sample_key, relabel_key = jax.random.split(key)
-        sample = replay.sample(ring, sample_key, batch_size)
-        return relabel(ring, sample, sampler, env.compute_reward, hparams, relabel_key)
-
     def see(learner: DDPGState, episodes: Episode, hparams: HParams, key: PRNGKey) -> DDPGState:
         """Shows the new episodes to the normalizers, with goals distributed as the learner will meet them."""
         num_new, num_steps = episodes.action.shape[:2]
         fresh = replay.add(replay.init(template, num_new), episodes)
-        batch = draw_batch(fresh, hparams, key, num_new * num_steps)
+        sample_key, relabel_key = jax.random.split(key)
+        sample = replay.sample(fresh, sample_key, num_new * num_steps)
+        batch = relabel(fresh, sample, sampler, env.compute_reward, hparams, relabel_key)
         return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams)
 
     def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
+        counts = replay.count_eventful(ring)
+
         def update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
-            batch = draw_batch(ring, hparams, key, config.batch_size)
+            row_key, sample_key, relabel_key = jax.random.split(key, 3)
+            rows = replay.draw_rows(ring, row_key, config.batch_size, hparams.eventful_share, counts)
+            sample = replay.sample(ring, sample_key, config.batch_size, rows)
+            batch = relabel(ring, sample, sampler, env.compute_reward, hparams, relabel_key)
             return ddpg.update(networks, learner, batch, hparams)
 
         def update_with_target(learner: DDPGState, keys: PRNGKey) -> tuple[DDPGState, Losses]:
@@ -108,19 +110,22 @@ def make_train(env: Env, config: Config) -> Train:
         return learner, jax.tree.map(jnp.mean, losses)
 
     def cycle(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
-        key, rollout_key, see_key, learn_key = jax.random.split(state.key, 4)
+        key, rollout_key, noise_key, see_key, learn_key = jax.random.split(state.key, 5)
         hparams = state.hparams
 
-        def policy(key: PRNGKey, obs: GoalObs) -> Array:
-            return ddpg.explore(key, ddpg.act(networks, state.learner, obs, hparams), hparams)
+        def policy(noise: ddpg.Noise, obs: GoalObs) -> Array:
+            return ddpg.explore(noise, ddpg.act(networks, state.learner, obs, hparams))
 
-        episodes, outcome = rollout(env, policy, rollout_key, config.num_envs)
-        ring = replay.add(state.replay, episodes)
+        noise = ddpg.exploration_noise(noise_key, env.episode_length, config.num_envs, env.action_size, hparams)
+        episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise)
+        eventful = is_eventful(episodes, env.compute_reward)
+        ring = replay.add(state.replay, episodes, eventful)
         learner = see(state.learner, episodes, hparams, see_key)
         learner, losses = learn(learner, ring, hparams, learn_key)
         metrics = {
             "train_success_rate": jnp.mean(outcome.success),
             "train_return_mean": jnp.mean(outcome.ret),
+            "eventful_share": jnp.mean(eventful),
             **losses._asdict(),
         }
         state = TrainState(
@@ -139,7 +144,7 @@ def make_train(env: Env, config: Config) -> Train:
             env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), eval_key, config.eval_episodes
         )
         metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles)
-        return state.replace(key=key), metrics  # type: ignore[attr-defined]
+        return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
 
@@ -155,7 +160,7 @@ def episode_template(env: Env) -> Episode:
     if not (hasattr(observation, "shape") and len(observation.shape) == 1):
         raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")
 
-    def repeat(x, times):
+    def repeat(x: Any, times: int) -> Any:
         return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
 
     num_steps = env.episode_length
@@ -163,7 +168,7 @@ def episode_template(env: Env) -> Episode:
         observation=repeat(observation, num_steps + 1),
         achieved_goal=repeat(obs["achieved_goal"], num_steps + 1),
         desired_goal=obs["desired_goal"],
-        action=jax.ShapeDtypeStruct((num_steps, env.action_size), jnp.float32),
+        action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
     )
 
 

@@ -103,20 +103,39 @@ def test_soft_update(state):
     jax.tree.map(lambda new, old: np.testing.assert_allclose(new, old + 0.25, rtol=1e-6), target, state.target)
 
 
+def make_noise(**hparams):
+    return ddpg.exploration_noise(jax.random.key(1), 100, 1000, 2, HParams(**hparams))
+
+
 def test_exploration_is_a_mixture_of_uniform_and_clipped_gaussian():
-    policy = jnp.tile(jnp.array([0.0, 0.9]), (100_000, 1))
-    key = jax.random.key(1)
-    noisy = ddpg.explore(key, policy, HParams(random_eps=0.0, noise_std=0.2))
-    assert abs(float(noisy[:, 0].std()) - 0.2) < 0.002
-    assert abs(float(noisy[:, 0].mean())) < 0.002
+    policy = jnp.tile(jnp.array([0.0, 0.9]), (100, 1000, 1))
+    noisy = ddpg.explore(make_noise(random_eps=0.0, noise_std=0.2), policy)
+    assert abs(float(noisy[..., 0].std()) - 0.2) < 0.002
+    assert abs(float(noisy[..., 0].mean())) < 0.002
     assert float(noisy.max()) == 1.0
-    uniform = ddpg.explore(key, policy, HParams(random_eps=1.0, noise_std=0.2))
+    uniform = ddpg.explore(make_noise(random_eps=1.0, noise_std=0.2), policy)
     assert abs(float(uniform.mean())) < 0.005
     assert abs(float(uniform.std()) - 1 / np.sqrt(3)) < 0.005
-    mixed = ddpg.explore(key, policy, HParams(random_eps=0.3, noise_std=0.0))
-    random_rows = ~np.asarray(mixed == policy).all(-1)
-    assert abs(random_rows.mean() - 0.3) < 0.006
-    np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), random_rows)  # a row is random as a whole
+    mixed = ddpg.explore(make_noise(random_eps=0.3, noise_std=0.0), policy)
+    is_random = ~np.asarray(mixed == policy).all(-1)
+    assert abs(is_random.mean() - 0.3) < 0.006
+    np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), is_random)  # an action is random as a whole
+
+
+def test_without_holding_every_step_tosses_its_own_coin():
+    is_random = np.asarray(make_noise(random_eps=0.3).is_random)
+    both = np.mean(is_random[1:] & is_random[:-1])
+    assert abs(both - 0.09) < 0.004
+
+
+def test_held_choices_last_as_long_as_they_should_and_keep_their_share():
+    noise = make_noise(random_eps=0.3, random_hold=5.0)
+    is_random, uniform = np.asarray(noise.is_random), np.asarray(noise.uniform)
+    assert abs(is_random.mean() - 0.3) < 0.02
+    # A choice is renewed with probability 1/5 a step; only then can the random action change.
+    changed = np.any(uniform[1:] != uniform[:-1], axis=-1)
+    assert abs(changed.mean() - 0.2) < 0.004
+    assert not np.any((is_random[1:] != is_random[:-1]) & ~changed)
 
 
 def test_paper_networks():

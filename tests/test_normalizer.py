@@ -27,9 +27,7 @@ def test_no_cancellation_after_many_batches():
 
 
 def test_normalize_by_hand():
-    state = normalizer.NormalizerState(
-        count=jnp.array(4.0), mean=jnp.array([1.0, 0.0, 0.0]), var=jnp.array([4.0, 1e-8, 1.0])
-    )
+    state = normalizer.NormalizerState(count=jnp.array(4.0), mean=jnp.array([1.0, 0.0, 0.0]), var=jnp.array([4.0, 1e-8, 1.0]))
     got = normalizer.normalize(state, jnp.array([[3.0, 0.02, 1000.0]]), eps=0.01, clip=5.0, input_clip=4.5)
     # (3 - 1) / 2; 0.02 / max(1e-4, 0.01); 1000 clipped to 4.5
     np.testing.assert_allclose(got, [[1.0, 2.0, 4.5]], rtol=1e-6)

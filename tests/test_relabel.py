@@ -2,12 +2,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Clock
 
 from mjx_dher import config, replay, samplers
 from mjx_dher.config import HParams
-from mjx_dher.relabel import hindsight_goals, relabel
+from mjx_dher.relabel import hindsight_goals, is_eventful, relabel
 from mjx_dher.rollout import rollout
+from mjx_dher.types import Episode
+from probes import Clock
 
 HP = HParams()
 ENV = Clock(episode_length=12)
@@ -17,10 +18,8 @@ ENV = Clock(episode_length=12)
 def ring():
     """Episodes of a random walk: no two achieved goals are alike, but for the origin where all begin."""
 
-    def policy(key, obs):
-        return jax.random.normal(key, (*obs["desired_goal"].shape[:-1], 2))
-
-    episodes, _ = rollout(ENV, policy, jax.random.key(0), 64)
+    steps = jax.random.normal(jax.random.key(0), (12, 64, 2))
+    episodes, _ = rollout(ENV, lambda step, obs: step, jax.random.key(0), 64, steps)
     return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 80), episodes)
 
 
@@ -77,6 +76,12 @@ def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
     assert 0.01 < np.mean(np.asarray(batch.reward) == 0) < 0.99
     np.testing.assert_array_equal(batch.action, sample.action)
     np.testing.assert_array_equal(batch.observation, sample.observation)
+
+
+def test_an_episode_is_eventful_if_it_left_where_it_began():
+    paths = jnp.array([[0.0, 0.5, 0.05], [0.0, 0.0, 0.3], [0.0, 0.0, 0.0]])[..., None] * jnp.array([1.0, 0.0])
+    episodes = Episode(paths, paths, jnp.ones((3, 2)), jnp.zeros((3, 2, 2)))
+    np.testing.assert_array_equal(is_eventful(episodes, ENV.compute_reward), [False, True, False])
 
 
 def test_weighted_prefers_goals_near_the_desired_one(ring):

@@ -42,7 +42,7 @@ def test_wrap_around_never_mixes_episodes(num_rows, num_new):
         assert sorted(ids) == list(range(added - size, added))
         # ... each whole: every leaf of a row carries the row's id and its own step.
         expected = make_episodes(ids)
-        jax.tree.map(lambda got, want: np.testing.assert_array_equal(got[:size], want), rows, expected)
+        jax.tree.map(lambda got, want, size=size: np.testing.assert_array_equal(got[:size], want), rows, expected)
 
 
 def test_samples_are_transitions_of_one_episode_and_cover_all():
@@ -82,3 +82,29 @@ def test_refuses_an_empty_ring_and_lengths_that_disagree():
         replay.init(template, 0)
     with pytest.raises(ValueError, match=r"scalar.*T\+1 = 5"):
         replay.init(template.replace(observation=template.observation | {"scalar": jnp.zeros(4)}), 2)
+
+
+def test_draw_rows_mixes_eventful_and_any():
+    ring = replay.add(make_ring(6), make_episodes([0, 1, 2, 3]), jnp.array([False, True, False, True]))
+    counts = replay.count_eventful(ring)
+    np.testing.assert_array_equal(counts, [0, 1, 1, 2, 2, 2])
+
+    def shares(ring, share):
+        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, share, replay.count_eventful(ring))
+        return np.bincount(rows, minlength=6) / 40_000
+
+    # Rows 1 and 3 are eventful; rows 4 and 5 are empty.
+    np.testing.assert_allclose(shares(ring, 0.0), [0.25, 0.25, 0.25, 0.25, 0, 0], atol=0.01)
+    np.testing.assert_allclose(shares(ring, 1.0), [0, 0.5, 0, 0.5, 0, 0], atol=0.01)
+    np.testing.assert_allclose(shares(ring, 0.6), [0.1, 0.4, 0.1, 0.4, 0, 0], atol=0.01)
+    # What is written over is no longer eventful, and without any eventful episode all are drawn alike.
+    ring = replay.add(ring, make_episodes([4, 5, 6, 7]), False)
+    np.testing.assert_allclose(shares(ring, 1.0), [0, 0, 0, 1, 0, 0], atol=0.01)
+    ring = replay.add(ring, make_episodes([8, 9]), False)
+    np.testing.assert_allclose(shares(ring, 1.0), np.full(6, 1 / 6), atol=0.01)
+
+
+def test_sample_takes_the_rows_it_is_given():
+    ring = replay.add(make_ring(6), make_episodes([1, 2, 3]))
+    sample = replay.sample(ring, jax.random.key(0), 4, jnp.array([2, 0, 2, 1]))
+    np.testing.assert_array_equal(sample.desired_goal[:, 0], [3500, 1500, 3500, 2500])

@@ -81,9 +81,7 @@ def test_closest_ties_share():
 def test_epsilon_bounds_are_closest_and_future():
     sampler = samplers.make("epsilon_closest")
     for epsilon, name in ((0.0, "closest"), (1.0, "future")):
-        np.testing.assert_allclose(
-            table(sampler, 0, HP._replace(epsilon=epsilon)), table(samplers.make(name), 0), atol=1e-6
-        )
+        np.testing.assert_allclose(table(sampler, 0, HP._replace(epsilon=epsilon)), table(samplers.make(name), 0), atol=1e-6)
 
 
 def test_custom_metric_and_kernel():

@@ -2,10 +2,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import PointMass
 
 from mjx_dher import Config, HParams, config, ddpg, make_train, trainer
 from mjx_dher.rollout import rollout
+from probes import PointMass
 
 ENV = PointMass()
 SMALL = Config(
@@ -36,15 +36,12 @@ LEARNS = Config(
 
 
 def test_rollout_keeps_every_observation():
-    def policy(key, obs):
-        return jax.random.uniform(key, (3, 2), minval=-1, maxval=1)
-
-    episodes, outcome = rollout(ENV, policy, jax.random.key(0), 3)
+    actions = jax.random.uniform(jax.random.key(1), (10, 3, 2), minval=-1, maxval=1)
+    episodes, outcome = rollout(ENV, lambda action, obs: action, jax.random.key(0), 3, actions)
+    np.testing.assert_array_equal(episodes.action, jnp.moveaxis(actions, 0, 1))
     assert episodes.observation.shape == (3, 11, 2)
     assert episodes.action.shape == (3, 10, 2)
-    np.testing.assert_allclose(
-        episodes.achieved_goal[:, 1:], episodes.achieved_goal[:, :-1] + 0.1 * episodes.action, atol=1e-6
-    )
+    np.testing.assert_allclose(episodes.achieved_goal[:, 1:], episodes.achieved_goal[:, :-1] + 0.1 * episodes.action, atol=1e-6)
     distance = jnp.linalg.norm(episodes.achieved_goal - episodes.desired_goal[:, None], axis=-1)
     np.testing.assert_array_equal(outcome.success, distance[:, -1] <= 0.1)
     np.testing.assert_array_equal(outcome.reset_success, distance[:, 0] <= 0.1)
@@ -61,7 +58,7 @@ def test_an_epoch_counts_what_it_does():
     assert state.learner.observation_norm.count == 4 * 3 * 11
     assert state.learner.goal_norm.count == 4 * 3 * 10
     assert set(metrics) == {
-        *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean"),
+        *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "eventful_share"),
         *("critic_loss", "actor_loss", "q_mean"),
     }
     assert all(value.shape == () and jnp.isfinite(value) for value in metrics.values())

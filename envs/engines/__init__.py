@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -34,11 +36,17 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
       model: the compiled MJCF, with exactly one mocap body.
       substeps: MuJoCo timesteps an environment step.
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver.
+
+    Raises:
+      ValueError: no such engine or option.
     """
-    if resolve_engine(name) == "native":
-        from mjx_dher.envs.engines.native import NativeEngine
-
-        return NativeEngine(model, substeps, **options)
-    from mjx_dher.envs.engines.mjx import MjxEngine
-
-    return MjxEngine(model, substeps, **options)
+    name = resolve_engine(name)
+    constructor: Callable[..., Engine]
+    if name == "native":
+        from mjx_dher.envs.engines.native import NativeEngine as constructor
+    else:
+        from mjx_dher.envs.engines.mjx import MjxEngine as constructor
+    allowed = set(inspect.signature(constructor).parameters) - {"model", "substeps"}
+    for option in options:
+        check_name(f"option of engine {name}", option, sorted(allowed))
+    return constructor(model, substeps, **options)
