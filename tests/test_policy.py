@@ -1,0 +1,155 @@
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+
+import mjx_dher
+from mjx_dher import ddpg, policy, run_folder
+from mjx_dher.config import Config, HParams
+from mjx_dher.ddpg import Networks
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.run_folder import RunConfig, RunFolderError
+
+HP = HParams(norm_clip=3.0)
+NETWORKS = Networks(actor=Actor(4), critic=Critic())
+
+
+@pytest.fixture(scope="module")
+def learner():
+    keys = jax.random.split(jax.random.key(0), 3)
+    state = ddpg.init(keys[0], NETWORKS, 25, 3, 4)
+    observations = 0.3 * jax.random.normal(keys[1], (100, 25)) + 1.3
+    return ddpg.update_normalizers(state, observations.at[:, 5].set(0.0), jax.random.normal(keys[2], (100, 3)), HP)
+
+
+@pytest.fixture
+def run_dir(tmp_path, learner):
+    run = RunConfig(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native")
+    run_folder.create(tmp_path / "run", run, {"note": "for the reader"})
+    policy.from_learner(learner, HP).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    return tmp_path / "run"
+
+
+def test_the_loaded_policy_acts_as_the_learner_does(run_dir, learner):
+    rng = np.random.default_rng(0)
+    obs = {
+        "observation": rng.normal(1.3, 1.0, (64, 25)).astype(np.float32),
+        "achieved_goal": np.zeros((64, 3), np.float32),
+        "desired_goal": rng.normal(0, 2, (64, 3)).astype(np.float32),
+    }
+    loaded = mjx_dher.load_policy(run_dir)
+    actions = loaded(obs)
+    assert isinstance(actions, np.ndarray)
+    assert actions.shape == (64, 4)
+    assert np.abs(actions).max() <= 1
+    assert np.abs(actions).std() > 0.05
+    np.testing.assert_allclose(actions, ddpg.act(NETWORKS, learner, obs, HP), atol=1e-5)
+    np.testing.assert_allclose(loaded({k: v[7] for k, v in obs.items()}), actions[7], atol=1e-6)
+    traced = jax.jit(lambda o: loaded.forward(o["observation"], o["desired_goal"], jnp))(obs)
+    np.testing.assert_allclose(actions, traced, atol=1e-5)
+
+
+def test_a_run_config_comes_back_as_it_was(run_dir):
+    run = run_folder.read_config(run_dir)
+    assert run == RunConfig(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native")
+
+
+def test_loading_and_acting_need_numpy_alone(run_dir):
+    code = f"""
+import sys
+import numpy as np
+import mjx_dher
+policy = mjx_dher.load_policy({str(run_dir)!r})
+policy({{"observation": np.zeros(25), "achieved_goal": np.zeros(3), "desired_goal": np.zeros(3)}})
+loaded = {{name.split(".")[0] for name in sys.modules}}
+assert not loaded & {{"jax", "mujoco", "flax", "optax", "gymnasium"}}, loaded
+assert not any(name.startswith("mjx_dher.envs") for name in sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(
+    ("obs", "message"),
+    [
+        ({"observation": np.zeros(25)}, "the policy needs 'desired_goal'; got .'observation'"),
+        (
+            {"observation": np.zeros(24), "desired_goal": np.zeros(3)},
+            r"observation must end in an axis of 25; got shape \(24,\)",
+        ),
+        ({"observation": np.zeros(25), "desired_goal": np.zeros(())}, r"desired_goal must end in an axis of 3; got shape \(\)"),
+        ({"observation": np.zeros((2, 25)), "desired_goal": np.zeros(3)}, "batch shapes differ"),
+        ({"observation": np.full(25, np.nan), "desired_goal": np.zeros(3)}, "observation must be finite"),
+    ],
+)
+def test_bad_observations_are_refused(run_dir, obs, message):
+    with pytest.raises(ValueError, match=message):
+        mjx_dher.load_policy(run_dir)(obs)
+
+
+def damage(run_dir, how):
+    config_file, policy_file = run_dir / run_folder.CONFIG_FILE, run_dir / run_folder.POLICY_FILE
+    content = json.loads(config_file.read_text())
+    if how == "no config":
+        config_file.unlink()
+    elif how == "broken json":
+        config_file.write_text(config_file.read_text()[:-20])
+    elif how == "foreign json":
+        config_file.write_text('{"model_type": "bert"}')
+    elif how == "list":
+        config_file.write_text("[]")
+    elif how == "newer schema":
+        config_file.write_text(json.dumps(content | {"schema": 99}))
+    elif how == "unknown field":
+        content["config"]["colour"] = 1
+        config_file.write_text(json.dumps(content))
+    elif how == "no policy":
+        policy_file.unlink()
+    elif how == "truncated policy":
+        policy_file.write_bytes(policy_file.read_bytes()[:1000])
+    elif how == "foreign policy":
+        np.savez(policy_file.open("wb"), other=np.zeros(3))
+    elif how == "no policy file at all":
+        policy_file.write_text("hello")
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("no config", "is not a run folder: it has no config.json"),
+        ("broken json", "config.json cannot be read"),
+        ("foreign json", "is not of this program's schema 1 .found None"),
+        ("list", "is not of this program's schema 1"),
+        ("newer schema", "is not of this program's schema 1 .found 99"),
+        ("unknown field", "config.json does not describe a run"),
+        ("no policy", "policy.npz is missing: the run was stopped before its first epoch ended"),
+        ("truncated policy", "policy.npz is damaged"),
+        ("foreign policy", "policy.npz is damaged or not a policy"),
+        ("no policy file at all", "policy.npz is damaged or not a policy"),
+    ],
+)
+def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, message):
+    damage(run_dir, how)
+    with pytest.raises(RunFolderError, match=message):
+        mjx_dher.load_policy(run_dir)
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(RunFolderError, match="nowhere is not a run folder: no such folder"):
+        mjx_dher.load_policy(tmp_path / "nowhere")
+
+
+def test_a_folder_in_use_is_never_chosen(run_dir, tmp_path, monkeypatch):
+    with pytest.raises(RunFolderError, match=r"out: .* is there already and is never overwritten"):
+        run_folder.choose(run_dir, Config(), 0)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert run_folder.choose(empty, Config(), 0) == empty
+    monkeypatch.chdir(tmp_path)
+    first = run_folder.choose(None, Config(), 0)
+    first.mkdir(parents=True)
+    assert run_folder.choose(None, Config(), 0) != first
