@@ -77,8 +77,6 @@ class HParams(NamedTuple):
     """Probability of a uniformly random action while exploring."""
     noise_std: float = 0.2
     """Standard deviation of the Gaussian noise on the other actions."""
-    random_hold: float = 1.0
-    """Steps that a random action, or the policy's turn, lasts on average; 1: each step tosses anew, as in the paper."""
     her_k: float = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
     eventful_share: float = 0.0
@@ -122,7 +120,16 @@ def preset(name: str, env: str) -> tuple[Config, HParams]:
     """
     check_name("preset", name, PRESETS)
     if name == "default":
-        return Config(env=env), HParams()
+        config = Config(
+            env=env,
+            num_envs=32,
+            cycles_per_epoch=15,
+            updates_per_cycle=40,
+            target_period=1,
+            batch_size=1024,
+            total_steps=600_000,
+        )
+        return config, HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     config = Config(
@@ -210,7 +217,6 @@ _HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
     "action_l2": (0, True, math.inf, False),
     "random_eps": (0, True, 1, True),
     "noise_std": (0, True, math.inf, False),
-    "random_hold": (1, True, math.inf, False),
     "her_k": (0, True, math.inf, False),
     "eventful_share": (0, True, 1, True),
     "epsilon": (0, True, 1, True),

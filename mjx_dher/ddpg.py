@@ -85,26 +85,13 @@ class Noise(NamedTuple):
 
 
 def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-    """Noise for `num_envs` episodes of `num_steps` steps.
-
-    A share `random_eps` of the actions is uniformly random. With `random_hold` = 1 each step tosses its own coin, as in the
-    original HER code line. With h > 1 a toss, and the random action if it comes to that, is kept for 1, 2, ... steps, h on
-    average (a geometric time): temporally extended epsilon-greedy exploration (Dabney et al. 2021). A random action
-    that lasts carries the gripper somewhere, and what is in the way along with it.
-    """
-    gaussian_key, uniform_key, coin_key, renew_key = jax.random.split(key, 4)
+    """Noise for `num_envs` episodes of `num_steps` steps: a share `random_eps` of the actions is uniformly random."""
+    gaussian_key, uniform_key, coin_key = jax.random.split(key, 3)
     shape = (num_steps, num_envs)
-    gaussian = hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size))
-    uniform = jax.random.uniform(uniform_key, (*shape, action_size), minval=-1.0, maxval=1.0)
-    coin = jax.random.uniform(coin_key, shape) < hparams.random_eps
-    renew = jax.random.uniform(renew_key, shape) * hparams.random_hold < 1.0
-    # The step whose toss each step goes by: the last one renewed.
-    steps = jnp.arange(num_steps)[:, None]
-    source = jax.lax.cummax(jnp.where(renew, steps, 0), axis=0)
     return Noise(
-        gaussian=gaussian,
-        is_random=jnp.take_along_axis(coin, source, axis=0),
-        uniform=jnp.take_along_axis(uniform, source[..., None], axis=0),
+        gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size)),
+        is_random=jax.random.uniform(coin_key, shape) < hparams.random_eps,
+        uniform=jax.random.uniform(uniform_key, (*shape, action_size), minval=-1.0, maxval=1.0),
     )
 
 

@@ -18,7 +18,7 @@ def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
     assert c.hidden_sizes == (256, 256, 256)
     assert (h.actor_lr, h.critic_lr, h.gamma, h.polyak, h.action_l2) == (1e-3, 1e-3, 0.98, 0.95, 1.0)
     assert (h.random_eps, h.noise_std, h.her_k) == (0.3, 0.2, 4.0)
-    assert (h.random_hold, h.eventful_share) == (1.0, 0.0)  # what the paper does not have is off
+    assert h.eventful_share == 0.0  # what the paper does not have is off
     assert (h.obs_clip, h.norm_clip, h.norm_eps) == (200.0, 5.0, 0.01)
 
 
@@ -72,7 +72,6 @@ BAD_HPARAMS = [
     ({"noise_std": float("inf")}, r"noise_std must lie in \[0, inf\); got inf"),
     ({"temperature": 0.0}, r"temperature must lie in \(0, inf\); got 0.0"),
     ({"her_k": -1}, r"her_k must lie in \[0, inf\); got -1"),
-    ({"random_hold": 0.5}, r"random_hold must lie in \[1, inf\); got 0.5"),
     ({"eventful_share": 1.5}, r"eventful_share must lie in \[0, 1\]; got 1.5"),
 ]
 

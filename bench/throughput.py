@@ -1,0 +1,51 @@
+"""Environment steps a second, inside a jitted rollout as training makes it: the policy network and exploration included.
+
+python bench/throughput.py [--env push] [--engines native jax] [--num-envs 16 32 128]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import jax
+from timing import median_seconds, print_table
+
+from mjx_dher import HParams, ddpg, envs
+from mjx_dher.ddpg import Networks
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.rollout import rollout
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="push")
+    parser.add_argument("--engines", nargs="+", default=["native", "jax"])
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[16, 32, 128])
+    args = parser.parse_args()
+    hparams = HParams()
+    rows = []
+    for engine in args.engines:
+        env = envs.make(args.env, engine=engine)
+        networks = Networks(actor=Actor(env.action_size), critic=Critic())
+        learner = ddpg.init(jax.random.key(0), networks, env.observation_size, env.goal_size, env.action_size)
+        for num_envs in args.num_envs:
+
+            @jax.jit
+            def play(key, env=env, num_envs=num_envs, networks=networks, learner=learner):
+                noise = ddpg.exploration_noise(key, env.episode_length, num_envs, env.action_size, hparams)
+                policy = lambda noise, obs: ddpg.explore(noise, ddpg.act(networks, learner, obs, hparams))  # noqa: E731
+                return rollout(env, policy, key, num_envs, noise)
+
+            start = time.perf_counter()
+            jax.block_until_ready(play(jax.random.key(1)))
+            compiled = time.perf_counter() - start
+            keys = iter(jax.random.split(jax.random.key(2), 100))
+            seconds = median_seconds(lambda: play(next(keys)))
+            rate = num_envs * env.episode_length / seconds
+            rows.append((engine, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
+    print_table(("engine", "num_envs", "env steps/s", "first call, s"), rows)
+
+
+if __name__ == "__main__":
+    main()

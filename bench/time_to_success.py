@@ -1,0 +1,75 @@
+"""Time to success: trains several seeds of a preset, one after the other, and prints when each first reached a threshold.
+
+    python bench/time_to_success.py [--env push] [--sampler weighted] [--seeds 5] [--threshold 0.9] [--out FILE.csv]
+
+Seconds are those of training, evaluations included and compilation apart. "First" is the first evaluation (eval_episodes
+episodes) at or above the threshold; the final success is over 500 fresh episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import statistics
+from pathlib import Path
+
+from timing import print_table
+
+from mjx_dher import config, envs, policy, stats
+from mjx_dher.cli import play
+from mjx_dher.trainer import train
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", default="push")
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--sampler", default="weighted")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--threshold", type=float, default=0.9)
+    parser.add_argument("--total-steps", type=int)
+    parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
+    args = parser.parse_args()
+    static, hparams = config.preset(args.preset, args.env)
+    static = dataclasses.replace(static, sampler=args.sampler, total_steps=args.total_steps or static.total_steps)
+    env = envs.make(args.env, engine=args.engine)
+    rows, curve, compiled = [], [], []
+    for seed in range(args.seeds):
+        first = None
+        for progress in train(env, static, hparams, seed, lambda seconds: seconds and compiled.append(seconds)):
+            success = progress.metrics["success_rate"]
+            curve.append((seed, progress.env_steps, progress.updates, round(progress.wall_seconds, 2), success))
+            if first is None and success >= args.threshold:
+                first = progress
+            last = progress
+        outcome = play(env, policy.from_learner(last.state.learner, hparams), 500, seed=1000 + seed)
+        low, high = stats.wilson_interval(int(outcome.success.sum()), len(outcome.success))
+        reached = (f"{first.wall_seconds:.0f}", f"{first.env_steps:,}", f"{first.updates:,}") if first else ("never",) * 3
+        rows.append(
+            (seed, *reached, f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")
+            + (f"{outcome.success.mean():.3f} ({low:.3f}-{high:.3f})", f"{outcome.reset_success.mean():.3f}")
+        )
+        print(rows[-1], flush=True)
+    if args.out:
+        with args.out.open("w", newline="") as file:
+            csv.writer(file).writerows([("seed", "env_steps", "updates", "wall_seconds", "success_rate"), *curve])
+    head = (
+        f"s to {args.threshold}",
+        "env steps",
+        "updates",
+        "s in all",
+        "env steps in all",
+        "final success (95 %)",
+        "at reset",
+    )
+    print_table(("seed", *head), rows)
+    times = [float(row[1]) if row[1] != "never" else float("inf") for row in rows]
+    print(
+        f"\nmedian seconds to {args.threshold}: {statistics.median(times):.0f}; compilation: {statistics.median(compiled):.1f} s"
+    )
+
+
+if __name__ == "__main__":
+    main()
