@@ -47,10 +47,9 @@ def main() -> None:
         outcome = play(env, policy.from_learner(last.state.learner, hparams), 500, seed=1000 + seed)
         low, high = stats.wilson_interval(int(outcome.success.sum()), len(outcome.success))
         reached = (f"{first.wall_seconds:.0f}", f"{first.env_steps:,}", f"{first.updates:,}") if first else ("never",) * 3
-        rows.append(
-            (seed, *reached, f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")
-            + (f"{outcome.success.mean():.3f} ({low:.3f}-{high:.3f})", f"{outcome.reset_success.mean():.3f}")
-        )
+        total = (f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")
+        final = (f"{outcome.success.mean():.3f} ({low:.3f}-{high:.3f})", f"{outcome.reset_success.mean():.3f}")
+        rows.append((seed, *reached, *total, *final))
         print(rows[-1], flush=True)
     if args.out:
         with args.out.open("w", newline="") as file:
@@ -66,9 +65,7 @@ def main() -> None:
     )
     print_table(("seed", *head), rows)
     times = [float(row[1]) if row[1] != "never" else float("inf") for row in rows]
-    print(
-        f"\nmedian seconds to {args.threshold}: {statistics.median(times):.0f}; compilation: {statistics.median(compiled):.1f} s"
-    )
+    print(f"\nmedian seconds to {args.threshold}: {statistics.median(times):.0f}; compiling: {statistics.median(compiled):.1f}")
 
 
 if __name__ == "__main__":

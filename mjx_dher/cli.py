@@ -96,9 +96,14 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     chosen, _ = early.parse_known_args(argv)
     base, hparams = config.preset(chosen.preset, chosen.env)
     args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=TrainArgs(config=base, hparams=hparams))
-    config.check_name("env", args.config.env, envs.list_envs())
-    config.validate(args.config, args.hparams)
-    _check_count("final_episodes", args.final_episodes)
+    checks = (
+        lambda: config.check_name("env", args.config.env, envs.list_envs()),
+        lambda: config.validate(args.config, args.hparams),
+        lambda: _check_count("final_episodes", args.final_episodes),
+    )
+    problems = [problem for problem in map(_problem, checks) if problem]
+    if problems:
+        raise ValueError("\n".join(problems))
     return args
 
 
@@ -254,6 +259,14 @@ def _row(progress: Progress, previous: Progress | None) -> dict[str, Any]:
         "steps_per_second": steps / progress.epoch_seconds,
         "updates_per_second": updates / progress.epoch_seconds,
     }
+
+
+def _problem(check: Callable[[], None]) -> str | None:
+    try:
+        check()
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 def _check_count(field: str, value: int) -> None:

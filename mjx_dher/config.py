@@ -169,6 +169,7 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
     for field, value, allowed in (
         ("sampler", c.sampler, _sampler_names()),
         ("weight_kernel", c.weight_kernel, WEIGHT_KERNELS),
+        ("metric", c.metric, METRICS),
         ("engine", c.engine, ENGINES),
     ):
         try:

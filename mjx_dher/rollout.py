@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree
 
-# policy(noise of one step, obs with leading [N]) -> actions [N, A]
+# policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
 
 
@@ -22,28 +22,28 @@ class Outcome(NamedTuple):
     ret: Array  # undiscounted sum of rewards
 
 
-def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, noise: PyTree = None) -> tuple[Episode, Outcome]:
+def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None) -> tuple[Episode, Outcome]:
     """`num_envs` episodes side by side.
 
     Args:
       env: an unbatched environment.
-      policy: called with one step of `noise` and the observations of all environments.
+      policy: called with one step of `inputs` and the observations of all environments.
       key: of the first states.
       num_envs: episodes, N.
-      noise: a pytree whose leaves lead with [T]; None for a policy that takes none.
+      inputs: what the policy takes beside the observation, such as noise: leaves lead with [T]. None for nothing.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
     """
     first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
 
-    def step(state, noise):
-        action = policy(noise, state.obs)
+    def step(state, step_inputs):
+        action = policy(step_inputs, state.obs)
         following = jax.vmap(env.step)(state, action)
         played = (state.obs["observation"], state.obs["achieved_goal"], action, following.reward)
         return following, played
 
-    last, (observation, achieved_goal, action, reward) = jax.lax.scan(step, first, noise, length=env.episode_length)
+    last, (observation, achieved_goal, action, reward) = jax.lax.scan(step, first, inputs, length=env.episode_length)
 
     def whole(steps, end):  # [T, N, ...] and [N, ...] -> [N, T+1, ...]
         return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)

@@ -1,0 +1,190 @@
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from rich.console import Console
+
+import mjx_dher
+from mjx_dher import cli, config, metrics
+from mjx_dher.run_folder import RunFolderError
+
+TINY = (
+    "--num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200"
+    " --replay-size 1000 --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4"
+).split()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A whole tiny run of the command, as a user starts it: (run folder, completed process)."""
+    out = tmp_path_factory.mktemp("cli") / "run"
+    command = [sys.executable, "train.py", "--env", "push", "--sampler", "weighted", *TINY, "--out", str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return out, done
+
+
+def test_a_run_writes_its_folder(finished):
+    out, _ = finished
+    assert {path.name for path in out.iterdir()} == {"config.json", "metrics.csv", "policy.npz", "result.json"}
+    content = json.loads((out / "config.json").read_text())
+    assert (content["config"]["env"], content["config"]["sampler"], content["engine"]) == ("push", "weighted", "native")
+    assert {"jax", "mujoco", "mjx_dher", "python"} <= set(content["versions"])
+    with (out / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0])[:6] == ("epoch", "env_steps", "updates", "wall_seconds", "success_rate", "return_mean")
+    assert [(row["epoch"], row["env_steps"], row["updates"]) for row in rows] == [("1", "100", "2"), ("2", "200", "4")]
+    assert all(np.isfinite(float(value)) for row in rows for value in row.values())
+    result = json.loads((out / "result.json").read_text())
+    assert result["success_low"] <= result["success_rate"] <= result["success_high"]
+    assert (result["episodes"], result["env_steps"]) == (4, 200)
+
+
+def test_a_run_says_what_it_does(finished):
+    out, done = finished
+    lines = done.stdout.splitlines()
+    assert "physics native" in lines[0]
+    assert "replay ring 130.5 kB" in lines[0]
+    assert str(out) in lines[0]
+    assert lines[1].startswith("compiling the training loop")
+    assert lines[2].startswith("compiled in ")
+    for number in (1, 2):
+        line = lines[2 + number]
+        assert line.startswith(f"epoch {number}/2  {number * 100} steps")
+        assert all(word in line for word in ("steps/s", "updates/s", "success", "return", "ETA"))
+    assert lines[5].startswith("success ")
+    assert "95 % interval" in lines[5]
+    assert "already at reset" in lines[5]
+    assert lines[6] == f"run folder: {out}"
+    assert done.stderr == ""
+
+
+def test_the_policy_of_a_run_loads(finished):
+    policy = mjx_dher.load_policy(finished[0])
+    assert policy({"observation": np.zeros((5, 25)), "desired_goal": np.zeros((5, 3))}).shape == (5, 4)
+
+
+def test_eval_plays_a_run_again(finished, capsys):
+    for _ in range(2):
+        assert cli.main(["eval", str(finished[0]), "--episodes", "6"]) == 0
+    first, second = capsys.readouterr().out.split("push: 6 episodes")[1:]
+    assert "6 episodes); already at reset" in first
+    assert first == second
+
+
+def test_an_existing_run_is_never_overwritten(finished, capsys):
+    out = finished[0]
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    assert cli.main(["--out", str(out)]) == 2
+    assert f"error: out: {out} is there already and is never overwritten" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+BAD = [
+    (["--env", "pusch"], ["env must be one of ", "got 'pusch' (did you mean 'push'?)"]),
+    (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
+    (["--engine", "natve"], ["engine must be one of auto, native, jax; got 'natve' (did you mean 'native'?)"]),
+    (["--preset", "papr"], ["preset must be one of default, paper; got 'papr' (did you mean 'paper'?)"]),
+    (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax; got 'cubic'"]),
+    (["--metric", "speed"], ["metric must be one of position; got 'speed'"]),
+    (["--num-envs", "0"], ["num_envs must be an integer of at least 1; got 0"]),
+    (["--num-envs", "-3"], ["num_envs must be an integer of at least 1; got -3"]),
+    (["--batch-size", "2000001"], ["batch_size must not exceed replay_size (1000000); got 2000001"]),
+    (["--replay-size", "1500"], ["replay_size must hold at least one cycle of 32 episodes x 50 steps = 1600 transitions; got 1500"]),
+    (["--gamma", "1.0"], ["gamma must lie in [0, 1); got 1.0"]),
+    (["--final-episodes", "0"], ["final_episodes must be an integer of at least 1; got 0"]),
+    (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must be", "gamma must lie"]),
+    (["evall", "runs/x"], ["command must be one of train, eval; got 'evall' (did you mean 'eval'?)"]),
+    (["eval", "runs/not-there"], ["runs/not-there is not a run folder: no such folder"]),
+    (["eval", "docs"], ["docs is not a run folder: it has no config.json"]),
+    (["eval", "docs", "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
+    (["eval", "docs", "--engine", "wrap"], ["engine must be one of auto, native, jax; got 'wrap'"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "messages"), BAD)
+def test_bad_arguments_are_refused_with_a_line_each(argv, messages, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert cli.main(argv) == 2
+    error = capsys.readouterr().err
+    assert all(line.startswith("error: ") for line in error.splitlines())
+    assert len(error.splitlines()) == max(1, len([m for m in messages if " must " in m]))
+    for message in messages:
+        assert message in error
+
+
+def test_bad_arguments_are_refused_before_jax_or_mujoco_load():
+    """So a refusal takes a fraction of a second."""
+    code = f"""
+import sys
+from mjx_dher.cli import main
+assert all(main(argv) == 2 for argv in {[argv for argv, _ in BAD]!r})
+assert not {{"jax", "mujoco"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_presets_are_the_base_that_options_override():
+    args = cli.parse_train_args(["--preset=paper", "--env", "push", "--num-envs", "4", "--gamma", "0.9"])
+    base, hparams = config.preset("paper", "push")
+    assert args.config == config.dataclasses.replace(base, num_envs=4)
+    assert args.hparams == hparams._replace(gamma=0.9)
+    assert cli.parse_train_args([]).config == config.preset("default", "push")[0]
+
+
+def test_help_names_every_option(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    fields = [f.name for f in config.dataclasses.fields(config.Config)] + list(config.HParams._fields)
+    for field in [*fields, "seed", "out", "preset", "final_episodes"]:
+        assert f"--{field.replace('_', '-')}" in text
+
+
+def test_a_terminal_gets_a_live_line():
+    screen = io.StringIO()
+    sink = metrics.ConsoleSink(Console(file=screen, force_terminal=True, width=200), num_epochs=4)
+    row = {"epoch": 1, "env_steps": 1000, "wall_seconds": 30.0, "success_rate": 0.5, "return_mean": -20.0}
+    sink.write({**row, "steps_per_second": 500.0, "updates_per_second": 50.0})
+    sink.close()
+    assert "epoch 1/4  1,000 steps  500 steps/s  50 updates/s  success 0.50  return -20.0  ETA 1:30" in screen.getvalue()
+
+
+def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
+    out = tmp_path / "run"
+    long = [*TINY, "--total-steps", "100000", "--out", str(out)]
+    process = subprocess.Popen(
+        [sys.executable, "train.py", *long], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.time() + 120
+    while not (out / "policy.npz").exists() and time.time() < deadline:
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stdout + stderr
+    assert "stopping when this epoch has ended" in stdout
+    assert f"the policy so far is in {out}" in stdout
+    assert stderr == ""
+    mjx_dher.load_policy(out)
+    epochs = int(stdout.split("stopped after epoch ")[1].split()[0])
+    assert 1 <= epochs < 1000
+    assert len((out / "metrics.csv").read_text().splitlines()) == 1 + epochs
+
+
+def test_an_unwritable_out_is_refused(tmp_path):
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(RunFolderError, match="out: cannot create"):
+        from mjx_dher import run_folder
+
+        run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
+        run_folder.create(blocker / "run", run, {})
