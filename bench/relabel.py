@@ -1,6 +1,6 @@
 """Sampling and relabelling: transitions a second, for each goal sampler, from a ring of 10^6 transitions.
 
-    python bench/relabel.py [--batch-size 1024]
+python bench/relabel.py [--batch-size 1024]
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ def main() -> None:
     keys = jax.random.split(jax.random.key(0), BATCHES)
     times = {}
     for name in samplers.list_samplers():
+        sampler = samplers.make(name)
 
         @jax.jit
-        def run(keys, sampler=samplers.make(name)):
+        def run(keys, sampler=sampler):
             def step(total, key):
                 sample_key, relabel_key = jax.random.split(key)
                 sample = replay.sample(ring, sample_key, args.batch_size)

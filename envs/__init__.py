@@ -16,6 +16,9 @@ __all__ = ["GoalEnv", "State", "list_envs", "make", "register"]
 # name -> the constructor, or "module:attribute" where importing it can wait (this module must stay cheap to import)
 _REGISTRY: dict[str, Callable[..., Any] | str] = {
     "push": "mjx_dher.envs.push:Push",
+    "pick_and_place": "mjx_dher.envs.pick_and_place:PickAndPlace",
+    "slide": "mjx_dher.envs.slide:Slide",
+    "reach": "mjx_dher.envs.reach:Reach",
 }
 
 

@@ -7,7 +7,7 @@ The tasks follow gymnasium-robotics 1.4.2, version v4 of its Fetch environments,
 from __future__ import annotations
 
 import dataclasses
-from importlib import resources
+from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -22,7 +22,9 @@ from mjx_dher.types import Array, GoalObs, PRNGKey
 SUBSTEPS = 20  # of 2 ms: 25 actions a second
 ACTION_SCALE = 0.05  # m that an action of 1 asks for
 RESET_CANDIDATES = 64  # object positions drawn at once; all lie too close with probability < 1e-6 in any task
-DT = SUBSTEPS * 0.002  # s; the observation gives velocities as displacements per step
+TIMESTEP = 0.002  # s
+DT = SUBSTEPS * TIMESTEP  # s; the observation gives velocities as displacements per step
+ASSETS = Path(__file__).parent / "assets"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +34,16 @@ class FetchTask:
     xml: str  # file in envs/assets
     initial_grip_pos: tuple[float, float, float]  # settled
     initial_grip_vel: tuple[float, float, float]  # settled, m/s
-    object_height: float  # settled height of the object's centre; also the height of goals on the table
-    object_range: float  # the object starts within this of the gripper, along x and along y
-    target_range: float  # the goal lies within this of the gripper plus target_offset
+    target_range: float  # the goal lies within this of the gripper plus target_offset, along each axis
     target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    min_object_distance: float = 0.1  # the object starts at least this far from the gripper in the plane
+    object_height: float | None = None  # settled height of the object's centre, and of goals on the table; None: no object
+    object_range: float = 0.15  # the object starts within this of the gripper, along x and along y
+    min_object_distance: float = 0.1  # but at least this far from it in the plane
+    max_goal_lift: float = 0.0  # half of all goals are lifted by up to this
 
 
 class FetchEnv(GoalEnv):
-    """A gripper on a Cartesian carriage, an object, and a goal for the object's position.
+    """A gripper on a Cartesian carriage and, but for reaching, an object; the goal is a place for it (or for the gripper).
 
     Args:
       engine: "auto", "native" or "jax".
@@ -51,7 +54,6 @@ class FetchEnv(GoalEnv):
     """
 
     task: ClassVar[FetchTask]
-    observation_size = 25
     goal_size = 3
     action_size = 4
 
@@ -72,30 +74,39 @@ class FetchEnv(GoalEnv):
         self.reward_type = reward_type
         self.distance_threshold = distance_threshold
         self.episode_length = episode_length
-        self.model = mujoco.MjModel.from_xml_string((resources.files("mjx_dher.envs") / "assets" / self.task.xml).read_text())
+        self.model = mujoco.MjModel.from_xml_path(str(ASSETS / self.task.xml))
         self.engine = make_engine(engine, self.model, SUBSTEPS, **engine_options)
+        self.has_object = self.task.object_height is not None
+        self.observation_size = 25 if self.has_object else 10
         self._grip_qpos, self._grip_qvel = _joint_slices(self.model, "grip_x", width=3)
-        self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
+        # Two finger joints, right and left, where the fingers move; an actuator for each.
+        self.has_fingers = self.model.nu > 0
+        if self.has_fingers:
+            self._finger_qpos, self._finger_qvel = _joint_slices(self.model, "finger_r", width=2)
+        if self.has_object:
+            self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
 
     def reset(self, key: PRNGKey) -> State:
         """A start drawn as in the original: gripper at its settled place, object on the table near it, random goal."""
         object_key, goal_key = jax.random.split(key)
-        object_pos = self._sample_object(object_key)
-        object_qpos = jnp.concatenate([object_pos, jnp.array([1.0, 0.0, 0.0, 0.0])])
-        task = self.task
-        return self.init_state(jnp.array(task.initial_grip_pos), object_qpos, self._sample_goal(goal_key))
+        object_qpos = self._sample_object(object_key) if self.has_object else None
+        return self.init_state(jnp.array(self.task.initial_grip_pos), object_qpos, self._sample_goal(goal_key))
 
-    def init_state(self, grip_pos: Array, object_qpos: Array, desired_goal: Array, grip_vel: Array | None = None) -> State:
+    def init_state(
+        self, grip_pos: Array, object_qpos: Array | None, desired_goal: Array, grip_vel: Array | None = None
+    ) -> State:
         """A given start, as for replaying a recorded episode.
 
         Args:
           grip_pos: [3] grip point in world coordinates, m.
-          object_qpos: [7] object position, m, and orientation (w, x, y, z).
+          object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
           desired_goal: [3] m.
           grip_vel: [3] m/s; the settled velocity of the original (a few cm/s at most) unless given.
         """
         grip_vel = jnp.array(self.task.initial_grip_vel) if grip_vel is None else grip_vel
-        qpos = jnp.zeros(self.model.nq).at[self._grip_qpos].set(grip_pos).at[self._object_qpos].set(object_qpos)
+        qpos = jnp.zeros(self.model.nq).at[self._grip_qpos].set(grip_pos)
+        if self.has_object:
+            qpos = qpos.at[self._object_qpos].set(object_qpos)
         qvel = jnp.zeros(self.model.nv).at[self._grip_qvel].set(grip_vel)
         physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
         obs = self._observe(physics, jnp.asarray(desired_goal, jnp.float32))
@@ -114,9 +125,10 @@ class FetchEnv(GoalEnv):
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         grip_pos = state.physics.qpos[self._grip_qpos]
-        # As in the original, the request is relative to where the gripper is, not to where it was asked to be.
-        physics = self.engine.advance(state.physics, grip_pos + ACTION_SCALE * action[:3], jnp.zeros(self.model.nu))
-        obs = self._observe(physics, state.obs["desired_goal"])
+        # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be.
+        ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.has_fingers else jnp.zeros(0)
+        physics = self.engine.advance(state.physics, grip_pos + ACTION_SCALE * action[:3], ctrl)
+        obs = self._observe(self._seen(physics), state.obs["desired_goal"])
         return State(
             physics=physics,
             obs=obs,
@@ -135,27 +147,50 @@ class FetchEnv(GoalEnv):
         return (goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
     def _sample_object(self, key: PRNGKey) -> Array:
-        """[3] uniform in the square around the gripper, but not within `min_object_distance` of it."""
+        """[7] upright, uniform in the square around the gripper, but not within `min_object_distance` of it."""
         task = self.task
         offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), minval=-task.object_range, maxval=task.object_range)
         distance = jnp.linalg.norm(offsets, axis=-1)
         # The first one far enough; were there none, the farthest.
         index = jnp.argmax(jnp.where(distance >= task.min_object_distance, jnp.inf, distance))
         xy = jnp.array(task.initial_grip_pos[:2]) + offsets[index]
-        return jnp.append(xy, task.object_height)
+        return jnp.concatenate([xy, jnp.array([task.object_height, 1.0, 0.0, 0.0, 0.0])])
 
     def _sample_goal(self, key: PRNGKey) -> Array:
-        """[3] uniform in the square around the gripper plus the task's offset, at the object's height."""
+        """[3] uniform around the gripper plus the task's offset; with an object, at its height, or (half of them) above."""
         task = self.task
-        offset = jax.random.uniform(key, (3,), minval=-task.target_range, maxval=task.target_range)
+        offset_key, lift_key, coin_key = jax.random.split(key, 3)
+        offset = jax.random.uniform(offset_key, (3,), minval=-task.target_range, maxval=task.target_range)
         goal = jnp.array(task.initial_grip_pos) + offset + jnp.array(task.target_offset)
-        return goal.at[2].set(task.object_height)
+        if not self.has_object:
+            return goal
+        lift = jax.random.uniform(lift_key) * task.max_goal_lift
+        return goal.at[2].set(task.object_height + jnp.where(jax.random.bernoulli(coin_key), lift, 0.0))
+
+    def _seen(self, physics: Physics) -> Physics:
+        """What the observation is made from after a step.
+
+        Where fingers move, the original does not recompute positions after its last substep: gripper and object are seen
+        one substep (2 ms) late, while joint positions and all velocities are fresh.
+        """
+        if not self.has_fingers:
+            return physics
+        qpos, qvel = physics.qpos, physics.qvel
+        late = qpos.at[self._grip_qpos].add(-TIMESTEP * qvel[self._grip_qvel])
+        if self.has_object:
+            late = late.at[self._object_qpos].set(_integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
+        return dataclasses.replace(physics, qpos=late)
 
     def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
         grip_pos, grip_vel = physics.qpos[self._grip_qpos], physics.qvel[self._grip_qvel]
+        blocked = jnp.zeros(2)
+        finger_pos = physics.qpos[self._finger_qpos] if self.has_fingers else blocked
+        finger_vel = physics.qvel[self._finger_qvel] if self.has_fingers else blocked
+        if not self.has_object:
+            observation = jnp.concatenate([grip_pos, finger_pos, grip_vel * DT, finger_vel * DT])
+            return GoalObs(observation=observation, achieved_goal=grip_pos, desired_goal=desired_goal)
         object_qpos, object_qvel = physics.qpos[self._object_qpos], physics.qvel[self._object_qvel]
-        fingers = jnp.zeros(4)  # positions, m, and velocities of the right and the left finger: blocked
-        observation = fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, fingers[:2], fingers[2:])
+        observation = fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, finger_pos, finger_vel)
         return GoalObs(observation=observation, achieved_goal=object_qpos[:3], desired_goal=desired_goal)
 
 
@@ -219,6 +254,23 @@ def matrix_to_euler(matrix: Array) -> Array:
     b = jnp.arctan2(matrix[0, 2], cos_b)
     c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
     return jnp.stack([a, b, c])
+
+
+def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
+    """A free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
+    half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
+    x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
+    w = jnp.cos(half_angle)
+    a, b, c, d = qpos[3:]
+    turned = jnp.array(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+    )
+    return jnp.concatenate([qpos[:3] + dt * qvel[:3], turned])
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:

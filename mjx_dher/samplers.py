@@ -198,9 +198,13 @@ def draw(key: PRNGKey, log_weights: Array) -> Array:
 
     What has no weight is never drawn, whatever the rounding of the cumulative sum. At least one weight must be positive.
     """
+    num_goals = log_weights.shape[-1]
     weights = jnp.exp(log_weights - jnp.max(log_weights, axis=-1, keepdims=True))
-    cumulative = jnp.cumsum(weights, axis=-1)
-    threshold = jax.random.uniform(key, log_weights.shape[:-1]) * cumulative[..., -1]
-    reached = (cumulative > threshold[..., None]) & (weights > 0)
-    last = log_weights.shape[-1] - 1 - jnp.argmax(weights[..., ::-1] > 0, axis=-1)
-    return jnp.where(jnp.any(reached, axis=-1), jnp.argmax(reached, axis=-1), last).astype(jnp.int32)
+    possible = weights > 0
+    # A product with a triangle of ones is a faster prefix sum than a scan, at such lengths. It may fail to be monotone in the
+    # last bit; hence the mask, and the total taken where an index can be drawn.
+    cumulative = jnp.matmul(weights, jnp.triu(jnp.ones((num_goals, num_goals))), precision=jax.lax.Precision.HIGHEST)
+    total = jnp.max(jnp.where(possible, cumulative, 0.0), axis=-1)
+    threshold = jax.random.uniform(key, log_weights.shape[:-1]) * total
+    reached = possible & (cumulative > threshold[..., None])
+    return jnp.min(jnp.where(reached, jnp.arange(num_goals, dtype=jnp.int32), num_goals), axis=-1)

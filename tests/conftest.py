@@ -12,8 +12,13 @@ ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 
+def load_recorded(task):
+    """Episodes of the original task; see tests/data/README.md."""
+    with np.load(ROOT / "tests" / "data" / f"fetch_{task}.npz") as file:
+        return {name: file[name] for name in file.files}
+
+
 @pytest.fixture(scope="session")
 def recorded():
-    """Episodes of the original FetchPush; see tests/data/README.md."""
-    with np.load(ROOT / "tests" / "data" / "fetch_push.npz") as file:
-        return {name: file[name] for name in file.files}
+    """Episodes of the original FetchPush."""
+    return load_recorded("push")

@@ -13,13 +13,12 @@ from conftest import ROOT
 from rich.console import Console
 
 import mjx_dher
-from mjx_dher import cli, config, metrics
-from mjx_dher.run_folder import RunFolderError
+from mjx_dher import cli, config, metrics, run_folder
 
-TINY = (
-    "--num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200"
-    " --replay-size 1000 --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4"
-).split()
+TINY = """
+    --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200
+    --replay-size 1000 --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4
+""".split()  # noqa: SIM905
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +88,7 @@ def test_an_existing_run_is_never_overwritten(finished, capsys):
 
 
 BAD = [
-    (["--env", "pusch"], ["env must be one of ", "got 'pusch' (did you mean 'push'?)"]),
+    (["--env", "pusch"], ["env must be one of pick_and_place, push", "got 'pusch' (did you mean 'push'?)"]),
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
     (["--engine", "natve"], ["engine must be one of auto, native, jax; got 'natve' (did you mean 'native'?)"]),
     (["--preset", "papr"], ["preset must be one of default, paper; got 'papr' (did you mean 'paper'?)"]),
@@ -98,7 +97,10 @@ BAD = [
     (["--num-envs", "0"], ["num_envs must be an integer of at least 1; got 0"]),
     (["--num-envs", "-3"], ["num_envs must be an integer of at least 1; got -3"]),
     (["--batch-size", "2000001"], ["batch_size must not exceed replay_size (1000000); got 2000001"]),
-    (["--replay-size", "1500"], ["replay_size must hold at least one cycle of 32 episodes x 50 steps = 1600 transitions; got 1500"]),
+    (
+        ["--replay-size", "1500"],
+        ["replay_size must hold at least one cycle of 32 episodes x 50 steps = 1600 transitions; got 1500"],
+    ),
     (["--gamma", "1.0"], ["gamma must lie in [0, 1); got 1.0"]),
     (["--final-episodes", "0"], ["final_episodes must be an integer of at least 1; got 0"]),
     (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must be", "gamma must lie"]),
@@ -183,8 +185,6 @@ def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
 def test_an_unwritable_out_is_refused(tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("")
-    with pytest.raises(RunFolderError, match="out: cannot create"):
-        from mjx_dher import run_folder
-
-        run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
+    run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
+    with pytest.raises(run_folder.RunFolderError, match="out: cannot create"):
         run_folder.create(blocker / "run", run, {})

@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import load_recorded
 
 from mjx_dher import envs
 from mjx_dher.envs import fetch
 from mjx_dher.envs.engines import Physics
 
 ENGINES = ("native", "jax")
+RECORDED = ("push", "pick_and_place", "slide")
 
 
 @pytest.fixture(scope="module")
@@ -39,45 +41,65 @@ def test_the_interface(name):
     assert env.episode_length == 50
 
 
-def test_observation_is_the_original_s_as_a_function_of_the_state(recorded):
-    """Recorded states in, recorded observations out; finger entries apart, because the carriage's fingers are fixed."""
-    dt = fetch.DT
-    qpos = recorded["object_qpos"][:, ::7].reshape(-1, 7)
-    qvel = recorded["object_qvel"][:, ::7].reshape(-1, 6)
-    want = recorded["observation"][:, ::7].reshape(-1, 25)
-    got = np.array(
-        jax.vmap(fetch.fetch_observation)(want[:, :3], want[:, 20:23] / dt, qpos, qvel, want[:, 9:11], want[:, 23:25] / dt)
-    )
-    # An angle of +-pi is one angle.
-    turns = np.round((got[:, 11:14] - want[:, 11:14]) / (2 * np.pi)) * 2 * np.pi
-    got[:, 11:14] -= turns
+@pytest.mark.parametrize("task", RECORDED)
+def test_observation_is_the_original_s_as_a_function_of_the_state(task):
+    """Recorded states in, recorded observations out."""
+    recorded, dt = load_recorded(task), fetch.DT
+    qpos = recorded["object_qpos"][:, 1::7].reshape(-1, 7)
+    qvel = recorded["object_qvel"][:, 1::7].reshape(-1, 6)
+    want = recorded["observation"][:, 1::7].reshape(-1, 25)
+    if task == "pick_and_place":  # seen one substep late
+        qpos = np.asarray(jax.vmap(lambda q, v: fetch._integrate(q, v, -fetch.TIMESTEP))(qpos, qvel))
+    args = (want[:, :3], want[:, 20:23] / dt, qpos, qvel, want[:, 9:11], want[:, 23:25] / dt)
+    got = np.array(jax.vmap(fetch.fetch_observation)(*args))
+    got[:, 11:14] -= np.round((got[:, 11:14] - want[:, 11:14]) / (2 * np.pi)) * 2 * np.pi  # +-pi is one angle
     # Recorded in float32; near a pitch of 90 degrees, Euler angles amplify its rounding.
     steady = np.abs(np.abs(want[:, 12]) - np.pi / 2) > 0.05
     assert steady.mean() > 0.95
-    np.testing.assert_allclose(got[steady], want[steady], atol=2e-5)
+    np.testing.assert_allclose(got[steady], want[steady], atol=1e-4)
     np.testing.assert_allclose(got[:, :11], want[:, :11], atol=2e-6)
-    assert np.ptp(want[:, 11:14], axis=0).min() > 1  # the recording has turned objects about every axis
+    assert np.ptp(want[:, 11:14], axis=0).max() > 1  # the recording has turned objects
 
 
-def test_reset_is_drawn_as_in_the_original(resets, recorded):
-    obs = jax.tree.map(np.asarray, resets.obs)
+def ks_statistic(a, b):
+    """Two-sample Kolmogorov-Smirnov statistic."""
+    grid = np.sort(np.concatenate([a, b]))
+    return np.abs(
+        np.searchsorted(np.sort(a), grid, "right") / len(a) - np.searchsorted(np.sort(b), grid, "right") / len(b)
+    ).max()
+
+
+@pytest.mark.parametrize("task", RECORDED)
+def test_reset_is_drawn_as_in_the_original(task):
+    recorded, env = load_recorded(task), envs.make(task)
+    obs = jax.tree.map(np.asarray, jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 20_000)).obs)
+    first = recorded["observation"][:, 0]
     grip = obs["observation"][:, :3]
-    np.testing.assert_allclose(grip, np.tile(recorded["grip"][0, 0], (len(grip), 1)), atol=1e-6)
-    np.testing.assert_allclose(obs["observation"][0, 20:23], recorded["observation"][0, 0, 20:23], atol=1e-6)
+    np.testing.assert_allclose(grip, np.tile(first[0, :3], (len(grip), 1)), atol=1e-6)
+    np.testing.assert_allclose(obs["observation"][0, 20:23], first[0, 20:23], atol=1e-6)
     offset = obs["achieved_goal"][:, :2] - grip[:, :2]
-    assert np.abs(offset).max() <= 0.15 + 1e-6
     assert np.linalg.norm(offset, axis=1).min() >= 0.1 - 1e-6
+    assert np.abs(offset).max() <= env.task.object_range + 1e-6
     np.testing.assert_allclose(obs["achieved_goal"][:, 2], recorded["achieved"][0, 0, 2], atol=1e-6)
-    # Uniform on the square less the disc: the share of a corner square of a third of the side.
-    corner = np.mean(np.all(offset > 0.05, axis=1) & (np.linalg.norm(offset, axis=1) > 0.1))
-    grid = np.stack(np.meshgrid(*[np.linspace(-0.15, 0.15, 601)] * 2), -1).reshape(-1, 2)
-    grid = grid[np.linalg.norm(grid, axis=1) > 0.1]
-    expected = np.mean(np.all(grid > 0.05, axis=1))
-    assert abs(corner - expected) < 0.01
-    goal_offset = obs["desired_goal"][:, :2] - grip[:, :2]
-    assert np.abs(goal_offset).max() <= 0.15 + 1e-6
-    np.testing.assert_allclose(goal_offset.std(0), 0.15 / np.sqrt(3), rtol=0.02)
-    np.testing.assert_allclose(obs["desired_goal"][:, 2], recorded["goal"][0, 2], atol=1e-6)
+    goal_offset = obs["desired_goal"][:, :2] - grip[:, :2] - np.array(env.task.target_offset[:2])
+    assert np.abs(goal_offset).max() <= env.task.target_range + 1e-6
+    # Kolmogorov-Smirnov at 0.1 % for each of ten coordinates, against the recorded resets.
+    pairs = [(offset[:, i], recorded["achieved"][:, 0, i] - first[:, i]) for i in (0, 1)]
+    pairs += [(np.linalg.norm(offset, axis=1), np.linalg.norm((recorded["achieved"][:, 0] - first[:, :3])[:, :2], axis=1))]
+    pairs += [(obs["desired_goal"][:, i], recorded["goal"][:, i]) for i in range(3)]
+    for ours, theirs in pairs:
+        ours = ours.astype(np.float32).round(6)
+        theirs = theirs.astype(np.float32).round(6)  # heights that are constant differ by rounding alone
+        assert ks_statistic(ours, theirs) < 1.95 * np.sqrt(1 / len(ours) + 1 / len(theirs))
+
+
+def test_reach_goals_lie_in_a_cube_around_the_gripper():
+    env = envs.make("reach")
+    obs = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 20_000)).obs
+    offset = np.asarray(obs["desired_goal"] - obs["achieved_goal"])
+    np.testing.assert_allclose(offset.std(0), 0.15 / np.sqrt(3), rtol=0.02)
+    assert np.abs(offset).max() <= 0.15 + 1e-6
+    np.testing.assert_array_equal(obs["achieved_goal"], obs["observation"][:, :3])
 
 
 def test_success_at_reset_is_the_original_s(resets):
@@ -224,11 +246,12 @@ def test_bad_actions_are_refused(native, action, message):
 @pytest.mark.parametrize(
     ("args", "kwargs", "message"),
     [
-        (("pusch",), {}, "env must be one of push.*got 'pusch' .did you mean 'push'"),
+        (("pusch",), {}, r"env must be one of .*push.*got 'pusch' .did you mean 'push'"),
         (("push", "natve"), {}, "engine must be one of auto, native, jax; got 'natve' .did you mean 'native'"),
         (("push",), {"reward_type": "sprase"}, "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
         (("push",), {"distance_threshold": 0}, "distance_threshold must be greater than 0; got 0"),
         (("push",), {"episode_length": 0}, "episode_length must be at least 1; got 0"),
+        (("slide", "jax"), {}, r"engine jax cannot simulate this task .*CYLINDER.*; engine native can"),
         (("push",), {"colour": 1}, "option of engine native must be one of num_threads; got 'colour'"),
         (("push",), {"engine": "jax", "num_threads": 1}, "option of engine jax must be one of iterations, ls_iterations"),
     ],

@@ -30,7 +30,10 @@ class MjxEngine:
         model = copy.copy(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
-        self._model = mjx.put_model(model, impl="jax")
+        try:
+            self._model = mjx.put_model(model, impl="jax")
+        except NotImplementedError as error:  # slide: a cylinder against boxes
+            raise ValueError(f"engine jax cannot simulate this task ({error}); engine native can") from error
         # NumPy leaves: constants of whatever program traces them, on whatever device it runs.
         self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
         self._substeps = substeps
