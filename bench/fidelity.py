@@ -1,8 +1,8 @@
 """Open-loop replay of recorded episodes of the original task: how far does the rebuilt one stray?
 
-    python bench/fidelity.py [--engine native]
+    python bench/fidelity.py [--engine native] [--tasks push pick_and_place slide]
 
-Starts, goals and actions are those of tests/data/fetch_push.npz (see tests/data/README.md); nothing is fed back in 50 steps.
+Starts, goals and actions are those of tests/data/fetch_TASK.npz (see tests/data/README.md); nothing is fed back in 50 steps.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from timing import print_table
 
 from mjx_dher import envs
 
-DATA = Path(__file__).parent.parent / "tests" / "data" / "fetch_push.npz"
+DATA = Path(__file__).parent.parent / "tests" / "data"
 KINDS = ("random actions", "script with noise", "script")
 MOVED = 0.02  # m
 
@@ -39,13 +39,11 @@ def replay(env, recorded):
     return path[..., :3], path[..., 3:]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--engine", default="auto")
-    args = parser.parse_args()
-    with np.load(DATA) as file:
+def compare(task, engine):
+    """Table rows of one task, a row for each kind of episode."""
+    with np.load(DATA / f"fetch_{task}.npz") as file:
         recorded = {name: file[name] for name in file.files}
-    grip, obj = replay(envs.make("push", engine=args.engine), recorded)
+    grip, obj = replay(envs.make(task, engine=engine), recorded)
     grip_error = 1e3 * np.linalg.norm(grip - recorded["grip"], axis=-1)
     object_error = 1e3 * np.linalg.norm(obj[:, -1] - recorded["achieved"][:, -1], axis=-1)
 
@@ -57,22 +55,27 @@ def main() -> None:
 
     same_moved = moved(obj) == moved(recorded["achieved"])
     same_success = succeeded(obj) == succeeded(recorded["achieved"])
-    rows = []
     for kind, name in enumerate(KINDS):
         of = recorded["policy"] == kind
-        rows.append(
-            (
-                name,
-                int(of.sum()),
-                f"{grip_error[of].mean():.1f}",
-                f"{np.percentile(grip_error[of], 95):.1f}",
-                f"{np.median(object_error[of]):.1f}",
-                f"{np.percentile(object_error[of], 95):.0f}",
-                f"{same_moved[of].mean():.0%}",
-                f"{same_success[of].mean():.0%}",
-            )
+        yield (
+            task,
+            name,
+            f"{grip_error[of].mean():.1f}",
+            f"{np.percentile(grip_error[of], 95):.0f}",
+            f"{np.median(object_error[of]):.1f}",
+            f"{np.percentile(object_error[of], 95):.0f}",
+            f"{same_moved[of].mean():.0%}",
+            f"{same_success[of].mean():.0%}",
         )
-    head = ("episodes of", "n", "grip, mean mm", "p95", "object at the end, median mm", "p95", "moved agrees", "success agrees")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--tasks", nargs="+", default=["push", "pick_and_place", "slide"])
+    args = parser.parse_args()
+    rows = [row for task in args.tasks for row in compare(task, args.engine)]
+    head = ("task", "episodes", "grip, mean", "p95", "object at the end, median", "p95", "moved agrees", "success agrees")
     print_table(head, rows)
 
 
