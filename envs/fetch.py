@@ -162,7 +162,7 @@ class FetchEnv(GoalEnv):
         offset_key, lift_key, coin_key = jax.random.split(key, 3)
         offset = jax.random.uniform(offset_key, (3,), minval=-task.target_range, maxval=task.target_range)
         goal = jnp.array(task.initial_grip_pos) + offset + jnp.array(task.target_offset)
-        if not self.has_object:
+        if task.object_height is None:
             return goal
         lift = jax.random.uniform(lift_key) * task.max_goal_lift
         return goal.at[2].set(task.object_height + jnp.where(jax.random.bernoulli(coin_key), lift, 0.0))
