@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import platform
 import signal
 import sys
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             config.check_name("command", argv[0], commands)
-        return commands[name](argv, Console(highlight=False))
+        return commands[name](argv, Console(highlight=False, markup=False))
     except ValueError as error:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)
@@ -181,8 +182,10 @@ class _Training:
 
     def _on_interrupt(self, signum: int, frame: Any) -> None:
         if self.stop_asked:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            raise KeyboardInterrupt
+            self.console.show_cursor(True)
+            self.console.print(f"stopped at once; what was saved is in {self.folder}", soft_wrap=True)
+            sys.stdout.flush()
+            os._exit(130)  # a compiled epoch cannot be interrupted, and all that was saved is on the disk already
         self.stop_asked = True
         self.console.print("stopping when this epoch has ended; Ctrl-C again stops at once, keeping the last saved policy")
 

@@ -182,6 +182,25 @@ def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     assert len((out / "metrics.csv").read_text().splitlines()) == 1 + epochs
 
 
+def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
+    out = tmp_path / "run"
+    slow = [*TINY, "--total-steps", "10000000", "--num-envs", "32", "--cycles-per-epoch", "40", "--replay-size", "2000"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "train.py", *slow, "--out", str(out)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    deadline = time.time() + 120
+    while not (out / "policy.npz").exists() and time.time() < deadline:
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGINT)
+    time.sleep(0.5)
+    os.kill(process.pid, signal.SIGINT)
+    stdout, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, stdout
+    assert f"stopped at once; what was saved is in {out}" in stdout
+    assert "stopped after epoch" not in stdout
+    mjx_dher.load_policy(out)
+
+
 def test_an_unwritable_out_is_refused(tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("")
