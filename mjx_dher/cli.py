@@ -21,6 +21,7 @@ from mjx_dher.run_folder import RunConfig
 
 if TYPE_CHECKING:
     from mjx_dher.envs import GoalEnv
+    from mjx_dher.metrics import Sink
     from mjx_dher.policy import Policy
     from mjx_dher.rollout import Outcome
     from mjx_dher.trainer import Progress
@@ -136,7 +137,7 @@ class _Training:
         previous_handler = signal.signal(signal.SIGINT, self._on_interrupt)
         last: Progress | None = None
         learned: Policy | None = None
-        sinks: list[Any] = []
+        sinks: list[Sink] = []
         try:
             for progress in trainer.train(env, args.config, args.hparams, args.seed, self._on_compile):
                 if not sinks:
@@ -169,7 +170,7 @@ class _Training:
         console.print(f"run folder: {self.folder}", soft_wrap=True)
         return 130 if self.stop_asked else 0
 
-    def _open_sinks(self, num_epochs: int) -> list[Any]:
+    def _open_sinks(self, num_epochs: int) -> list[Sink]:
         from mjx_dher.metrics import ConsoleSink, CsvSink
 
         return [CsvSink(self.folder / run_folder.METRICS_FILE), ConsoleSink(self.console, num_epochs)]
