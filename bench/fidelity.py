@@ -25,17 +25,16 @@ MOVED = 0.02  # m
 def replay(env, recorded):
     """(grip, object) positions [E, T+1, 3] of the recorded actions from the recorded starts."""
 
-    def one(grip_pos, object_qpos, desired_goal, actions):
+    def one(object_qpos, desired_goal, actions):
         def step(state, action):
             state = env.step(state, action)
             return state, state.obs["observation"][:6]
 
-        first = env.init_state(grip_pos, object_qpos, desired_goal)
+        first = env.init_state(object_qpos, desired_goal)
         _, path = jax.lax.scan(step, first, actions)
         return jnp.concatenate([first.obs["observation"][None, :6], path])
 
-    starts = (recorded["grip"][:, 0], recorded["object_qpos"][:, 0], recorded["goal"])
-    path = np.asarray(jax.jit(jax.vmap(one))(*starts, recorded["action"]))
+    path = np.asarray(jax.jit(jax.vmap(one))(recorded["object_qpos"][:, 0], recorded["goal"], recorded["action"]))
     return path[..., :3], path[..., 3:]
 
 

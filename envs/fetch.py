@@ -17,6 +17,7 @@ import numpy as np
 
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Physics, make_engine
+from mjx_dher.envs.kinematics import Chain, quat_multiply
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # of 2 ms: 25 actions a second
@@ -24,6 +25,7 @@ ACTION_SCALE = 0.05  # m that an action of 1 asks for
 RESET_CANDIDATES = 64  # object positions drawn at once; all lie too close with probability < 1e-6 in any task
 TIMESTEP = 0.002  # s
 DT = SUBSTEPS * TIMESTEP  # s; the observation gives velocities as displacements per step
+POINTING_DOWN = np.array([1.0, 0.0, 1.0, 0.0], np.float32)  # the gripper's orientation (w, x, y, z), not normalized
 ASSETS = Path(__file__).parent / "assets"
 
 
@@ -32,8 +34,9 @@ class FetchTask:
     """The numbers that set one task apart from another (all lengths in m)."""
 
     xml: str  # file in envs/assets
-    initial_grip_pos: tuple[float, float, float]  # settled
-    initial_grip_vel: tuple[float, float, float]  # settled, m/s
+    arm_qpos: tuple[float, ...]  # [7] settled, rad, shoulder to wrist
+    arm_qvel: tuple[float, ...]  # [7] settled, rad/s
+    initial_grip_pos: tuple[float, float, float]  # settled; object and goal are drawn around it
     target_range: float  # the goal lies within this of the gripper plus target_offset, along each axis
     target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     object_height: float | None = None  # settled height of the object's centre, and of goals on the table; None: no object
@@ -43,7 +46,7 @@ class FetchTask:
 
 
 class FetchEnv(GoalEnv):
-    """A gripper on a Cartesian carriage and, but for reaching, an object; the goal is a place for it (or for the gripper).
+    """The Fetch arm and, but for reaching, an object; the goal is a place for it (or for the gripper).
 
     Args:
       engine: "auto", "native" or "jax".
@@ -78,7 +81,7 @@ class FetchEnv(GoalEnv):
         self.engine = make_engine(engine, self.model, SUBSTEPS, **engine_options)
         self.has_object = self.task.object_height is not None
         self.observation_size = 25 if self.has_object else 10
-        self._grip_qpos, self._grip_qvel = _joint_slices(self.model, "grip_x", width=3)
+        self.arm = Chain(self.model, body="gripper", site="grip")
         # Two finger joints, right and left, where the fingers move; an actuator for each.
         self.has_fingers = self.model.nu > 0
         if self.has_fingers:
@@ -87,27 +90,23 @@ class FetchEnv(GoalEnv):
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
 
     def reset(self, key: PRNGKey) -> State:
-        """A start drawn as in the original: gripper at its settled place, object on the table near it, random goal."""
+        """A start drawn as in the original: arm as it settled, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)
         object_qpos = self._sample_object(object_key) if self.has_object else None
-        return self.init_state(jnp.array(self.task.initial_grip_pos), object_qpos, self._sample_goal(goal_key))
+        return self.init_state(object_qpos, self._sample_goal(goal_key))
 
-    def init_state(
-        self, grip_pos: Array, object_qpos: Array | None, desired_goal: Array, grip_vel: Array | None = None
-    ) -> State:
-        """A given start, as for replaying a recorded episode.
+    def init_state(self, object_qpos: Array | None, desired_goal: Array) -> State:
+        """A given start, as for replaying a recorded episode; the arm is where it always starts.
 
         Args:
-          grip_pos: [3] grip point in world coordinates, m.
           object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
           desired_goal: [3] m.
-          grip_vel: [3] m/s; the settled velocity of the original (a few cm/s at most) unless given.
         """
-        grip_vel = jnp.array(self.task.initial_grip_vel) if grip_vel is None else grip_vel
-        qpos = jnp.zeros(self.model.nq).at[self._grip_qpos].set(grip_pos)
+        qpos = jnp.zeros(self.model.nq).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos))
         if self.has_object:
             qpos = qpos.at[self._object_qpos].set(object_qpos)
-        qvel = jnp.zeros(self.model.nv).at[self._grip_qvel].set(grip_vel)
+        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
+        qvel = jnp.zeros(self.model.nv).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel))
         physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
         obs = self._observe(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
@@ -124,10 +123,13 @@ class FetchEnv(GoalEnv):
         `action[3]` opens and closes the fingers where the task has any that move.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
-        grip_pos = state.physics.qpos[self._grip_qpos]
-        # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be.
+        # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be; and
+        # the gripper is asked to turn half-way from where it points to straight down.
+        pos, quat = self.arm.pose(self._seen(state.physics).qpos[self.arm.qpos])
+        quat = quat + POINTING_DOWN
+        target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
         ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.has_fingers else jnp.zeros(0)
-        physics = self.engine.advance(state.physics, grip_pos + ACTION_SCALE * action[:3], ctrl)
+        physics = self.engine.advance(state.physics, target, ctrl)
         obs = self._observe(self._seen(physics), state.obs["desired_goal"])
         return State(
             physics=physics,
@@ -176,13 +178,13 @@ class FetchEnv(GoalEnv):
         if not self.has_fingers:
             return physics
         qpos, qvel = physics.qpos, physics.qvel
-        late = qpos.at[self._grip_qpos].add(-TIMESTEP * qvel[self._grip_qvel])
+        late = qpos.at[self.arm.qpos].add(-TIMESTEP * qvel[self.arm.qvel])
         if self.has_object:
             late = late.at[self._object_qpos].set(_integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
         return dataclasses.replace(physics, qpos=late)
 
     def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
-        grip_pos, grip_vel = physics.qpos[self._grip_qpos], physics.qvel[self._grip_qvel]
+        grip_pos, grip_vel = self.arm.site_motion(physics.qpos[self.arm.qpos], physics.qvel[self.arm.qvel])
         blocked = jnp.zeros(2)
         finger_pos = physics.qpos[self._finger_qpos] if self.has_fingers else blocked
         finger_vel = physics.qvel[self._finger_qvel] if self.has_fingers else blocked
@@ -260,17 +262,8 @@ def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
     """A free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
     half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
     x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
-    w = jnp.cos(half_angle)
-    a, b, c, d = qpos[3:]
-    turned = jnp.array(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
-    return jnp.concatenate([qpos[:3] + dt * qvel[:3], turned])
+    turn = jnp.stack([jnp.cos(half_angle), x, y, z])
+    return jnp.concatenate([qpos[:3] + dt * qvel[:3], quat_multiply(qpos[3:], turn)])
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:

@@ -75,8 +75,9 @@ def test_reset_is_drawn_as_in_the_original(task):
     obs = jax.tree.map(np.asarray, jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 20_000)).obs)
     first = recorded["observation"][:, 0]
     grip = obs["observation"][:, :3]
-    np.testing.assert_allclose(grip, np.tile(first[0, :3], (len(grip), 1)), atol=1e-6)
-    np.testing.assert_allclose(obs["observation"][0, 20:23], first[0, 20:23], atol=1e-6)
+    np.testing.assert_allclose(grip, np.tile(first[0, :3], (len(grip), 1)), atol=5e-6)
+    # But for the 3 mm/s at which the original's torso creeps upwards.
+    np.testing.assert_allclose(obs["observation"][0, 20:23], first[0, 20:23], atol=1.4e-4)
     offset = obs["achieved_goal"][:, :2] - grip[:, :2]
     assert np.linalg.norm(offset, axis=1).min() >= 0.1 - 1e-6
     assert np.abs(offset).max() <= env.task.object_range + 1e-6
@@ -122,8 +123,10 @@ def test_batching_is_vmap_in_any_nesting(engine):
     alone = jax.jit(episode)
     for i in range(2):
         for j in range(3):
-            # native is exact; under vmap MJX's solver stops with the slowest environment, and sums are reordered
-            np.testing.assert_allclose(nested[i, j], alone(keys[i, j], actions[i, j]), atol=0 if engine == "native" else 5e-3)
+            # native: rounding in the arm's kinematics; under vmap MJX's solver stops with the slowest environment, too
+            np.testing.assert_allclose(
+                nested[i, j], alone(keys[i, j], actions[i, j]), atol=1e-4 if engine == "native" else 5e-3
+            )
 
 
 def test_native_is_a_plain_loop_over_mj_step(native):
@@ -137,76 +140,104 @@ def test_native_is_a_plain_loop_over_mj_step(native):
     for action in np.random.default_rng(0).uniform(-1, 1, (5, 4)).astype(np.float32):
         data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
         data.qacc_warmstart[:] = state.physics.warmstart
-        data.mocap_pos[0] = np.float32(state.physics.qpos[:3]) + np.float32(0.05) * action[:3]
+        pos, quat = native.arm.pose(state.physics.qpos[native.arm.qpos])
+        data.mocap_pos[0], data.mocap_quat[0] = pos + np.float32(0.05) * action[:3], quat + np.float32([1, 0, 1, 0])
         for _ in range(20):
             mujoco.mj_step(model, data)
         state = step(state, action)
-        np.testing.assert_array_equal(state.physics.qpos, data.qpos.astype(np.float32))
-        np.testing.assert_array_equal(state.physics.qvel, data.qvel.astype(np.float32))
+        # The target is computed in float32 in another order; all else is the same.
+        np.testing.assert_allclose(state.physics.qpos, data.qpos, atol=1e-5)
+        np.testing.assert_allclose(state.physics.qvel, data.qvel, atol=1e-3)
 
 
 def replay(env, recorded, episodes):
     """(grip [E, T+1, 3], object [E, T+1, 3]) of recorded actions, open loop from the recorded start."""
 
-    def one(grip, qpos, goal, actions):
+    def one(qpos, goal, actions):
         def step(state, action):
             state = env.step(state, action)
-            return state, state.physics.qpos
+            return state, state.obs["observation"][:6]
 
-        state = env.init_state(grip, qpos, goal)
+        state = env.init_state(qpos, goal)
         _, path = jax.lax.scan(step, state, actions)
-        return jnp.concatenate([state.physics.qpos[None], path])
+        return jnp.concatenate([state.obs["observation"][None, :6], path])
 
-    starts = (recorded["grip"][episodes, 0], recorded["object_qpos"][episodes, 0], recorded["goal"][episodes])
+    starts = (recorded["object_qpos"][episodes, 0], recorded["goal"][episodes])
     path = np.asarray(jax.jit(jax.vmap(one))(*starts, recorded["action"][episodes]))
-    return path[..., :3], path[..., 3:6]
+    return path[..., :3], path[..., 3:]
 
 
-def test_open_loop_replay_follows_the_original(native, recorded):
-    """A first bound on fidelity, on all 90 recorded episodes; docs/fidelity.md has what was measured."""
-    grip, obj = replay(native, recorded, slice(None))
-    error = np.linalg.norm(grip - recorded["grip"], axis=-1)
-    assert error.mean() < 0.008
-    moved, moved_there = (np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) > 0.02 for path in (obj, recorded["achieved"]))
-    assert np.mean(moved == moved_there) >= 0.95
-    final = np.linalg.norm(obj[:, -1] - recorded["achieved"][:, -1], axis=-1)
-    assert np.median(final[recorded["policy"] == 2]) < 0.015
+@pytest.mark.parametrize(("task", "object_error"), [("push", 0.010), ("pick_and_place", 0.005), ("slide", 0.020)])
+def test_open_loop_replay_follows_the_original(task, object_error):
+    """On the 30 recorded scripted episodes of each task; docs/fidelity.md has what was measured."""
+    env, recorded = envs.make(task, engine="native"), load_recorded(task)
+    episodes = np.flatnonzero(recorded["policy"] == 2)
+    grip, obj = replay(env, recorded, episodes)
+    there, grip_there = recorded["achieved"][episodes], recorded["grip"][episodes]
+    error = np.linalg.norm(grip - grip_there, axis=-1)
+    assert error.mean() < 0.002
+    assert np.percentile(error, 95) < 0.008
+    moved, moved_there = (np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) > 0.02 for path in (obj, there))
+    assert np.mean(moved == moved_there) >= 0.97
+    assert np.median(np.linalg.norm(obj[:, -1] - there[:, -1], axis=-1)) < object_error
 
 
 def test_engines_follow_the_same_episode(native, recorded):
     """`jax` against `native` on recorded scripted episodes.
 
     Both integrate the same model. `native` works in float64 with its solver run to 1e-8; `jax` in float32 with 4 Newton
-    iterations a substep, and its box-box collision makes up to 4 contact points where C makes up to 8. Where nothing is
-    touched, rounding is all there is: 0.1 mm after 50 steps. In contact the solver's cap and the contact points
-    add up to a millimetre or two of the gripper's place; the cube's place is compared over the 10 steps from the start, because
-    a push amplifies any difference (the original does, too, when its start is moved by 0.1 mm).
+    iterations a substep, and its box-box collision makes up to 4 contact points where C makes up to 8. The
+    cube's place is compared over the 10 steps from the start, because a push amplifies any difference (the original does, too,
+    when its start is moved by 0.1 mm).
     """
     env = envs.make("push", engine="jax")
     episodes = np.flatnonzero(recorded["policy"] == 2)[:8]
     (grip_a, obj_a), (grip_b, obj_b) = (replay(e, recorded, episodes) for e in (native, env))
     error = np.linalg.norm(grip_a - grip_b, axis=-1)
-    assert error.mean() < 2e-3
-    assert np.percentile(error, 95) < 5e-3
+    # Measured 4.0 and 8.1 mm: the solver's cap costs most where the fingers press on the table.
+    assert error.mean() < 6e-3
+    assert np.percentile(error, 95) < 12e-3
     assert np.linalg.norm(obj_a - obj_b, axis=-1)[:, :10].max() < 2e-3
 
-    # High above the table, nothing touches.
-    free = dict(recorded, grip=recorded["grip"] + np.float32([0, 0, 0.3]))
-    grip_a, grip_b = (replay(e, free, episodes[:2])[0] for e in (native, env))
-    assert np.linalg.norm(grip_a - grip_b, axis=-1).max() < 1e-4
+
+def test_engines_agree_where_nothing_is_touched():
+    """Rounding and the solver's cap alone: 0.2 mm after 20 steps of free motion."""
+    actions = jax.random.uniform(jax.random.key(0), (20, 4), minval=-0.5, maxval=0.5)
+
+    def path(engine):
+        env = envs.make("reach", engine=engine)
+        step = lambda state, action: (env.step(state, action),) * 2  # noqa: E731
+        return jax.jit(lambda: jax.lax.scan(step, env.init_state(None, jnp.ones(3)), actions)[1].obs["achieved_goal"])()
+
+    native, mjx = path("native"), path("jax")
+    assert np.ptp(native, axis=0).max() > 0.02
+    assert np.linalg.norm(native - mjx, axis=-1).max() < 2e-4
+
+
+def test_the_puck_slides_alike_on_both_engines():
+    """A puck set in motion, and left alone: the same distance, and friction 0.1 stops it where Coulomb says."""
+    start, speed = jnp.array([1.2, 0.75, 0.42, 1, 0, 0, 0]), 0.5
+    for engine in ENGINES:
+        env = envs.make("slide", engine=engine)
+        state = env.init_state(start, jnp.ones(3))
+        qvel = state.physics.qvel.at[env._object_qvel].set(jnp.array([speed, 0, 0, 0, 0, 0]))
+        state = state.replace(physics=state.physics.replace(qvel=qvel))
+        end = jax.jit(lambda s, env=env: jax.lax.fori_loop(0, 30, lambda _, s: env.step(s, jnp.zeros(4)), s))(state)
+        travelled = end.obs["achieved_goal"] - start[:3]
+        np.testing.assert_allclose(travelled, [speed**2 / (2 * 0.1 * 9.81), 0, 0], atol=0.004)
 
 
 def test_the_object_rests_and_the_table_holds_it(native):
-    """Left alone with the gripper lifted away, the cube stays within 0.1 mm of where it was put."""
-    state = native.init_state(jnp.array([1.3, 0.75, 0.6]), jnp.array([1.4, 0.8, 0.42489222, 1, 0, 0, 0]), jnp.ones(3))
+    """Left alone, away from the gripper, the cube stays within 0.1 mm of where it was put."""
+    state = native.init_state(jnp.array([1.4, 0.9, 0.42489222, 1, 0, 0, 0]), jnp.ones(3))
     step = jax.jit(native.step)
     for _ in range(50):
         state = step(state, jnp.zeros(4))
-    assert np.linalg.norm(state.obs["achieved_goal"] - np.array([1.4, 0.8, 0.42489222])) < 1e-4
+    assert np.linalg.norm(state.obs["achieved_goal"] - np.array([1.4, 0.9, 0.42489222])) < 1e-4
 
 
 def test_an_object_off_the_table_falls_to_the_floor_and_no_further(native):
-    state = native.init_state(jnp.array([1.3, 0.75, 0.6]), jnp.array([1.7, 0.75, 0.42, 1, 0, 0, 0]), jnp.ones(3))
+    state = native.init_state(jnp.array([1.7, 0.75, 0.42, 1, 0, 0, 0]), jnp.ones(3))
     step = jax.jit(native.step)
     for _ in range(50):
         state = step(state, jnp.zeros(4))
@@ -251,7 +282,6 @@ def test_bad_actions_are_refused(native, action, message):
         (("push",), {"reward_type": "sprase"}, "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
         (("push",), {"distance_threshold": 0}, "distance_threshold must be greater than 0; got 0"),
         (("push",), {"episode_length": 0}, "episode_length must be at least 1; got 0"),
-        (("slide", "jax"), {}, r"engine jax cannot simulate this task .*CYLINDER.*; engine native can"),
         (("push",), {"colour": 1}, "option of engine native must be one of num_threads; got 'colour'"),
         (("push",), {"engine": "jax", "num_threads": 1}, "option of engine jax must be one of iterations, ls_iterations"),
     ],
@@ -278,4 +308,4 @@ def test_register(monkeypatch):
 def test_physics_has_the_shapes_it_says(native):
     physics = native.reset(jax.random.key(7)).physics
     assert isinstance(physics, Physics)
-    assert (physics.qpos.shape, physics.qvel.shape, physics.warmstart.shape) == ((10,), (9,), (9,))
+    assert (physics.qpos.shape, physics.qvel.shape, physics.warmstart.shape) == ((14,), (13,), (13,))

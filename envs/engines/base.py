@@ -23,6 +23,6 @@ class Engine(Protocol):
 
     name: str
 
-    def advance(self, physics: Physics, mocap_pos: Array, ctrl: Array) -> Physics:
-        """One environment step later; mocap_pos [3] in m and ctrl [nu] are held meanwhile."""
+    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
+        """One environment step later; meanwhile the mocap body is held at `target` [7] (position, m, and w, x, y, z)."""
         ...

@@ -35,16 +35,16 @@ class NativeEngine:
         # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self._substeps = substeps
-        # Where qpos, qvel, warmstart and mocap_pos end in the packed rows; ctrl is the rest.
-        self._ends = np.cumsum([model.nq, model.nv, model.nv, 3])
+        # Where qpos, qvel, warmstart and the target end in the packed rows; ctrl is the rest.
+        self._ends = np.cumsum([model.nq, model.nv, model.nv, 7])
         self._num_threads = num_threads or usable_cores()
         self._batches: dict[int, Batch] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
 
-    def advance(self, physics: Physics, mocap_pos: Array, ctrl: Array) -> Physics:
+    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
         # One array in and one out: each costs the callback some 20 microseconds.
         state = jnp.concatenate([physics.qpos, physics.qvel, physics.warmstart])
-        inputs = jnp.concatenate([state, mocap_pos, ctrl])
+        inputs = jnp.concatenate([state, target, ctrl])
         result = jax.ShapeDtypeStruct(state.shape, jnp.float32)
         state = jax.pure_callback(self._advance, result, inputs, vmap_method="broadcast_all")
         qpos, qvel, warmstart = jnp.split(state, self._ends[:2].tolist())
@@ -53,13 +53,14 @@ class NativeEngine:
     def _advance(self, inputs: Any) -> np.ndarray:
         """The host side: `inputs` leads with any number of batch axes. NumPy only: JAX calls could deadlock."""
         rows = np.asarray(inputs).reshape(-1, inputs.shape[-1])
-        qpos, qvel, warmstart, mocap_pos, ctrl = np.split(rows, self._ends, axis=1)
+        qpos, qvel, warmstart, target, ctrl = np.split(rows, self._ends, axis=1)
         with self._lock:
             batch = self._batch(len(rows))
             batch.bind("qpos")[:] = qpos
             batch.bind("qvel")[:] = qvel
             batch.bind("qacc_warmstart")[:] = warmstart
-            batch.bind("mocap_pos")[:, 0] = mocap_pos
+            batch.bind("mocap_pos")[:, 0] = target[:, :3]
+            batch.bind("mocap_quat")[:, 0] = target[:, 3:]
             if self._model.nu:
                 batch.bind("ctrl")[:] = ctrl
             batch.step(nstep=self._substeps)
