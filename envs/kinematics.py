@@ -53,7 +53,7 @@ class Chain:
         return site, jnp.sum(rates[:, None] * jnp.cross(axes, site - anchors), axis=0)
 
     def _walk(self, angles: Array) -> tuple[Array, Array, Array, Array]:
-        """Position [3] and orientation [4] of the body; places [J, 3] and axes [J, 3] of the joints; all in the world's frame."""
+        """Position [3] and orientation [4] of the body; places and axes [J, 3] of the joints; all in the world's frame."""
         pos, quat = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
         anchors: list[Array] = []
         axes: list[Array] = []
