@@ -67,6 +67,8 @@ class HParams(NamedTuple):
     """Adam's step size for the actor."""
     critic_lr: float = 1e-3
     """Adam's step size for the critic."""
+    lr_end: float = 1.0
+    """Share of both step sizes that is left at the end of the run, reached linearly; 1 (constant) in the paper."""
     gamma: float = 0.98
     """Discount; target values are clipped to [-1/(1-gamma), 0]."""
     polyak: float = 0.95
@@ -213,6 +215,7 @@ def _sampler_names() -> tuple[str, ...]:
 _HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
     "actor_lr": (0, True, 1, True),
     "critic_lr": (0, True, 1, True),
+    "lr_end": (0, True, 1, True),
     "gamma": (0, True, 1, False),
     "polyak": (0, True, 1, True),
     "action_l2": (0, True, math.inf, False),

@@ -65,6 +65,7 @@ def make_train(env: Env, config: Config) -> Train:
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
     updates_per_target = config.target_period
     targets_per_cycle = config.updates_per_cycle // updates_per_target
+    num_cycles = config_lib.num_epochs(config, env.episode_length) * config.cycles_per_epoch
 
     def init(key: PRNGKey, hparams: HParams) -> TrainState:
         key, learner_key = jax.random.split(key)
@@ -93,6 +94,7 @@ def make_train(env: Env, config: Config) -> Train:
 
     def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
         counts = replay.count_eventful(ring)
+        hparams = anneal(hparams, learner.num_updates / (num_cycles * config.updates_per_cycle))
 
         def update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
             row_key, sample_key, relabel_key = jax.random.split(key, 3)
@@ -147,6 +149,12 @@ def make_train(env: Env, config: Config) -> Train:
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def anneal(hparams: HParams, progress: Array | float) -> HParams:
+    """The numbers that hold once a share `progress` of the run's updates is done: step sizes fall linearly to `lr_end` of them."""
+    left = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
+    return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 
 
 def episode_template(env: Env) -> Episode:

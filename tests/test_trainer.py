@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,3 +171,22 @@ def test_train_refuses_before_it_compiles():
         next(iter(trainer.train(ENV, SMALL, HParams(gamma=1.0), on_compile=called.append)))
     assert not called
     assert ddpg  # the learner is reachable as a component
+
+
+def test_step_sizes_fall_linearly_to_their_end():
+    hparams = HParams(actor_lr=0.2, critic_lr=0.4, lr_end=0.25)
+    for progress, left in ((0.0, 1.0), (0.5, 0.625), (1.0, 0.25), (2.0, 0.25)):
+        now = trainer.anneal(hparams, progress)
+        np.testing.assert_allclose((now.actor_lr, now.critic_lr), (0.2 * left, 0.4 * left), rtol=1e-6)
+        assert now.gamma == hparams.gamma
+
+
+def test_a_run_ends_with_the_step_sizes_at_their_end():
+    """With lr_end 0 the last of many small epochs hardly moves the actor, the first one does."""
+    long = dataclasses.replace(LEARNS, total_steps=20 * config.steps_per_epoch(LEARNS, ENV.episode_length))
+    params = [jax.device_get(p.state.learner.params.actor) for p in trainer.train(ENV, long, HParams(lr_end=0.0))]
+    first, last = (
+        max(float(np.abs(a - b).max()) for a, b in zip(jax.tree.leaves(params[i]), jax.tree.leaves(params[i + 1])))
+        for i in (0, -2)
+    )
+    assert last < 0.2 * first
