@@ -152,7 +152,7 @@ def make_train(env: Env, config: Config) -> Train:
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:
-    """The numbers that hold once a share `progress` of the run's updates is done: step sizes fall linearly to `lr_end` of them."""
+    """The numbers once a share `progress` of the run's updates is done: step sizes fall linearly to `lr_end` of themselves."""
     left = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
     return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 

@@ -44,8 +44,8 @@ class _Weld:
     """The part of the weld's acceleration that is due to velocity, which MJX leaves out and MuJoCo C and Warp put in.
 
     With r the weld's residual, MuJoCo asks for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: a gripper on
-    an arm that moves at 1 m/s is then pulled aside by 1 mm in half a second. The weld must be of a mocap body (which counts as at
-    rest) to a moving body, with their frames made to coincide.
+    an arm that moves at 1 m/s is then pulled aside by 1 mm in half a second. The weld must be of a mocap body (which counts as
+    at rest) to a moving body, with their frames made to coincide.
     """
 
     def __init__(self, model: mujoco.MjModel):
