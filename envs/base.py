@@ -21,6 +21,7 @@ class State:
     reward: Array  # [] of the step that led here; 0 after a reset
     success: Array  # [] 1.0 where the achieved goal is within reach of the desired goal, else 0.0
     step: Array  # [] steps taken, int32
+    failed: Array | bool = False  # [] whether the physics blew up in this episode, which is then not to be learned from
 
 
 class GoalEnv(abc.ABC):

@@ -21,6 +21,8 @@ from mjx_dher.envs.kinematics import Chain, quat_multiply
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # of 2 ms: 25 actions a second
+MAX_OBJECT_SPEED = 10.0  # m/s; and
+MAX_JOINT_SPEED = 100.0  # rad/s or, of a finger, m/s: beyond these the physics has blown up
 ACTION_SCALE = 0.05  # m that an action of 1 asks for
 RESET_CANDIDATES = 64  # object positions drawn at once; all lie too close with probability < 1e-6 in any task
 TIMESTEP = 0.002  # s
@@ -102,12 +104,7 @@ class FetchEnv(GoalEnv):
           object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
           desired_goal: [3] m.
         """
-        qpos = jnp.zeros(self.model.nq).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos))
-        if self.has_object:
-            qpos = qpos.at[self._object_qpos].set(object_qpos)
-        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
-        qvel = jnp.zeros(self.model.nv).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel))
-        physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
+        physics = self._start(object_qpos)
         obs = self._observe(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
             physics=physics,
@@ -115,12 +112,14 @@ class FetchEnv(GoalEnv):
             reward=jnp.zeros(()),
             success=self._success(obs["achieved_goal"], obs["desired_goal"]),
             step=jnp.zeros((), jnp.int32),
+            failed=jnp.zeros((), bool),
         )
 
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
 
-        `action[3]` opens and closes the fingers where the task has any that move.
+        `action[3]` opens and closes the fingers where the task has any that move. Should the physics blow up (a value that is
+        not finite, or a speed out of all reason), the state goes back to a start, and `failed` stays True until `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be; and
@@ -130,14 +129,44 @@ class FetchEnv(GoalEnv):
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
         ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.has_fingers else jnp.zeros(0)
         physics = self.engine.advance(state.physics, target, ctrl)
+        sound = self._is_sound(physics)
+        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._start(self._resting_place()))
+        failed = state.failed | ~sound
         obs = self._observe(self._seen(physics), state.obs["desired_goal"])
         return State(
             physics=physics,
             obs=obs,
             reward=self.compute_reward(obs["achieved_goal"], obs["desired_goal"]),
-            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
+            success=jnp.where(failed, 0.0, self._success(obs["achieved_goal"], obs["desired_goal"])),
             step=state.step + 1,
+            failed=failed,
         )
+
+    def _start(self, object_qpos: Array | None) -> Physics:
+        qpos = jnp.zeros(self.model.nq).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos))
+        if self.has_object:
+            qpos = qpos.at[self._object_qpos].set(object_qpos)
+        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
+        qvel = jnp.zeros(self.model.nv).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel))
+        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
+
+    def _resting_place(self) -> Array | None:
+        """[7] where the object is put after the physics has blown up: beside the gripper, as near as a reset would."""
+        if self.task.object_height is None:
+            return None
+        x, y, _ = self.task.initial_grip_pos
+        return jnp.array([x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0])
+
+    def _is_sound(self, physics: Physics) -> Array:
+        """[] whether this can be a state of the task. Comparisons with NaN are false, so NaN never passes."""
+        qpos, qvel = physics.qpos, physics.qvel
+        sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
+        sound &= jnp.all(jnp.abs(qvel[self.arm.qvel]) < MAX_JOINT_SPEED)
+        if self.has_fingers:
+            sound &= jnp.all(jnp.abs(qvel[self._finger_qvel]) < MAX_JOINT_SPEED)
+        if self.has_object:
+            sound &= jnp.linalg.norm(qvel[self._object_qvel][:3]) < MAX_OBJECT_SPEED
+        return sound
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """Sparse: 0 within `distance_threshold`, else -1. Dense: minus the distance, m. [..., 3], [..., 3] -> [...]."""

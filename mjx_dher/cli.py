@@ -1,4 +1,4 @@
-"""The command line: `train` (the default command) and `eval`."""
+"""The command line: `train` (the default command), `eval`, `render` and `transfer`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import __version__, config, envs, run_folder, stats
+from mjx_dher import __version__, config, envs, render, run_folder, stats
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -34,7 +34,8 @@ EVAL_CHUNK = 500  # episodes evaluated at once
 class TrainArgs:
     """Train a policy with DDPG and Hindsight Experience Replay.
 
-    Other commands: `eval RUN` evaluates a run again (see `eval --help`).
+    Other commands: `eval RUN` evaluates a run again, `render RUN` draws it, `transfer RUN` plays it in the original Fetch task
+    (see `eval --help` and so on).
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -63,10 +64,61 @@ class EvalArgs:
     """Physics: native, jax or auto; the run's own unless given."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RenderArgs:
+    """Play the policy of a run folder, or a task with random actions, and draw it: a video, or stills side by side.
+
+    Needs no screen (EGL or OSMesa draw; MUJOCO_GL chooses) but the extra: `pip install -e ".[video]"`.
+    """
+
+    out: Path
+    """File to write: .mp4, .gif or .png (stills of the first episode). Its folder must be there."""
+    run: tyro.conf.Positional[Path | None] = None
+    """The run folder; or else give --env."""
+    env: str | None = None
+    """Without a run folder: the environment, played with uniformly random actions."""
+    episodes: int = 4
+    """Episodes to play, one after the other."""
+    seed: int = 1
+    """Of the starts, the goals and the random actions."""
+    engine: str | None = None
+    """Physics: native, jax or auto; the run's own unless given."""
+    width: int = 640
+    """Of a picture, pixels."""
+    height: int = 480
+    """Of a picture, pixels."""
+    overwrite: bool = False
+    """Replace `out` if it is there already."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TransferArgs:
+    """Play the policy of a run folder, unchanged, in the original task of gymnasium-robotics and here, and compare.
+
+    The original needs an older MuJoCo, and so an environment of its own: --set-up makes it once.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """The run folder."""
+    episodes: int = FINAL_EPISODES
+    """Episodes to play, there and here."""
+    seed: int = 1000
+    """Of the first episode there (the next ones follow), and of those here."""
+    set_up: bool = False
+    """Make the originals' environment in the user's cache folder, if it is not there yet (a download of 200 MB)."""
+    python: Path | None = None
+    """The Python of an environment that has the original tasks; the one that --set-up makes unless given."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (2: the arguments were refused)."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    commands: dict[str, Callable[[list[str], Console], int]] = {"train": train_command, "eval": eval_command}
+    commands: dict[str, Callable[[list[str], Console], int]] = {
+        "train": train_command,
+        "eval": eval_command,
+        "render": render_command,
+        "transfer": transfer_command,
+    }
     name = argv.pop(0) if argv and argv[0] in commands else "train"
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
@@ -162,7 +214,7 @@ class _Training:
                 soft_wrap=True,
             )
         outcome = play(env, learned, args.final_episodes, args.seed + 1)
-        result = report(outcome, console)
+        result = report(outcome.success, outcome.reset_success, outcome.ret, console)
         run_folder.write_json(
             self.folder / run_folder.RESULT_FILE,
             {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result},
@@ -203,7 +255,76 @@ def eval_command(argv: list[str], console: Console) -> int:
     policy = load_policy(args.run)
     env = envs.make(run.config.env, engine=args.engine or run.config.engine)
     console.print(f"{run.config.env}: {args.episodes} episodes, seed {args.seed}, physics {_engine_name(env)} ...")
-    report(play(env, policy, args.episodes, args.seed), console)
+    outcome = play(env, policy, args.episodes, args.seed)
+    report(outcome.success, outcome.reset_success, outcome.ret, console)
+    return 0
+
+
+def render_command(argv: list[str], console: Console) -> int:
+    """`render`: draws episodes of a run's policy, or of random actions."""
+    args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
+    render.check(args.out, args.width, args.height, args.overwrite)
+    _check_count("episodes", args.episodes)
+    if args.engine is not None:
+        config.check_name("engine", args.engine, config.ENGINES)
+    if args.run is not None and args.env is None:
+        from mjx_dher.policy import load_policy
+
+        played, policy = run_folder.read_config(args.run).config, load_policy(args.run)
+    elif args.env is not None and args.run is None:
+        config.check_name("env", args.env, envs.list_envs())
+        played, policy = Config(env=args.env), None
+    else:
+        raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
+    render.ffmpeg()
+    gl = render.choose_gl()
+    env: Any = envs.make(played.env, engine=args.engine or played.engine)  # Any: a GoalEnv need not have a model
+    import jax
+    import jax.numpy as jnp
+
+    def act(obs, key):
+        if policy is None:
+            return jax.random.uniform(key, (args.episodes, env.action_size), minval=-1.0, maxval=1.0)
+        return policy.forward(obs["observation"], obs["desired_goal"], jnp)
+
+    console.print(
+        f"{played.env}: {args.episodes} episodes{'' if policy else ' of random actions'}, seed {args.seed},"
+        f" physics {_engine_name(env)}, drawn with {gl} ..."
+    )
+    qpos, goals, success = render.play(env, act, args.seed, args.episodes)
+    pictures = (env.model, qpos, goals, args.width, args.height)
+    render.write(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
+    console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)
+    return 0
+
+
+def transfer_command(argv: list[str], console: Console) -> int:
+    """`transfer RUN`: plays the policy of a run folder in the original task."""
+    args = tyro.cli(TransferArgs, prog="train.py transfer", args=argv)
+    _check_count("episodes", args.episodes)
+    run = run_folder.read_config(args.run)
+    from mjx_dher import originals
+    from mjx_dher.policy import load_policy
+
+    policy = load_policy(args.run)
+    environment = originals.default_environment()
+    if args.set_up:
+        console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
+        originals.set_up(environment)
+    python = args.python or originals.interpreter(environment)
+    name = originals.check(run.config.env, python)
+    env = envs.make(run.config.env, engine=run.config.engine)
+    console.print(f"{name}, {args.episodes} episodes ...")
+    there = originals.play_apart(args.run, python, args.episodes, args.seed, workers=os.cpu_count() or 1)
+    report_there = report(there["success"], there["reset_success"], there["ret"], console)
+    console.print(f"{run.config.env} here, {args.episodes} episodes, physics {_engine_name(env)} ...")
+    here = play(env, policy, args.episodes, args.seed)
+    report_here = report(here.success, here.reset_success, here.ret, console)
+    low, high = stats.difference_interval(
+        int(there["success"].sum()), len(there["success"]), int(here.success.sum()), len(here.success)
+    )
+    difference = report_there["success_rate"] - report_here["success_rate"]
+    console.print(f"there minus here {difference:+.3f} (95 % interval {low:+.3f} to {high:+.3f})")
     return 0
 
 
@@ -226,17 +347,17 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
 
 
-def report(outcome: Outcome, console: Console) -> dict[str, Any]:
-    """Prints success with its interval, success at reset and mean return; returns them."""
-    trials = len(outcome.success)
-    low, high = stats.wilson_interval(int(outcome.success.sum()), trials)
+def report(success: Any, reset_success: Any, ret: Any, console: Console) -> dict[str, Any]:
+    """Prints success with its interval, success at reset and mean return of episodes (arrays [N]); returns them."""
+    trials = len(success)
+    low, high = stats.wilson_interval(int(success.sum()), trials)
     result = {
         "episodes": trials,
-        "success_rate": float(outcome.success.mean()),
+        "success_rate": float(success.mean()),
         "success_low": low,
         "success_high": high,
-        "reset_success_rate": float(outcome.reset_success.mean()),
-        "return_mean": float(outcome.ret.mean()),
+        "reset_success_rate": float(reset_success.mean()),
+        "return_mean": float(ret.mean()),
     }
     console.print(
         f"success {result['success_rate']:.3f} (95 % interval {low:.3f} to {high:.3f}, {trials} episodes);"

@@ -131,7 +131,16 @@ def preset(name: str, env: str) -> tuple[Config, HParams]:
             batch_size=1024,
             total_steps=600_000,
         )
-        return config, HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
+        hparams = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
+        if env == "reach":
+            config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=32_000)
+        elif env == "pick_and_place":
+            config = dataclasses.replace(config, total_steps=1_000_000)
+            hparams = hparams._replace(noise_std=0.2, lr_end=0.05)
+        elif env == "slide":
+            config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
+            hparams = hparams._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
+        return config, hparams
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     config = Config(

@@ -100,12 +100,18 @@ def explore(noise: Noise, action: Array) -> Array:
     return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
 
 
-def update_normalizers(state: DDPGState, observation: Array, goal: Array, hparams: HParams) -> DDPGState:
-    """The state after its normalizers saw observations [..., D] and goals [..., G]."""
+def update_normalizers(
+    state: DDPGState, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
+) -> DDPGState:
+    """The state after its normalizers saw observations [..., D] and goals [..., G].
+
+    `valid`, where given, is [N] and says which of the observations [N, ..., D] to see; the goals are seen if any of it is true.
+    """
+    seen = None if valid is None else valid.reshape(-1, *(1,) * (observation.ndim - 2))
     return dataclasses.replace(
         state,
-        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip),
-        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip),
+        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip, seen),
+        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip, None if valid is None else jnp.any(valid)),
     )
 
 

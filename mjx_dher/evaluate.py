@@ -16,9 +16,14 @@ def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episod
 
 
 def summary(outcome: Outcome) -> dict[str, Array]:
-    """Means over the episodes; all []."""
+    """Means over the episodes; all []. An episode that is not valid counts as a failure and has no return."""
     return {
         "success_rate": jnp.mean(outcome.success),
         "reset_success_rate": jnp.mean(outcome.reset_success),
-        "return_mean": jnp.mean(outcome.ret),
+        "return_mean": return_mean(outcome),
     }
+
+
+def return_mean(outcome: Outcome) -> Array:
+    """[] mean return of the valid episodes; 0 where there is none."""
+    return jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)) / jnp.maximum(jnp.sum(outcome.valid), 1)

@@ -22,13 +22,19 @@ def init(size: int) -> NormalizerState:
     return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
 
 
-def update(state: NormalizerState, values: Array, clip: Array | float) -> NormalizerState:
-    """The moments with `values` [..., D] added, after clipping them to +- `clip`."""
+def update(state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None) -> NormalizerState:
+    """The moments with `values` [..., D] added, after clipping them to +- `clip`.
+
+    `valid` broadcasts against [..., 1] and says which of them to add, whatever the others hold; all, where None.
+    """
+    seen = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
+    seen = seen.reshape(-1, 1)
     values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
-    batch_mean = jnp.mean(values, axis=0)
-    batch_var = jnp.mean(jnp.square(values - batch_mean), axis=0)
-    count = state.count + values.shape[0]
-    share = values.shape[0] / count
+    number = jnp.sum(seen).astype(jnp.float32)
+    batch_mean = jnp.sum(jnp.where(seen, values, 0.0), axis=0) / jnp.maximum(number, 1.0)
+    batch_var = jnp.sum(jnp.where(seen, jnp.square(values - batch_mean), 0.0), axis=0) / jnp.maximum(number, 1.0)
+    count = state.count + number
+    share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean
     return NormalizerState(
         count=count,

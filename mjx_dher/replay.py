@@ -66,13 +66,14 @@ def capacity(state: ReplayState) -> int:
     return state.episodes.action.shape[0]
 
 
-def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False) -> ReplayState:
+def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False, valid: Array | None = None) -> ReplayState:
     """The ring with `episodes` (leaves lead with [N]) written over its oldest.
 
     Args:
       state: the ring.
       episodes: N of them.
       eventful: [N], or one for all: whether an episode belongs to those that `draw_rows` can draw more often.
+      valid: [N] which of them to write; the others leave no trace. All, where None.
 
     Raises:
       ValueError: more episodes at once than the ring holds.
@@ -80,12 +81,24 @@ def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False) -
     num_new, num_rows = episodes.action.shape[0], capacity(state)
     if num_new > num_rows:
         raise ValueError(f"cannot add {num_new} episodes at once to a ring of {num_rows}")
-    rows = (state.cursor + jnp.arange(num_new, dtype=jnp.int32)) % num_rows
+    order = jnp.arange(num_new, dtype=jnp.int32)
+    written: Array | int = num_new
+    if valid is not None:
+        order = jnp.cumsum(valid, dtype=jnp.int32) - 1
+        written = order[-1] + 1
+    rows = (state.cursor + order) % num_rows
+    if valid is not None:
+        # Out of bounds, so that the write is dropped; each its own, because indices are promised to be unique.
+        rows = jnp.where(valid, rows, num_rows + jnp.arange(num_new, dtype=jnp.int32))
+
+    def write(ring: Array, new: Array | bool) -> Array:
+        return ring.at[rows].set(new, mode="drop", unique_indices=True)
+
     return ReplayState(
-        episodes=jax.tree.map(lambda ring, new: ring.at[rows].set(new, unique_indices=True), state.episodes, episodes),
-        eventful=state.eventful.at[rows].set(eventful, unique_indices=True),
-        cursor=(state.cursor + num_new) % num_rows,
-        size=jnp.minimum(state.size + num_new, num_rows),
+        episodes=jax.tree.map(write, state.episodes, episodes),
+        eventful=write(state.eventful, eventful),
+        cursor=(state.cursor + written) % num_rows,
+        size=jnp.minimum(state.size + written, num_rows),
     )
 
 

@@ -20,6 +20,7 @@ class Outcome(NamedTuple):
     success: Array  # 1.0 where the goal is reached at the last step
     reset_success: Array  # 1.0 where it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
+    valid: Array  # whether all that was seen is finite and the environment did not say `failed`, bool
 
 
 def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None) -> tuple[Episode, Outcome]:
@@ -54,4 +55,9 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
         desired_goal=first.obs["desired_goal"],
         action=jnp.moveaxis(action, 0, 1),
     )
-    return episodes, Outcome(success=last.success, reset_success=first.success, ret=jnp.sum(reward, axis=0))
+    seen = (episodes.observation, episodes.achieved_goal, episodes.desired_goal, episodes.action, jnp.moveaxis(reward, 0, 1))
+    valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,))
+    for leaf in jax.tree.leaves(seen):
+        valid &= jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+    ret = jnp.sum(reward, axis=0)
+    return episodes, Outcome(success=jnp.where(valid, last.success, 0.0), reset_success=first.success, ret=ret, valid=valid)

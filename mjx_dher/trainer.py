@@ -53,7 +53,7 @@ def make_train(env: Env, config: Config) -> Train:
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
     and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
     evaluation; train_success_rate and train_return_mean of the exploring policy, and the eventful_share of its episodes;
-    critic_loss, actor_loss and q_mean.
+    critic_loss, actor_loss and q_mean; discarded_episodes, of which the physics blew up and which were not learned from.
 
     Raises:
       ValueError: a Config that cannot run, or an observation that is not one vector.
@@ -83,14 +83,14 @@ def make_train(env: Env, config: Config) -> Train:
             env_steps=jnp.zeros((), jnp.int32),
         )
 
-    def see(learner: DDPGState, episodes: Episode, hparams: HParams, key: PRNGKey) -> DDPGState:
+    def see(learner: DDPGState, episodes: Episode, valid: Array, hparams: HParams, key: PRNGKey) -> DDPGState:
         """Shows the new episodes to the normalizers, with goals distributed as the learner will meet them."""
         num_new, num_steps = episodes.action.shape[:2]
-        fresh = replay.add(replay.init(template, num_new), episodes)
+        fresh = replay.add(replay.init(template, num_new), episodes, valid=valid)
         sample_key, relabel_key = jax.random.split(key)
         sample = replay.sample(fresh, sample_key, num_new * num_steps)
         batch = relabel(fresh, sample, sampler, env.compute_reward, hparams, relabel_key)
-        return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams)
+        return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
 
     def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
         counts = replay.count_eventful(ring)
@@ -121,12 +121,15 @@ def make_train(env: Env, config: Config) -> Train:
         noise = ddpg.exploration_noise(noise_key, env.episode_length, config.num_envs, env.action_size, hparams)
         episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise)
         eventful = is_eventful(episodes, env.compute_reward)
-        ring = replay.add(state.replay, episodes, eventful)
-        learner = see(state.learner, episodes, hparams, see_key)
-        learner, losses = learn(learner, ring, hparams, learn_key)
+        ring = replay.add(state.replay, episodes, eventful, outcome.valid)
+        learner = see(state.learner, episodes, outcome.valid, hparams, see_key)
+        learned, losses = learn(learner, ring, hparams, learn_key)
+        # No episode yet: nothing was learned.
+        learner = jax.tree.map(lambda new, old: jnp.where(replay.can_sample(ring), new, old), learned, learner)
         metrics = {
             "train_success_rate": jnp.mean(outcome.success),
-            "train_return_mean": jnp.mean(outcome.ret),
+            "train_return_mean": evaluate.return_mean(outcome),
+            "discarded_episodes": jnp.sum(~outcome.valid),
             "eventful_share": jnp.mean(eventful),
             **losses._asdict(),
         }
@@ -145,7 +148,8 @@ def make_train(env: Env, config: Config) -> Train:
         outcome = evaluate.evaluate(
             env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), eval_key, config.eval_episodes
         )
-        metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles)
+        discarded = jnp.sum(cycles.pop("discarded_episodes"))
+        metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles) | {"discarded_episodes": discarded}
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
@@ -153,7 +157,7 @@ def make_train(env: Env, config: Config) -> Train:
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:
     """The numbers once a share `progress` of the run's updates is done: step sizes fall linearly to `lr_end` of themselves."""
-    left = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
+    left: Any = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
     return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 
 

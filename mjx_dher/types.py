@@ -54,7 +54,10 @@ RewardFn = Callable[[Array, Array], Array]
 
 
 class EnvState(Protocol):
-    """What the trainer reads of an environment's state; the rest belongs to the environment."""
+    """What the trainer reads of an environment's state; the rest belongs to the environment.
+
+    A state may have `failed`, [] bool: True when the episode is not to be learned from, as after its physics blew up.
+    """
 
     @property
     def obs(self) -> GoalObs: ...

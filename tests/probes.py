@@ -55,3 +55,38 @@ class Clock(PointMass):
 
     def step(self, state: ProbeState, action: Array) -> ProbeState:
         return self._state(state.obs["achieved_goal"] + action, state.obs["desired_goal"])
+
+
+@struct.dataclass
+class ExplodingState(ProbeState):
+    step: Array
+    failed: Array
+
+
+class Explodes(PointMass):
+    """PointMass of which the episodes that start beyond `edge` break at their third step.
+
+    `value` then stands in their observations for one step; None: they say `failed` and show nothing.
+    """
+
+    EDGE = 0.2
+
+    def __init__(self, value: float | None, edge: float = EDGE):
+        super().__init__()
+        self.value, self.edge = value, edge
+
+    def reset(self, key) -> ExplodingState:
+        state = super().reset(key)
+        breaks = state.obs["achieved_goal"][0] > self.edge
+        # Counts up from 0 in an episode that will break, from 100 in any other.
+        return ExplodingState(state.obs, state.reward, state.success, jnp.where(breaks, 0, 100), jnp.zeros((), bool))
+
+    def step(self, state: ExplodingState, action: Array) -> ExplodingState:
+        following = super().step(state, action)
+        step, obs = state.step + 1, following.obs
+        if self.value is None:
+            failed = state.failed | (step == 3)
+        else:
+            failed = state.failed
+            obs = obs | {"observation": jnp.where(step == 3, self.value, obs["observation"])}
+        return ExplodingState(obs, following.reward, following.success, step, failed)

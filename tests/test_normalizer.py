@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -42,3 +43,12 @@ def test_values_are_clipped_before_they_count():
 
 def test_nothing_seen_is_the_identity():
     np.testing.assert_allclose(normalizer.normalize(normalizer.init(2), jnp.array([0.5, -2.0]), 0.01, 5.0, 200.0), [0.5, -2])
+
+
+def test_only_valid_values_are_seen():
+    values = jnp.array([[1.0, 2.0], [jnp.nan, 5.0], [3.0, 8.0]])
+    valid = jnp.array([True, False, True])
+    state = normalizer.update(normalizer.init(2), values, 200.0, valid)
+    expected = normalizer.update(normalizer.init(2), values[valid], 200.0)
+    jax.tree.map(np.testing.assert_array_equal, state, expected)
+    jax.tree.map(np.testing.assert_array_equal, normalizer.update(state, values, 200.0, jnp.zeros(3, bool)), state)

@@ -108,3 +108,21 @@ def test_sample_takes_the_rows_it_is_given():
     ring = replay.add(make_ring(6), make_episodes([1, 2, 3]))
     sample = replay.sample(ring, jax.random.key(0), 4, jnp.array([2, 0, 2, 1]))
     np.testing.assert_array_equal(sample.desired_goal[:, 0], [3500, 1500, 3500, 2500])
+
+
+def test_only_valid_episodes_are_written():
+    """The others leave the ring as if they had never been: rows, cursor and size, over the wrap-around too."""
+    four = make_episodes([10, 11, 12, 13])
+    ring = jax.jit(replay.add)(ring_of_two(), four, jnp.array([True, False, True, True]), jnp.array([False, True, False, True]))
+    expected = replay.add(ring_of_two(), make_episodes([11, 13]), jnp.array([False, True]))
+    jax.tree.map(np.testing.assert_array_equal, ring, expected)
+    ring = replay.add(ring, make_episodes([14, 15]), True, jnp.array([False, True]))
+    expected = replay.add(expected, make_episodes([15]), True)
+    jax.tree.map(np.testing.assert_array_equal, ring, expected)
+    assert (int(ring.cursor), int(ring.size)) == (1, 4)
+    untouched = replay.add(ring, make_episodes([16, 17]), True, jnp.zeros(2, bool))
+    jax.tree.map(np.testing.assert_array_equal, untouched, ring)
+
+
+def ring_of_two():
+    return replay.add(make_ring(4), make_episodes([1, 2]), jnp.array([True, False]))

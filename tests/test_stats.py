@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 from mjx_dher import stats
@@ -22,3 +23,12 @@ def test_wilson_interval(successes, trials, low, high):
 def test_what_is_no_success_rate_is_refused(successes, trials):
     with pytest.raises(ValueError, match="need 0 <= successes <= trials"):
         stats.wilson_interval(successes, trials)
+
+
+def test_difference_interval():
+    """Newcombe's (1998) example (a): 56 of 70 against 48 of 80 gives 0.0524 to 0.3339."""
+    np.testing.assert_allclose(stats.difference_interval(56, 70, 48, 80), (0.0524, 0.3339), atol=5e-5)
+    low, high = stats.difference_interval(500, 500, 500, 500)
+    assert low < 0 < high
+    with pytest.raises(ValueError, match="trials"):
+        stats.difference_interval(1, 0, 1, 2)

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, config, ddpg, make_train, trainer
+from mjx_dher import Config, HParams, config, ddpg, make_train, replay, trainer
 from mjx_dher.rollout import rollout
-from probes import PointMass
+from probes import Explodes, PointMass
 
 ENV = PointMass()
 SMALL = Config(
@@ -61,9 +61,37 @@ def test_an_epoch_counts_what_it_does():
     assert state.learner.goal_norm.count == 4 * 3 * 10
     assert set(metrics) == {
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "eventful_share"),
-        *("critic_loss", "actor_loss", "q_mean"),
+        *("critic_loss", "actor_loss", "q_mean", "discarded_episodes"),
     }
+    assert metrics["discarded_episodes"] == 0
     assert all(value.shape == () and jnp.isfinite(value) for value in metrics.values())
+
+
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf, None])
+def test_episodes_that_blow_up_leave_no_trace(value):
+    """A quarter of all starts ends in NaN, Inf or a `failed` state: counted exactly, in no ring, in no normalizer."""
+    env = Explodes(value)
+    program = make_train(env, dataclasses.replace(SMALL, num_envs=8, cycles_per_epoch=1, replay_size=1000))
+    first = program.init(jax.random.key(0), HParams())
+    state, metrics = jax.jit(program.epoch)(first)
+    kept = int(state.replay.size)
+    assert 0 < kept < 8
+    assert metrics["discarded_episodes"] == 8 - kept
+    goals = np.asarray(state.replay.episodes.achieved_goal[:kept])
+    assert goals[:, 0, 0].max() <= Explodes.EDGE
+    assert state.learner.observation_norm.count == kept * 11
+    np.testing.assert_allclose(state.learner.observation_norm.mean, goals.reshape(-1, 2).mean(0), rtol=1e-5)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.learner, metrics)))
+
+
+def test_without_any_valid_episode_nothing_is_learned():
+    program = make_train(Explodes(jnp.nan, edge=-1.0), SMALL)
+    first = program.init(jax.random.key(0), HParams())
+    state, metrics = jax.jit(program.epoch)(first)
+    assert metrics["discarded_episodes"] == 4 * 3
+    assert metrics["success_rate"] == 0
+    jax.tree.map(np.testing.assert_array_equal, state.learner, first.learner)
+    assert not replay.can_sample(state.replay)
 
 
 def test_targets_follow_every_target_period():

@@ -34,6 +34,9 @@ class NativeEngine:
         self._model = copy.copy(model)
         # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        # MuJoCo would silently put a simulation that blows up back to qpos0, all bodies at the world's origin: the environment
+        # is to see it instead.
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._substeps = substeps
         # Where qpos, qvel, warmstart and the target end in the packed rows; ctrl is the rest.
         self._ends = np.cumsum([model.nq, model.nv, model.nv, 7])

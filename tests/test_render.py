@@ -1,0 +1,207 @@
+import json
+import os
+import subprocess
+import sys
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from mjx_dher import cli, config, envs, policy, render, run_folder
+
+NO_GL = 77  # exit status of SCRIPT where nothing can draw
+
+# In a process of its own: MuJoCo chooses how to draw when it is imported, which other tests have done.
+SCRIPT = """
+import sys
+from pathlib import Path
+import numpy as np
+from mjx_dher import cli, envs, render
+
+folder = Path(sys.argv[1])
+try:
+    render.choose_gl()
+except ValueError as error:
+    print(error)
+    sys.exit(77)
+import jax
+
+def picture(env, qpos, goal):
+    return next(render.draw(env.model, [qpos], goal, 320, 240))
+
+frames = {}
+for name in envs.list_envs():
+    env = envs.make(name, engine="native")
+    state = env.reset(jax.random.key(0))
+    frames[name] = picture(env, np.asarray(state.physics.qpos), np.asarray(state.obs["desired_goal"]))
+
+env = envs.make("push", engine="native")
+qpos = np.array(env.reset(jax.random.key(0)).physics.qpos)
+place = env._object_qpos.start
+for key, shift in (("near", 0.1), ("far", -0.1)):  # along x, away from the robot and towards it
+    frames["goal_" + key] = picture(env, qpos, np.array([1.3 + shift, 0.6, 0.425]))
+    qpos[place : place + 2] = 1.3 + shift, 0.6
+    frames["object_" + key] = picture(env, qpos, np.array([1.3, 0.9, 0.425]))
+np.savez(folder / "frames.npz", **frames)
+
+small = ["--width", "96", "--height", "64"]
+codes = [
+    cli.main(["render", str(folder / "run"), "--out", str(folder / "run.gif"), "--episodes", "2", *small]),
+    cli.main(["render", "--env", "reach", "--out", str(folder / "reach.png"), "--episodes", "1", *small]),
+]
+assert codes == [0, 0]
+"""
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """(folder, pictures by name, what the commands printed) of SCRIPT."""
+    folder = tmp_path_factory.mktemp("render")
+    settings = config.Config(env="push")
+    run_folder.create(folder / "run", run_folder.RunConfig(settings, config.HParams(), 0, "native"), {})
+    still = policy.Policy(
+        layers=((np.zeros((28, 4)), np.zeros(4)),),
+        observation_mean=np.zeros(25),
+        observation_std=np.ones(25),
+        goal_mean=np.zeros(3),
+        goal_std=np.ones(3),
+        norm_clip=5.0,
+        obs_clip=200.0,
+    )
+    still.save(folder / "run" / run_folder.POLICY_FILE)
+    done = subprocess.run([sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode == NO_GL:
+        pytest.skip(f"nothing on this machine can draw: {done.stdout.strip()}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    with np.load(folder / "frames.npz") as file:
+        return folder, dict(file), done.stdout
+
+
+def centre(picture, colour):
+    """(row, column) of the middle of all pixels in which one channel stands out; None without such."""
+    channel = {"red": 0, "blue": 2}[colour]
+    rest = np.delete(picture.astype(int), channel, axis=-1).max(axis=-1)
+    found = np.argwhere(picture[..., channel] - rest > 60)
+    return found.mean(axis=0) if len(found) > 20 else None
+
+
+def test_every_task_shows_its_goal_and_its_object(drawn):
+    _, frames, _ = drawn
+    for name in envs.list_envs():
+        assert frames[name].shape == (240, 320, 3)
+        assert centre(frames[name], "red") is not None, name
+        assert (centre(frames[name], "blue") is None) == (name == "reach")
+
+
+@pytest.mark.parametrize(("what", "colour"), [("goal", "red"), ("object", "blue")])
+def test_a_thing_moved_is_drawn_moved(drawn, what, colour):
+    _, frames, _ = drawn
+    near, far = (centre(frames[f"{what}_{where}"], colour) for where in ("near", "far"))
+    assert near[0] > far[0] + 20  # the camera looks at the robot: nearer to the camera is lower in the picture
+
+
+def test_the_command_writes_every_frame(drawn):
+    folder, _, printed = drawn
+    assert frames_in(folder / "run.gif", 96, 64) == 2 * (51 + render.HOLD)
+    assert "push: 2 episodes, seed 1, physics native, drawn with " in printed
+    assert f"of 2; wrote {folder / 'run.gif'}\n" in printed
+
+
+def test_without_a_run_a_task_is_played_with_random_actions(drawn):
+    folder, _, printed = drawn
+    assert frames_in(folder / "reach.png", 96 * render.STILLS, 64) == 1
+    assert "reach: 1 episodes of random actions, seed 1, physics native" in printed
+    assert {path.name for path in folder.iterdir()} == {"run", "run.gif", "reach.png", "frames.npz"}
+
+
+def frames_in(path, width, height):
+    """How many pictures of this size a file holds."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "image2pipe", "-c:v", "ppm", "-"]
+    return subprocess.run(command, capture_output=True, check=True).stdout.count(f"P6\n{width} {height}\n255\n".encode())
+
+
+def moving(count):
+    """`count` pictures, no two alike."""
+    frames = np.full((count, 64, 96, 3), 200, np.uint8)
+    for index, frame in enumerate(frames):
+        frame[20:40, 2 * index : 2 * index + 20] = (255, 0, 0)
+    return frames
+
+
+@pytest.mark.parametrize(("suffix", "count"), [(".mp4", 12), (".gif", 12), (".GIF", 12), (".png", 1)])
+def test_what_is_written_can_be_read(tmp_path, suffix, count):
+    render.write(tmp_path / f"out{suffix}", moving(count))
+    assert frames_in(tmp_path / f"out{suffix}", 96, 64) == count
+    assert os.listdir(tmp_path) == [f"out{suffix}"]
+
+
+def test_a_file_stays_whole_when_its_successor_fails(tmp_path):
+    def breaks():
+        yield moving(1)[0]
+        raise RuntimeError("cannot draw")
+
+    out = tmp_path / "out.mp4"
+    out.write_text("before")
+    with pytest.raises(RuntimeError, match="cannot draw"):
+        render.write(out, breaks())
+    with pytest.raises(ValueError, match=r"out: cannot write .*out\.mp4 \("):
+        render.write(out, np.zeros((3, 65, 65, 3), np.uint8))  # H.264 takes even sizes only
+    assert out.read_text() == "before"
+    assert os.listdir(tmp_path) == ["out.mp4"]
+
+
+OUT = ["--out", "there-is-none.gif"]
+BAD = [
+    (["--env", "push", "--out", "x.avi"], ["out must end in .mp4, .gif, .png; got 'x.avi'"]),
+    (["--env", "push", "--out", "x"], ["out must end in .mp4, .gif, .png; got 'x'"]),
+    (["--env", "push", "--out", "nowhere/x.gif"], ["out: there is no folder nowhere"]),
+    (["--env", "push", "--out", "docs/push_learning_curve.png"], ["learning_curve.png is there already", "--overwrite"]),
+    (["--env", "push", *OUT, "--width", "641"], ["width must be an even integer from 64 to 2048; got 641"]),
+    (["--env", "push", *OUT, "--width", "0", "--height", "9999"], ["width must be", "height must be", "got 9999"]),
+    (["--env", "push", *OUT, "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
+    (["--env", "pusch", *OUT], ["env must be one of", "(did you mean 'push'?)"]),
+    (["--env", "push", *OUT, "--engine", "wrap"], ["engine must be one of auto, native, jax; got 'wrap'"]),
+    (OUT, ["render takes either a run folder or --env (one of pick_and_place, push"]),
+    (["docs", "--env", "push", *OUT], ["render takes either a run folder or --env"]),
+    (["docs", *OUT], ["docs is not a run folder: it has no config.json"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "messages"), BAD)
+def test_bad_arguments_are_refused(argv, messages, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert cli.main(["render", *argv]) == 2
+    error = capsys.readouterr().err
+    assert all(line.startswith("error: ") for line in error.splitlines())
+    for message in messages:
+        assert message in error
+
+
+def test_bad_arguments_are_refused_before_jax_or_mujoco_load():
+    code = f"""
+import sys
+from mjx_dher.cli import main
+assert all(main(["render", *argv]) == 2 for argv in {json.dumps([argv for argv, _ in BAD])})
+assert not {{"jax", "mujoco"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    with pytest.raises(ValueError, match=r"tried MUJOCO_GL=nonsense \(.*Install EGL or OSMesa.*libegl1.*libosmesa6"):
+        render.choose_gl()
+
+
+def test_mujoco_must_not_have_chosen_already(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco", object())
+    with pytest.raises(ValueError, match="imported already: set MUJOCO_GL"):
+        render.choose_gl()
+
+
+def test_the_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ValueError, match=r'pip install -e "\.\[video\]"'):
+        render.ffmpeg()
