@@ -1,29 +1,88 @@
-"""Open-loop replay of recorded episodes of the original task: how far does the rebuilt one stray?
+"""Open-loop replay of recorded episodes of the original tasks: how far do the rebuilt ones stray?
 
-    python bench/fidelity.py [--engine native] [--tasks push pick_and_place slide]
+    python bench/fidelity.py [--engines native jax] [--tasks push pick_and_place slide]
 
-Starts, goals and actions are those of tests/data/fetch_TASK.npz (see tests/data/README.md); nothing is fed back in 50 steps.
+Starts, goals and actions are those of tests/data/fetch_TASK.npz; nothing is fed back in 50 steps. With all tasks and both
+engines, which takes some minutes, it puts its tables into docs/fidelity.md and draws docs/fidelity_trajectories.png (extra
+`plot`); with fewer it only prints.
+
+The yardstick beside them is the original, replayed in the same way with its object's start moved by 0.1 mm. That runs in an
+environment of its own, which needs a MuJoCo older than ours, and writes tests/data/fetch_yardstick.csv:
+
+    python -m venv .fetch && .fetch/bin/pip install gymnasium-robotics==1.4.2 mujoco==3.11.0
+    PYTHONPATH=. .fetch/bin/python bench/fidelity.py yardstick
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import csv
+import io
+import warnings
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from timing import print_table
 
-from mjx_dher import envs
+ROOT = Path(__file__).parent.parent
+DATA = ROOT / "tests" / "data"
+YARDSTICK = DATA / "fetch_yardstick.csv"
+DOCUMENT = ROOT / "docs" / "fidelity.md"
+PICTURE = ROOT / "docs" / "fidelity_trajectories.png"
+BEGIN, END = "<!-- fidelity: begin -->", "<!-- fidelity: end -->"
 
-DATA = Path(__file__).parent.parent / "tests" / "data"
+TASKS = ("push", "pick_and_place", "slide")
+ENGINES = ("native", "jax")
 KINDS = ("random actions", "script with noise", "script")
+HEAD = ("task", "episodes", "run by", "grip, mean", "p95", "object, median", "p95", "moved agrees", "success agrees")
 MOVED = 0.02  # m
+SHIFTS = (0.0, 1e-4)  # m, of the yardstick
+DIRECTIONS = 4  # that the yardstick moves each start in
+PUCK_SPEED, FRICTION, GRAVITY = 0.5, 0.1, 9.81  # m/s, -, m/s^2
+
+
+def load(task):
+    """The recorded episodes; bench/record_fetch.py says what the arrays are."""
+    with np.load(DATA / f"fetch_{task}.npz") as file:
+        return {name: file[name] for name in file.files}
+
+
+def figures(recorded, grip, obj, of):
+    """Cells for the columns of HEAD from "grip, mean" on; mm and percent.
+
+    Args:
+      recorded: the task's episodes.
+      grip: [K, T+1, 3] m, of K replayed ones.
+      obj: [K, 2, 3] the object's first and last place in them, m.
+      of: [K] which of the recorded they replay.
+    """
+    there, goal = recorded["achieved"][of][:, [0, -1]], recorded["goal"][of]
+    grip_error = 1e3 * np.linalg.norm(grip - recorded["grip"][of], axis=-1)
+    object_error = 1e3 * np.linalg.norm(obj[:, 1] - there[:, 1], axis=-1)
+
+    def moved(ends):
+        return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1) > MOVED
+
+    def succeeded(ends):
+        return np.linalg.norm(ends[:, 1] - goal, axis=-1) < 0.05
+
+    return (
+        f"{grip_error.mean():.1f}",
+        f"{np.percentile(grip_error, 95):.1f}",
+        f"{np.median(object_error):.1f}",
+        f"{np.percentile(object_error, 95):.0f}",
+        f"{np.mean(moved(obj) == moved(there)):.0%}",
+        f"{np.mean(succeeded(obj) == succeeded(there)):.0%}",
+    )
+
+
+# The rebuilt tasks.
 
 
 def replay(env, recorded):
     """(grip, object) positions [E, T+1, 3] of the recorded actions from the recorded starts."""
+    import jax
+    import jax.numpy as jnp
 
     def one(object_qpos, desired_goal, actions):
         def step(state, action):
@@ -38,44 +97,184 @@ def replay(env, recorded):
     return path[..., :3], path[..., 3:]
 
 
-def compare(task, engine):
-    """Table rows of one task, a row for each kind of episode."""
-    with np.load(DATA / f"fetch_{task}.npz") as file:
-        recorded = {name: file[name] for name in file.files}
-    grip, obj = replay(envs.make(task, engine=engine), recorded)
-    grip_error = 1e3 * np.linalg.norm(grip - recorded["grip"], axis=-1)
-    object_error = 1e3 * np.linalg.norm(obj[:, -1] - recorded["achieved"][:, -1], axis=-1)
+def free_slide(engine):
+    """How far, in m, a puck goes that starts at PUCK_SPEED along x and that nothing touches but the table."""
+    import jax
+    import jax.numpy as jnp
 
-    def moved(path):
-        return np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) > MOVED
+    from mjx_dher import envs
 
-    def succeeded(path):
-        return np.linalg.norm(path[:, -1] - recorded["goal"], axis=-1) < 0.05
+    env = envs.make("slide", engine=engine)
+    state = env.init_state(jnp.array([1.2, 0.75, env.task.object_height, 1, 0, 0, 0]), jnp.ones(3))
+    first = state.obs["achieved_goal"]
+    velocity = env.model.joint("object").dofadr[0]
+    state = state.replace(physics=state.physics.replace(qvel=state.physics.qvel.at[velocity].set(PUCK_SPEED)))
+    state = jax.jit(lambda s: jax.lax.fori_loop(0, 30, lambda _, s: env.step(s, jnp.zeros(4)), s))(state)
+    return float(jnp.linalg.norm(state.obs["achieved_goal"] - first))
 
-    same_moved = moved(obj) == moved(recorded["achieved"])
-    same_success = succeeded(obj) == succeeded(recorded["achieved"])
-    for kind, name in enumerate(KINDS):
-        of = recorded["policy"] == kind
-        yield (
-            task,
-            name,
-            f"{grip_error[of].mean():.1f}",
-            f"{np.percentile(grip_error[of], 95):.0f}",
-            f"{np.median(object_error[of]):.1f}",
-            f"{np.percentile(object_error[of], 95):.0f}",
-            f"{same_moved[of].mean():.0%}",
-            f"{same_success[of].mean():.0%}",
-        )
+
+def between_engines(recorded, paths):
+    """Lines on how the two engines compare with one another on Slide."""
+    script = recorded["policy"] == KINDS.index("script")
+    apart = 1e3 * np.linalg.norm(paths["slide", "native"][1] - paths["slide", "jax"][1], axis=-1)[script, -1]
+    went = 1e3 * np.linalg.norm(np.diff(paths["slide", "native"][1][script][:, [0, -1]], axis=1), axis=-1)
+    coulomb = 1e3 * PUCK_SPEED**2 / (2 * FRICTION * GRAVITY)
+    free = {engine: 1e3 * free_slide(engine) for engine in ENGINES}
+    return [
+        f"- A puck at {PUCK_SPEED} m/s that nothing else touches slides {free['native']:.1f} mm on `native` and"
+        f" {free['jax']:.1f} mm on `jax`; v²/(2μg) is {coulomb:.1f} mm.",
+        f"- Hit by the recorded script, it ends {np.median(apart):.1f} mm (median; p95 {np.percentile(apart, 95):.0f} mm) from"
+        f" one engine to the other, after {np.median(went):.0f} mm on `native` in the median.",
+    ]
+
+
+def report(tasks, engines):
+    """(the block of docs/fidelity.md, the recorded episodes, the replayed (grip, object) by task and engine)."""
+    from timing import print_table
+
+    from mjx_dher import envs
+
+    recorded = {task: load(task) for task in tasks}
+    paths = {(task, engine): replay(envs.make(task, engine=engine), recorded[task]) for task in tasks for engine in engines}
+    with open(YARDSTICK) as file:
+        original = [row for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
+    rows = []
+    for task in tasks:
+        for kind, name in enumerate(KINDS):
+            of = recorded[task]["policy"] == kind
+            for engine in engines:
+                grip, obj = paths[task, engine]
+                rows.append((task, name, engine, *figures(recorded[task], grip[of], obj[of][:, [0, -1]], of)))
+            rows += [row for row in original if row[:2] == [task, name]]
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        print_table(HEAD, rows)
+        if "slide" in tasks and set(ENGINES) <= set(engines):
+            print("\nSlide, the two engines against one another:\n")
+            print("\n".join(between_engines(recorded["slide"], paths)))
+    return text.getvalue().strip(), recorded, paths
+
+
+def draw(recorded, paths):
+    """The picture: three scripted episodes of each task, recorded and replayed on `native`, from above and over time."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, len(TASKS), figsize=(12, 7.6), height_ratios=(1.5, 1), layout="constrained")
+    # Wide and pale below, thin and dark on top: readable without colour. Gripper and object differ in their line, too.
+    looks = {"gripper": ("#a9cbe8", "#0b3c6d", "-"), "object": ("#f5bd76", "#7a2a00", (0, (3, 2)))}
+    for (top, side), task in zip(axes.T, TASKS):
+        there = {"gripper": 1e2 * recorded[task]["grip"], "object": 1e2 * recorded[task]["achieved"]}
+        here = {name: 1e2 * path for name, path in zip(looks, paths[task, "native"])}
+        time = 0.04 * np.arange(there["object"].shape[1])
+        script = np.flatnonzero(recorded[task]["policy"] == KINDS.index("script"))
+        error = np.linalg.norm((here["object"] - there["object"])[script, -1], axis=-1)
+        # Not the best ones: those at 25, 50 and 90 % of the order by the object's error.
+        chosen = np.argsort(error)[[len(script) * share // 100 for share in (25, 50, 90)]]
+        for name, (pale, dark, line) in looks.items():
+            for episode in script[chosen]:
+                label = name if episode == script[chosen[0]] else None
+                for panel, *xy in (
+                    (top, there[name][episode, :, :2].T, here[name][episode, :, :2].T),
+                    (side, (time, there[name][episode, :, 2]), (time, here[name][episode, :, 2])),
+                ):
+                    panel.plot(*xy[0], color=pale, linewidth=5, solid_capstyle="round", label=label and f"{label}, original")
+                    panel.plot(*xy[1], color=dark, linewidth=1.2, linestyle=line, label=label and f"{label}, here")
+        for letter, episode in zip("ABC", script[chosen]):
+            label = top.annotate(letter, there["object"][episode, 0, :2], (6, 6), textcoords="offset points", weight="bold")
+            label.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5})
+            top.plot(*there["object"][episode, -1, :2], "o", color=looks["object"][0], markersize=10)
+            top.plot(*here["object"][episode, -1, :2], "o", color=looks["object"][1], markersize=4)
+        apart = ", ".join(f"{letter} {10 * e:.1f}" for letter, e in zip("ABC", error[chosen]))
+        top.set_title(f"{task}\nobject at the end, mm apart: {apart}", fontsize=10)
+        top.margins(0.08)
+        top.set_aspect("equal", adjustable="datalim")
+        top.set_xlabel("x, cm")
+        side.set_xlabel("time, s")
+        for panel in (top, side):
+            panel.grid(alpha=0.25)
+    axes[0, 0].set_ylabel("y, cm (from above)")
+    axes[1, 0].set_ylabel("z, cm")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.savefig(PICTURE, dpi=100, pil_kwargs={"optimize": True})
+
+
+def put_into_document(block):
+    """Replaces what stands between the markers in docs/fidelity.md; all else there is written by hand."""
+    text = DOCUMENT.read_text()
+    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
+    DOCUMENT.write_text(f"{text[:start]}\n{block}\n{text[end:]}")
+
+
+# The originals.
+
+
+def run_by(shift):
+    return f"original, moved {1e3 * shift:.1f} mm"
+
+
+def replay_original(env, recorded, shift, rng):
+    """Grip [E, T+1, 3] and the object's first and last place [E, 2, 3], m, in the original itself.
+
+    The object starts `shift` m from where it was recorded, in a random direction of the plane; the recording is rounded to
+    float32, so a shift of 0 is no exact replay either.
+    """
+    import mujoco
+
+    joint = env.model.joint("object0:joint")
+    qpos, qvel = int(joint.qposadr[0]), int(joint.dofadr[0])
+    grips, ends = [], []
+    for episode, actions in enumerate(recorded["action"]):
+        env.reset(seed=0)
+        start = recorded["object_qpos"][episode, 0].astype(float)
+        angle = rng.uniform(0, 2 * np.pi)
+        start[:2] += shift * np.array([np.cos(angle), np.sin(angle)])
+        env.data.qpos[qpos : qpos + 7] = start
+        env.data.qvel[qvel : qvel + 6] = recorded["object_qvel"][episode, 0]
+        mujoco.mj_forward(env.model, env.data)
+        seen = [env.step(action)[0]["observation"][:6] for action in actions]
+        grips.append([recorded["grip"][episode, 0], *(obs[:3] for obs in seen)])
+        ends.append([start[:3], seen[-1][3:]])
+    return np.array(grips), np.array(ends)
+
+
+def yardstick():
+    """Writes what the report says of the originals, replayed from starts moved by SHIFTS."""
+    import gymnasium as gym
+    import gymnasium_robotics
+
+    from mjx_dher.originals import ORIGINALS
+
+    warnings.filterwarnings("ignore")
+    gym.register_envs(gymnasium_robotics)
+    rng = np.random.default_rng(0)
+    with open(YARDSTICK, "w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(HEAD)
+        for task in TASKS:
+            env, recorded = gym.make(ORIGINALS[task]).unwrapped, load(task)
+            for shift in SHIFTS:
+                runs = [replay_original(env, recorded, shift, rng) for _ in range(DIRECTIONS if shift else 1)]
+                grip, ends = (np.concatenate(parts) for parts in zip(*runs))
+                for kind, name in enumerate(KINDS):
+                    of = np.flatnonzero(recorded["policy"] == kind)
+                    rows = (len(recorded["policy"]) * np.arange(len(runs))[:, None] + of).ravel()
+                    row = (task, name, run_by(shift), *figures(recorded, grip[rows], ends[rows], np.tile(of, len(runs))))
+                    out.writerow(row)
+                    print(*row, flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--engine", default="auto")
-    parser.add_argument("--tasks", nargs="+", default=["push", "pick_and_place", "slide"])
+    parser.add_argument("mode", nargs="?", choices=("report", "yardstick"), default="report")
+    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=ENGINES)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
     args = parser.parse_args()
-    rows = [row for task in args.tasks for row in compare(task, args.engine)]
-    head = ("task", "episodes", "grip, mean", "p95", "object at the end, median", "p95", "moved agrees", "success agrees")
-    print_table(head, rows)
+    if args.mode == "yardstick":
+        return yardstick()
+    block, recorded, paths = report(args.tasks, args.engines)
+    print(block)
+    if set(args.tasks) == set(TASKS) and set(args.engines) == set(ENGINES):
+        put_into_document(block)
+        draw(recorded, paths)
 
 
 if __name__ == "__main__":
