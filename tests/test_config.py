@@ -18,7 +18,7 @@ def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
     assert c.hidden_sizes == (256, 256, 256)
     assert (h.actor_lr, h.critic_lr, h.gamma, h.polyak, h.action_l2) == (1e-3, 1e-3, 0.98, 0.95, 1.0)
     assert (h.random_eps, h.noise_std, h.her_k) == (0.3, 0.2, 4.0)
-    assert h.eventful_share == 0.0  # what the paper does not have is off
+    assert (h.eventful_share, h.lr_end) == (0.0, 1.0)  # what the paper does not have is off
     assert (h.obs_clip, h.norm_clip, h.norm_eps) == (200.0, 5.0, 0.01)
 
 
