@@ -5,7 +5,8 @@
 A line a task: episodes whose physics blew up (and was put back to a start), the object's greatest speed after any step, the
 share of episodes that end with any two geoms deeper than 5 mm in each other, and the deepest. Exits with 1 where an episode
 ended with a value that is not finite, an object faster than 10 m/s, or geoms deeper than 5 cm (a cube) in each other. The
-contacts are the original's, and soft: slammed from above, the cube sinks up to 50 mm into the table there, up to 47 here (bench/README.md).
+contacts are the original's, and soft: slammed from above, the cube sinks up to 50 mm into the table there, up to 47 here
+(bench/README.md).
 """
 
 from __future__ import annotations
