@@ -133,7 +133,7 @@ def preset(name: str, env: str) -> tuple[Config, HParams]:
         )
         hparams = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
         if env == "reach":
-            config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=32_000)
+            config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
         elif env == "pick_and_place":
             config = dataclasses.replace(config, total_steps=1_000_000)
             hparams = hparams._replace(noise_std=0.2, lr_end=0.05)
