@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import __version__, config, envs, render, run_folder, stats
+from mjx_dher import __version__, config, envs, run_folder, stats
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -262,6 +262,8 @@ def eval_command(argv: list[str], console: Console) -> int:
 
 def render_command(argv: list[str], console: Console) -> int:
     """`render`: draws episodes of a run's policy, or of random actions."""
+    from mjx_dher import render
+
     args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     _check_count("episodes", args.episodes)
@@ -304,6 +306,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     _check_count("episodes", args.episodes)
     run = run_folder.read_config(args.run)
     from mjx_dher import originals
+    from mjx_dher.envs.engines.native import usable_cores
     from mjx_dher.policy import load_policy
 
     policy = load_policy(args.run)
@@ -315,7 +318,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     name = originals.check(run.config.env, python)
     env = envs.make(run.config.env, engine=run.config.engine)
     console.print(f"{name}, {args.episodes} episodes ...")
-    there = originals.play_apart(args.run, python, args.episodes, args.seed, workers=os.cpu_count() or 1)
+    there = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
     report_there = report(there["success"], there["reset_success"], there["ret"], console)
     console.print(f"{run.config.env} here, {args.episodes} episodes, physics {_engine_name(env)} ...")
     here = play(env, policy, args.episodes, args.seed)

@@ -81,15 +81,11 @@ def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False, v
     num_new, num_rows = episodes.action.shape[0], capacity(state)
     if num_new > num_rows:
         raise ValueError(f"cannot add {num_new} episodes at once to a ring of {num_rows}")
-    order = jnp.arange(num_new, dtype=jnp.int32)
-    written: Array | int = num_new
-    if valid is not None:
-        order = jnp.cumsum(valid, dtype=jnp.int32) - 1
-        written = order[-1] + 1
-    rows = (state.cursor + order) % num_rows
-    if valid is not None:
-        # Out of bounds, so that the write is dropped; each its own, because indices are promised to be unique.
-        rows = jnp.where(valid, rows, num_rows + jnp.arange(num_new, dtype=jnp.int32))
+    valid = jnp.ones(num_new, bool) if valid is None else valid
+    order = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    written = order[-1] + 1
+    # Out of bounds where not valid, so that the write is dropped; each its own, because indices are promised to be unique.
+    rows = jnp.where(valid, (state.cursor + order) % num_rows, num_rows + jnp.arange(num_new, dtype=jnp.int32))
 
     def write(ring: Array, new: Array | bool) -> Array:
         return ring.at[rows].set(new, mode="drop", unique_indices=True)
