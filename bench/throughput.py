@@ -1,11 +1,14 @@
 """Environment steps a second, inside a jitted rollout as training makes it: the policy network and exploration included.
 
-python bench/throughput.py [--env push] [--engines native jax] [--num-envs 16 32 128]
+    python bench/throughput.py [--env push pick_and_place slide] [--engines native jax] [--num-envs 16 32 128]
+
+On a GPU: --engines warp --num-envs 2048 8192 32768.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 
 import jax
@@ -19,14 +22,14 @@ from mjx_dher.rollout import rollout
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="push")
+    parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engines", nargs="+", default=["native", "jax"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[16, 32, 128])
     args = parser.parse_args()
     hparams = HParams()
     rows = []
-    for engine in args.engines:
-        env = envs.make(args.env, engine=engine)
+    for task, engine in itertools.product(args.env, args.engines):
+        env = envs.make(task, engine=engine)
         networks = Networks(actor=Actor(env.action_size), critic=Critic())
         learner = ddpg.init(jax.random.key(0), networks, env.observation_size, env.goal_size, env.action_size)
         for num_envs in args.num_envs:
@@ -41,10 +44,11 @@ def main() -> None:
             jax.block_until_ready(play(jax.random.key(1)))
             compiled = time.perf_counter() - start
             keys = iter(jax.random.split(jax.random.key(2), 100))
-            seconds = median_seconds(lambda: play(next(keys)))
+            seconds = median_seconds(lambda: play(next(keys)), repeats=5)
             rate = num_envs * env.episode_length / seconds
-            rows.append((engine, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
-    print_table(("engine", "num_envs", "env steps/s", "first call, s"), rows)
+            env.check()
+            rows.append((task, engine, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
+    print_table(("task", "engine", "num_envs", "env steps/s", "first call, s"), rows)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pathlib import Path
 from timing import print_table
 
 from mjx_dher import config, envs, policy, stats
-from mjx_dher.cli import play
+from mjx_dher.cli import keep_compiled_programs, play
 from mjx_dher.trainer import train
 
 
@@ -25,7 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="push")
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--preset", default="default")
+    parser.add_argument("--preset", default=config.machine_preset())
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--threshold", type=float, default=0.9)
@@ -35,6 +35,7 @@ def main() -> None:
     static, hparams = config.preset(args.preset, args.env)
     static = dataclasses.replace(static, sampler=args.sampler, total_steps=args.total_steps or static.total_steps)
     env = envs.make(args.env, engine=args.engine)
+    keep_compiled_programs()
     rows, curve, compiled = [], [], []
     for seed in range(args.seeds):
         first = None

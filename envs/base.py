@@ -49,6 +49,12 @@ class GoalEnv(abc.ABC):
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """The reward for `achieved_goal` [..., G] under `desired_goal` [..., G], as [...]."""
 
+    def check(self) -> None:  # noqa: B027 - most have nothing to check
+        """Raises ValueError where the steps so far were not what they should be and their results do not show it.
+
+        To be called on the host once they are done, not while tracing.
+        """
+
     def check_action(self, action: Array) -> Array:
         """`action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
         shape = jnp.shape(action)

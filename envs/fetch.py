@@ -51,7 +51,7 @@ class FetchEnv(GoalEnv):
     """The Fetch arm and, but for reaching, an object; the goal is a place for it (or for the gripper).
 
     Args:
-      engine: "auto", "native" or "jax".
+      engine: "auto", "native", "jax" or "warp".
       reward_type: "sparse" (0 where the goal is reached, else -1) or "dense" (minus the distance).
       distance_threshold: how close, in m, counts as reached.
       episode_length: steps of an episode.
@@ -141,6 +141,9 @@ class FetchEnv(GoalEnv):
             step=state.step + 1,
             failed=failed,
         )
+
+    def check(self) -> None:
+        self.engine.check()
 
     def _start(self, object_qpos: Array | None) -> Physics:
         qpos = jnp.zeros(self.model.nq).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos))

@@ -74,7 +74,8 @@ class Chain:
 
 def quat_multiply(a: Array, b: Array) -> Array:
     """The rotation b followed by a, as quaternions [4] (w, x, y, z)."""
-    w = a[0] * b[0] - jnp.dot(a[1:], b[1:])
+    # A sum, not a dot product, whose precision on a GPU would be the learner's.
+    w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
 
 

@@ -40,8 +40,9 @@ class TrainArgs:
 
     config: Annotated[Config, tyro.conf.arg(name="")]
     hparams: Annotated[HParams, tyro.conf.arg(name="")]
-    preset: str = "default"
-    """default (tuned for time to success on a CPU) or paper (the paper's settings); other options override it."""
+    preset: str = "auto"
+    """cpu or gpu (tuned for time to success there), auto (the one for this machine) or paper (the paper's settings); other
+    options override it."""
     seed: int = 0
     """Of everything random."""
     out: Path | None = None
@@ -145,11 +146,14 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
       ValueError: one or more of them cannot be used.
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default="default")
+    early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
     chosen, _ = early.parse_known_args(argv)
-    base, hparams = config.preset(chosen.preset, chosen.env)
+    config.check_name("preset", chosen.preset, ("auto", *config.PRESETS))
+    preset = config.machine_preset() if chosen.preset == "auto" else chosen.preset
+    base, hparams = config.preset(preset, chosen.env)
     args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=TrainArgs(config=base, hparams=hparams))
+    args = dataclasses.replace(args, preset=preset)
     checks = (
         lambda: config.check_name("env", args.config.env, envs.list_envs()),
         lambda: config.validate(args.config, args.hparams),
@@ -173,6 +177,7 @@ class _Training:
 
         from mjx_dher import memory, policy, trainer
 
+        keep_compiled_programs()
         args, console = self.args, self.console
         env = envs.make(args.config.env, engine=args.config.engine)
         engine = _engine_name(env)
@@ -339,6 +344,8 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
 
     from mjx_dher.evaluate import evaluate
 
+    keep_compiled_programs()
+
     chunk = min(num_episodes, EVAL_CHUNK)
 
     @jax.jit
@@ -347,6 +354,7 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
 
     keys = jax.random.split(jax.random.key(seed), -(-num_episodes // chunk))
     outcomes = [jax.device_get(run(key)) for key in keys]
+    env.check()
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
 
 
@@ -368,6 +376,17 @@ def report(success: Any, reset_success: Any, ret: Any, console: Console) -> dict
         soft_wrap=True,
     )
     return result
+
+
+def keep_compiled_programs() -> None:
+    """Has JAX keep what it compiles in the user's cache folder, unless the user has chosen one.
+
+    A program that calls back to Python, as every one with native physics, cannot be kept.
+    """
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(run_folder.user_cache() / "xla"))
 
 
 def _row(progress: Progress, previous: Progress | None) -> dict[str, Any]:

@@ -1,22 +1,24 @@
 """What a training run is made of: `Config` (static) and `HParams` (traced), the presets, and all validation.
 
-This module imports neither JAX nor MuJoCo, so that a wrong argument is refused before either has been loaded.
+This module loads neither JAX nor MuJoCo (but for one question, `machine_preset`), so that a wrong argument is refused before
+either has been loaded.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib.util
 import math
 import sys
 from collections.abc import Iterable
 from typing import NamedTuple
 
-ENGINES = ("auto", "native", "jax")
+ENGINES = ("auto", "native", "jax", "warp")
 SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
 WEIGHT_KERNELS = ("linear", "inverse", "softmax")
 METRICS = ("position",)
-PRESETS = ("default", "paper")
+PRESETS = ("cpu", "gpu", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Config:
     metric: str = "position"
     """The distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by."""
     engine: str = "auto"
-    """Physics: native (MuJoCo C on all cores), jax (MJX) or auto (native on a CPU, jax elsewhere)."""
+    """Physics: native (MuJoCo C on all cores), warp (MuJoCo Warp on an NVIDIA GPU), jax (MJX) or auto, which picks."""
     num_envs: int = 16
     """Environments in parallel, and episodes a cycle."""
     cycles_per_epoch: int = 50
@@ -95,6 +97,15 @@ class HParams(NamedTuple):
     """Least standard deviation that the normalizers divide by."""
 
 
+def machine_preset() -> str:
+    """The preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin for one."""
+    if importlib.util.find_spec("jax_plugins") is None:
+        return "cpu"
+    import jax
+
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
 def episodes_capacity(config: Config, episode_length: int) -> int:
     """Whole episodes that the replay ring holds."""
     return config.replay_size // episode_length
@@ -113,34 +124,60 @@ def num_epochs(config: Config, episode_length: int) -> int:
 def preset(name: str, env: str) -> tuple[Config, HParams]:
     """The Config and HParams of a preset for an environment.
 
-    `default` is tuned for wall-clock time to success on a CPU (docs/design.md says how). `paper` is the set-up of
-    "Distance Based Replay Sampling in Hindsight Experience Replay": its workers' episodes are rolled out side by side,
-    and their averaged gradients are one gradient of the joint batch.
+    `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
+    warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
+    Replay": its workers' episodes are rolled out side by side, and their averaged gradients are one gradient of the joint
+    batch.
 
     Raises:
       ValueError: no such preset.
     """
     check_name("preset", name, PRESETS)
-    if name == "default":
-        config = Config(
-            env=env,
-            num_envs=32,
-            cycles_per_epoch=15,
-            updates_per_cycle=40,
-            target_period=1,
-            batch_size=1024,
-            total_steps=600_000,
+    if name == "paper":
+        return _paper(env)
+    return _cpu(env) if name == "cpu" else _gpu(env)
+
+
+_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
+
+
+def _cpu(env: str) -> tuple[Config, HParams]:
+    config = Config(env=env, num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
+    if env == "reach":
+        config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
+    elif env == "pick_and_place":
+        config = dataclasses.replace(config, total_steps=1_000_000)
+        return config, _TUNED._replace(noise_std=0.2, lr_end=0.05)
+    elif env == "slide":
+        config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
+        return config, _TUNED._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
+    return config, _TUNED
+
+
+def _gpu(env: str) -> tuple[Config, HParams]:
+    config = Config(
+        env=env,
+        num_envs=2048,
+        cycles_per_epoch=3,
+        updates_per_cycle=1000,
+        target_period=1,
+        batch_size=1024,
+        total_steps=1_500_000,
+        replay_size=2_000_000,
+    )
+    if env == "reach":
+        config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
+    elif env in ("pick_and_place", "slide"):
+        total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
+        config = dataclasses.replace(
+            config, cycles_per_epoch=5, updates_per_cycle=500, total_steps=total_steps, replay_size=4_000_000
         )
-        hparams = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
-        if env == "reach":
-            config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
-        elif env == "pick_and_place":
-            config = dataclasses.replace(config, total_steps=1_000_000)
-            hparams = hparams._replace(noise_std=0.2, lr_end=0.05)
-        elif env == "slide":
-            config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
-            hparams = hparams._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
-        return config, hparams
+        hparams = _TUNED._replace(noise_std=0.1, random_eps=0.2, lr_end=0.05)
+        return config, hparams if env == "pick_and_place" else hparams._replace(gamma=0.97, her_k=8.0)
+    return config, _TUNED
+
+
+def _paper(env: str) -> tuple[Config, HParams]:
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     config = Config(

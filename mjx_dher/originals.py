@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher.policy import load_policy
-from mjx_dher.run_folder import read_config
+from mjx_dher.run_folder import read_config, user_cache
 
 ORIGINALS = {
     "push": "FetchPush-v4",
@@ -38,8 +38,7 @@ REACHED = 0.05  # m
 
 def default_environment() -> Path:
     """Where `set_up` makes the originals' environment: in the user's cache folder."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "mjx-dher" / "fetch-originals"
+    return user_cache() / "fetch-originals"
 
 
 def set_up(environment: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -30,6 +32,28 @@ def is_eventful(episodes: Episode, compute_reward: RewardFn) -> Array:
     Manela & Biess 2021 and the energy-based prioritization of Zhao & Tresp 2018.
     """
     return compute_reward(episodes.achieved_goal[:, 0], episodes.achieved_goal[:, -1]) < 0
+
+
+def draw_batches(
+    state: ReplayState,
+    key: PRNGKey,
+    shape: tuple[int, ...],
+    sampler: Sampler,
+    compute_reward: RewardFn,
+    hparams: HParams,
+    counts: Array,
+) -> Batch:
+    """Transitions as the learner takes them, drawn and relabelled all at once; leaves lead with `shape`.
+
+    A share `hparams.eventful_share` of them is from eventful episodes; `counts` is `replay.count_eventful(state)`. The ring
+    must not be empty.
+    """
+    row_key, sample_key, relabel_key = jax.random.split(key, 3)
+    number = math.prod(shape)
+    rows = replay.draw_rows(state, row_key, number, hparams.eventful_share, counts)
+    sample = replay.sample(state, sample_key, number, rows)
+    batch = relabel(state, sample, sampler, compute_reward, hparams, relabel_key)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
 
 
 def relabel(

@@ -1,10 +1,11 @@
-"""A run on disk: config.json, metrics.csv, policy.npz, result.json."""
+"""What is on disk: a run (config.json, metrics.csv, policy.npz, result.json), and where the cache is."""
 
 from __future__ import annotations
 
 import dataclasses
 import datetime
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,11 @@ CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.csv"
 POLICY_FILE = "policy.npz"
 RESULT_FILE = "result.json"
+
+
+def user_cache() -> Path:
+    """The folder for what can be made again, in the user's cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher"
 
 
 class RunFolderError(ValueError):

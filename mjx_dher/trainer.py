@@ -17,10 +17,12 @@ from mjx_dher import ddpg, evaluate, memory, replay, samplers
 from mjx_dher.config import Config, HParams
 from mjx_dher.ddpg import DDPGState, Losses, Networks
 from mjx_dher.networks import Actor, Critic
-from mjx_dher.relabel import is_eventful, relabel
+from mjx_dher.relabel import draw_batches, is_eventful, relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey
+from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, PRNGKey
+
+DRAWN_AT_ONCE = 65_536  # transitions, at most, but for a single batch and those up to a target update
 
 
 @struct.dataclass
@@ -65,6 +67,8 @@ def make_train(env: Env, config: Config) -> Train:
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
     updates_per_target = config.target_period
     targets_per_cycle = config.updates_per_cycle // updates_per_target
+    # Batches are drawn many at once: on a GPU, drawing one takes twice as long as learning from it, and 40 hardly longer.
+    targets_at_once = _largest_divisor(targets_per_cycle, DRAWN_AT_ONCE // (updates_per_target * config.batch_size))
     num_cycles = config_lib.num_epochs(config, env.episode_length) * config.cycles_per_epoch
 
     def init(key: PRNGKey, hparams: HParams) -> TrainState:
@@ -96,19 +100,20 @@ def make_train(env: Env, config: Config) -> Train:
         counts = replay.count_eventful(ring)
         hparams = anneal(hparams, learner.num_updates / (num_cycles * config.updates_per_cycle))
 
-        def update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
-            row_key, sample_key, relabel_key = jax.random.split(key, 3)
-            rows = replay.draw_rows(ring, row_key, config.batch_size, hparams.eventful_share, counts)
-            sample = replay.sample(ring, sample_key, config.batch_size, rows)
-            batch = relabel(ring, sample, sampler, env.compute_reward, hparams, relabel_key)
+        def update(learner: DDPGState, batch: Batch) -> tuple[DDPGState, Losses]:
             return ddpg.update(networks, learner, batch, hparams)
 
-        def update_with_target(learner: DDPGState, keys: PRNGKey) -> tuple[DDPGState, Losses]:
-            learner, losses = jax.lax.scan(update, learner, keys)
+        def update_with_target(learner: DDPGState, batches: Batch) -> tuple[DDPGState, Losses]:
+            learner, losses = jax.lax.scan(update, learner, batches)
             return ddpg.update_target(learner, hparams), losses
 
-        keys = jax.random.split(key, (targets_per_cycle, updates_per_target))
-        learner, losses = jax.lax.scan(update_with_target, learner, keys)
+        def draw_and_update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
+            shape = (targets_at_once, updates_per_target, config.batch_size)
+            batches = draw_batches(ring, key, shape, sampler, env.compute_reward, hparams, counts)
+            return jax.lax.scan(update_with_target, learner, batches)
+
+        keys = jax.random.split(key, targets_per_cycle // targets_at_once)
+        learner, losses = jax.lax.scan(draw_and_update, learner, keys)
         return learner, jax.tree.map(jnp.mean, losses)
 
     def cycle(state: TrainState, _: None) -> tuple[TrainState, Metrics]:
@@ -153,6 +158,11 @@ def make_train(env: Env, config: Config) -> Train:
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def _largest_divisor(number: int, limit: int) -> int:
+    """The largest divisor of `number` up to `limit`; at least 1."""
+    return next(divisor for divisor in range(max(1, min(number, limit)), 0, -1) if number % divisor == 0)
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:
@@ -216,7 +226,8 @@ def train(
       on_compile: called with None when compilation begins and with its seconds when it has ended.
 
     Raises:
-      ValueError: a Config or HParams that cannot run, or a replay ring larger than the memory that is free.
+      ValueError: a Config or HParams that cannot run, a replay ring larger than the memory that is free, or what
+        `env.check` raises, where the environment has one, after an epoch.
     """
     hparams = HParams() if hparams is None else hparams
     config_lib.validate(config, hparams, env.episode_length)
@@ -236,6 +247,8 @@ def train(
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)
             state, metrics = running.result()
+            if (check := getattr(env, "check", None)) is not None:
+                check()
             now = time.perf_counter()
             yield Progress(
                 epoch=number,

@@ -70,7 +70,11 @@ class EnvState(Protocol):
 
 
 class Env(Protocol):
-    """An unbatched, pure, goal-conditioned environment of fixed horizon; `jax.vmap` is the batch."""
+    """An unbatched, pure, goal-conditioned environment of fixed horizon; `jax.vmap` is the batch.
+
+    It may have `check()`, which the trainer calls on the host after each epoch, and which raises ValueError where the steps
+    were not what they should be and their results do not show it.
+    """
 
     @property
     def action_size(self) -> int: ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # nothing of a test stays in the user's cache folder
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 

@@ -90,8 +90,8 @@ def test_an_existing_run_is_never_overwritten(finished, capsys):
 BAD = [
     (["--env", "pusch"], ["env must be one of pick_and_place, push", "got 'pusch' (did you mean 'push'?)"]),
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
-    (["--engine", "natve"], ["engine must be one of auto, native, jax; got 'natve' (did you mean 'native'?)"]),
-    (["--preset", "papr"], ["preset must be one of default, paper; got 'papr' (did you mean 'paper'?)"]),
+    (["--engine", "natve"], ["engine must be one of auto, native, jax, warp; got 'natve' (did you mean 'native'?)"]),
+    (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, paper; got 'papr' (did you mean 'paper'?)"]),
     (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax; got 'cubic'"]),
     (["--metric", "speed"], ["metric must be one of position; got 'speed'"]),
     (["--num-envs", "0"], ["num_envs must be an integer of at least 1; got 0"]),
@@ -108,7 +108,7 @@ BAD = [
     (["eval", "runs/not-there"], ["runs/not-there is not a run folder: no such folder"]),
     (["eval", "docs"], ["docs is not a run folder: it has no config.json"]),
     (["eval", "docs", "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
-    (["eval", "docs", "--engine", "wrap"], ["engine must be one of auto, native, jax; got 'wrap'"]),
+    (["eval", "docs", "--engine", "wrap"], ["engine must be one of auto, native, jax, warp; got 'wrap'"]),
 ]
 
 
@@ -139,7 +139,7 @@ def test_presets_are_the_base_that_options_override():
     base, hparams = config.preset("paper", "push")
     assert args.config == config.dataclasses.replace(base, num_envs=4)
     assert args.hparams == hparams._replace(gamma=0.9)
-    assert cli.parse_train_args([]).config == config.preset("default", "push")[0]
+    assert cli.parse_train_args([]).config == config.preset("cpu", "push")[0]
 
 
 def test_help_names_every_option(capsys):
@@ -150,6 +150,21 @@ def test_help_names_every_option(capsys):
     fields = [f.name for f in config.dataclasses.fields(config.Config)] + list(config.HParams._fields)
     for field in [*fields, "seed", "out", "preset", "final_episodes"]:
         assert f"--{field.replace('_', '-')}" in text
+
+
+@pytest.mark.parametrize("chosen", [True, False])
+def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(tmp_path, chosen):
+    code = (
+        "from mjx_dher import cli; cli.keep_compiled_programs(); import jax;"
+        "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0); jax.jit(lambda x: x + 1)(1.0)"
+    )
+    clean = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_COMPILATION_CACHE"}
+    chosen_folder = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine")} if chosen else {}
+    environment = {**clean, "XDG_CACHE_HOME": str(tmp_path), **chosen_folder}
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, env=environment)
+    kept = tmp_path / ("mine" if chosen else "mjx-dher/xla")
+    assert list(kept.glob("jit_*"))
+    assert [path.name for path in tmp_path.iterdir()] == ["mine" if chosen else "mjx-dher"]
 
 
 def test_a_terminal_gets_a_live_line():

@@ -38,7 +38,7 @@ def test_sizes_that_follow():
 BAD_CONFIG = [
     ({"sampler": "wieghted"}, "sampler must be one of random, .*; got 'wieghted' .did you mean 'weighted'"),
     ({"weight_kernel": "cubic"}, "weight_kernel must be one of linear, inverse, softmax; got 'cubic'"),
-    ({"engine": "warpp"}, "engine must be one of auto, native, jax; got 'warpp'"),
+    ({"engine": "warpp"}, "engine must be one of auto, native, jax, warp; got 'warpp'"),
     ({"num_envs": 0}, "num_envs must be an integer of at least 1; got 0"),
     ({"num_envs": 2.5}, "num_envs must be an integer of at least 1; got 2.5"),
     ({"num_envs": True}, "num_envs must be an integer of at least 1; got True"),
@@ -92,5 +92,5 @@ def test_all_problems_are_named_at_once():
 
 
 def test_unknown_preset():
-    with pytest.raises(ValueError, match=r"preset must be one of default, paper; got .papper. .did you mean .paper."):
+    with pytest.raises(ValueError, match=r"preset must be one of cpu, gpu, paper; got .papper. .did you mean .paper."):
         config.preset("papper", "push")

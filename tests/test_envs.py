@@ -322,7 +322,7 @@ def test_bad_actions_are_refused(native, action, message):
     ("args", "kwargs", "message"),
     [
         (("pusch",), {}, r"env must be one of .*push.*got 'pusch' .did you mean 'push'"),
-        (("push", "natve"), {}, "engine must be one of auto, native, jax; got 'natve' .did you mean 'native'"),
+        (("push", "natve"), {}, "engine must be one of auto, native, jax, warp; got 'natve' .did you mean 'native'"),
         (("push",), {"reward_type": "sprase"}, "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
         (("push",), {"distance_threshold": 0}, "distance_threshold must be greater than 0; got 0"),
         (("push",), {"episode_length": 0}, "episode_length must be at least 1; got 0"),

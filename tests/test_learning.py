@@ -9,8 +9,8 @@ from mjx_dher import cli, config, envs, policy, trainer
 
 
 def test_reach_is_learned():
-    """The default preset, physics included: at least 0.99 of 300 fresh episodes; an untrained policy reaches hardly any."""
-    settings, hparams = config.preset("default", "reach")
+    """The preset `cpu`, physics included: at least 0.99 of 300 fresh episodes; an untrained policy reaches hardly any."""
+    settings, hparams = config.preset("cpu", "reach")
     env = envs.make("reach")
     learner = None
     for progress in trainer.train(env, dataclasses.replace(settings, sampler="weighted"), hparams, seed=0):

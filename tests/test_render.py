@@ -161,7 +161,7 @@ BAD = [
     (["--env", "push", *OUT, "--width", "0", "--height", "9999"], ["width must be", "height must be", "got 9999"]),
     (["--env", "push", *OUT, "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
     (["--env", "pusch", *OUT], ["env must be one of", "(did you mean 'push'?)"]),
-    (["--env", "push", *OUT, "--engine", "wrap"], ["engine must be one of auto, native, jax; got 'wrap'"]),
+    (["--env", "push", *OUT, "--engine", "wrap"], ["engine must be one of auto, native, jax, warp; got 'wrap'"]),
     (OUT, ["render takes either a run folder or --env (one of pick_and_place, push"]),
     (["docs", "--env", "push", *OUT], ["render takes either a run folder or --env"]),
     (["docs", *OUT], ["docs is not a run folder: it has no config.json"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +16,7 @@ __all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
-    """The engine that `name` stands for here: `auto` is `native` on a CPU and `jax` elsewhere.
+    """The engine that `name` stands for here: `auto` is native on a CPU, warp on a GPU where warp-lang is there, else jax.
 
     Raises:
       ValueError: `name` is no engine.
@@ -25,25 +26,36 @@ def resolve_engine(name: str) -> str:
         return name
     import jax
 
-    return "native" if jax.default_backend() == "cpu" else "jax"
+    if jax.default_backend() == "cpu":
+        return "native"
+    return "warp" if _has_warp() else "jax"
+
+
+def _has_warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
 
 
 def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
     """An engine for `model` that advances `substeps` timesteps a call.
 
     Args:
-      name: "native", "jax" or "auto".
+      name: "native", "jax", "warp" or "auto".
       model: the compiled MJCF, with exactly one mocap body.
       substeps: MuJoCo timesteps an environment step.
-      **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver.
+      **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp
+        those, `contacts` and `constraints` (its memory), and `allow_cpu`.
 
     Raises:
-      ValueError: no such engine or option.
+      ValueError: no such engine or option, or an engine that cannot run here.
     """
     name = resolve_engine(name)
     constructor: Callable[..., Engine]
     if name == "native":
         from mjx_dher.envs.engines.native import NativeEngine as constructor
+    elif name == "warp":
+        if not _has_warp():
+            raise ValueError('engine warp needs warp-lang, which the extra "cuda" installs: pip install -e ".[cuda]"')
+        from mjx_dher.envs.engines.warp import WarpEngine as constructor
     else:
         from mjx_dher.envs.engines.mjx import MjxEngine as constructor
     allowed = set(inspect.signature(constructor).parameters) - {"model", "substeps"}

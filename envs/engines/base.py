@@ -26,3 +26,6 @@ class Engine(Protocol):
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
         """One environment step later; meanwhile the mocap body is held at `target` [7] (position, m, and w, x, y, z)."""
         ...
+
+    def check(self) -> None:
+        """Raises ValueError where the steps so far were not what they should be and their results do not show it."""

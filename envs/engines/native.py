@@ -53,6 +53,9 @@ class NativeEngine:
         qpos, qvel, warmstart = jnp.split(state, self._ends[:2].tolist())
         return Physics(qpos=qpos, qvel=qvel, warmstart=warmstart)
 
+    def check(self) -> None:
+        pass  # nothing is lost unseen
+
     def _advance(self, inputs: Any) -> np.ndarray:
         """The host side: `inputs` leads with any number of batch axes. NumPy only: JAX calls could deadlock."""
         rows = np.asarray(inputs).reshape(-1, inputs.shape[-1])

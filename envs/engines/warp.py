@@ -1,0 +1,219 @@
+"""MuJoCo Warp, the CUDA implementation that MJX brings: thousands of environments on one NVIDIA GPU.
+
+Not through `mjx.step`: that would hand some 170 arrays of every substep from Warp to XLA and back. One call advances the whole
+batch by all substeps of an environment step, in a CUDA graph that is captured once for a number of environments; what
+Warp needs between the substeps stays with it, and only the state goes in and out.
+"""
+# Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
+
+import contextlib
+import copy
+import io
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.engines.base import Physics
+from mjx_dher.types import Array
+
+with contextlib.redirect_stdout(io.StringIO()):
+    import warp as wp
+
+    # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.
+    from mujoco.mjx.third_party import mujoco_warp
+
+# Contacts between two geoms, at most.
+_MAX_CONTACTS = {
+    frozenset(("PLANE", "BOX")): 4,
+    frozenset(("PLANE", "CYLINDER")): 4,
+    frozenset(("SPHERE", "BOX")): 1,
+    frozenset(("BOX",)): 8,
+}
+wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
+_OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # of which contacts or constraints are lost
+
+
+class WarpEngine:
+    """MuJoCo Warp on the device of the JAX program around it.
+
+    Its sums depend on the order in which threads finish: two runs agree to rounding, not bit for bit.
+
+    Args:
+      model: the compiled MJCF, with exactly one mocap body.
+      substeps: MuJoCo timesteps an environment step.
+      iterations: Newton iterations of the constraint solver, at most; the slowest environment of the batch sets the pace.
+      ls_iterations: steps of its line search, at most.
+      contacts: contacts for which there is memory, an environment (in the mean over all of them); enough for all by default.
+      constraints: rows of constraints for which there is memory, in any one environment; enough for all by default.
+      allow_cpu: run where there is no NVIDIA GPU, too, on one thread: for comparing engines, not for training.
+
+    Raises:
+      ValueError: JAX does not run on an NVIDIA GPU here.
+    """
+
+    name = "warp"
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        substeps: int,
+        iterations: int = 8,
+        ls_iterations: int = 8,
+        contacts: int | None = None,
+        constraints: int | None = None,
+        allow_cpu: bool = False,
+    ):
+        if not allow_cpu and not (jax.default_backend() in ("gpu", "cuda") and wp.is_cuda_available()):
+            raise ValueError(
+                f"engine warp needs JAX on an NVIDIA GPU, and JAX runs on {jax.default_backend()} here:"
+                ' pip install -e ".[cuda]" on a machine that has one, or use engine native or jax'
+            )
+        self._model = copy.copy(model)
+        self._model.opt.iterations = iterations
+        self._model.opt.ls_iterations = ls_iterations
+        # Box against box as in C, analytically, not by the general convex algorithm.
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+        self._substeps = substeps
+        self.most_contacts, self.most_constraints = capacities(model)
+        self._contacts = contacts or self.most_contacts
+        self._constraints = constraints or self.most_constraints
+        self._simulations: dict[tuple[str, int], _Simulation] = {}
+        self._lock = threading.Lock()
+        self._ready = False
+
+        def advance_all(
+            qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            warmstart: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        ):
+            with self._lock:
+                simulation = self._simulation(qpos.device, qpos.shape[0])
+                simulation.advance((qpos, qvel, warmstart), inputs, (qpos_out, qvel_out, warmstart_out))
+
+        shapes = {"qpos_out": (1, model.nq), "qvel_out": (1, model.nv), "warmstart_out": (1, model.nv)}
+        self._call = wp.jax_callable(
+            advance_all,
+            num_outputs=3,
+            graph_mode=wp.JaxCallableGraphMode.NONE,  # `_Simulation` captures its own, whatever the buffers
+            vmap_method="broadcast_all",
+            output_dims=shapes,
+        )
+
+    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
+        self._load_kernels()
+        rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, physics.warmstart)]
+        # Else numbered by how often it has been traced, and JAX would not find a program again that it has compiled and kept.
+        self._call.call_id = 0
+        qpos, qvel, warmstart = self._call(*rows, jnp.concatenate([target, ctrl])[None])
+        return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0])
+
+    def check(self) -> None:
+        """Raises where contacts or constraints were lost since the last call, for want of memory.
+
+        Raises:
+          ValueError: says which, and how much memory is always enough.
+        """
+        lost = 0
+        with self._lock:
+            for simulation in self._simulations.values():
+                lost |= simulation.overflow()
+        names = [name for name in _OVERFLOWS if lost & int(mujoco_warp.OverflowType[name])]
+        if names:
+            raise ValueError(
+                f"the warp engine lost contacts or constraints ({', '.join(names).lower()}): it was made with"
+                f" contacts={self._contacts} and constraints={self._constraints}; contacts={self.most_contacts} and"
+                f" constraints={self.most_constraints} are always enough"
+            )
+
+    def _load_kernels(self) -> None:
+        """Compiles the kernels, a minute the first time on a machine, while the program is traced and not in its first step."""
+        with self._lock:
+            if not self._ready:
+                _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
+                wp.synchronize()
+                self._ready = True
+
+    def _simulation(self, device: Any, num_envs: int) -> "_Simulation":
+        key = (str(device), num_envs)
+        if key not in self._simulations:
+            self._simulations[key] = _Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
+        return self._simulations[key]
+
+
+class _Simulation:
+    """The memory of `num_envs` environments on Warp's current device, and the graph that advances them."""
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, constraints: int):
+        self._model = mujoco_warp.put_model(model)
+        self._model.opt.warn_overflow = 0  # a print from a kernel would stop all others
+        self._data = mujoco_warp.make_data(model, nworld=num_envs, naconmax=num_envs * contacts, njmax=constraints)
+        self._substeps = substeps
+        self._graph: Any = None
+        self._inputs = wp.zeros((num_envs, 7 + model.nu), dtype=float)
+
+    def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
+        data = self._data
+        for held, given in zip((data.qpos, data.qvel, data.qacc_warmstart), state):
+            wp.copy(held, given)
+        wp.copy(self._inputs, inputs)
+        if not wp.get_device().is_cuda:
+            self.run()
+        else:
+            if self._graph is None:
+                with wp.ScopedCapture() as capture:
+                    self.run()
+                self._graph = capture.graph
+            wp.capture_launch(self._graph)
+        for given, held in zip(result, (data.qpos, data.qvel, data.qacc_warmstart)):
+            wp.copy(given, held)
+
+    def run(self) -> None:
+        data = self._data
+        num_envs = data.nworld
+        wp.launch(_set_inputs, dim=num_envs, inputs=[self._inputs], outputs=[data.mocap_pos, data.mocap_quat, data.ctrl])
+        for _ in range(self._substeps):
+            mujoco_warp.step(self._model, data)
+
+    def overflow(self) -> int:
+        """The kinds of overflow since the last call, as a mask."""
+        mask = int(np.bitwise_or.reduce(self._data.overflow.numpy()))
+        self._data.overflow.zero_()
+        return mask
+
+
+@wp.kernel
+def _set_inputs(
+    inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    mocap_pos: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
+    mocap_quat: wp.array2d(dtype=wp.quat),  # type: ignore[valid-type]
+    ctrl: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    world = wp.tid()
+    mocap_pos[world, 0] = wp.vec3(inputs[world, 0], inputs[world, 1], inputs[world, 2])
+    mocap_quat[world, 0] = wp.quat(inputs[world, 3], inputs[world, 4], inputs[world, 5], inputs[world, 6])
+    for i in range(ctrl.shape[1]):
+        ctrl[world, i] = inputs[world, 7 + i]
+
+
+def capacities(model: mujoco.MjModel) -> tuple[int, int]:
+    """The most contacts, and the most rows of constraints, that one environment can have: whatever the pairs can give at once.
+
+    Raises:
+      ValueError: a pair of geoms of kinds that are not known.
+    """
+    contacts, rows = 0, 6 * model.neq + 2 * int(np.count_nonzero(model.jnt_limited))
+    for geom1, geom2, dim in zip(model.pair_geom1, model.pair_geom2, model.pair_dim):
+        kinds = frozenset(mujoco.mjtGeom(int(model.geom_type[geom])).name[len("mjGEOM_") :] for geom in (geom1, geom2))
+        if kinds not in _MAX_CONTACTS:
+            raise ValueError(f"no bound on the contacts between {' and '.join(sorted(kinds)).lower()}")
+        contacts += _MAX_CONTACTS[kinds]
+        rows += _MAX_CONTACTS[kinds] * (1 if dim == 1 else 2 * (int(dim) - 1))  # pyramidal cones
+    return contacts, rows
