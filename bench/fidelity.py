@@ -1,10 +1,10 @@
 """Open-loop replay of recorded episodes of the original tasks: how far do the rebuilt ones stray?
 
-    python bench/fidelity.py [--engines native jax] [--tasks push pick_and_place slide]
+    python bench/fidelity.py [--engines native jax warp] [--tasks push pick_and_place slide]
 
-Starts, goals and actions are those of tests/data/fetch_TASK.npz; nothing is fed back in 50 steps. With all tasks and both
-engines, which takes some minutes, it puts its tables into docs/fidelity.md and draws docs/fidelity_trajectories.png (extra
-`plot`); with fewer it only prints.
+Starts, goals and actions are those of tests/data/fetch_TASK.npz; nothing is fed back in 50 steps. `warp` runs on the CPU
+where there is no GPU. With all tasks and engines, which takes some minutes, it puts its tables into docs/fidelity.md and
+draws docs/fidelity_trajectories.png (extra `plot`); with fewer it only prints.
 
 The yardstick beside them is the original, replayed in the same way with its object's start moved by 0.1 mm. That runs in an
 environment of its own, which needs a MuJoCo older than ours, and writes tests/data/fetch_yardstick.csv:
@@ -32,7 +32,8 @@ PICTURE = ROOT / "docs" / "fidelity_trajectories.png"
 BEGIN, END = "<!-- fidelity: begin -->", "<!-- fidelity: end -->"
 
 TASKS = ("push", "pick_and_place", "slide")
-ENGINES = ("native", "jax")
+ENGINES = ("native", "jax", "warp")
+OPTIONS = {"warp": {"allow_cpu": True}}
 KINDS = ("random actions", "script with noise", "script")
 HEAD = ("task", "episodes", "run by", "grip, mean", "p95", "object, median", "p95", "moved agrees", "success agrees")
 MOVED = 0.02  # m
@@ -104,7 +105,7 @@ def free_slide(engine):
 
     from mjx_dher import envs
 
-    env = envs.make("slide", engine=engine)
+    env = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
     state = env.init_state(jnp.array([1.2, 0.75, env.task.object_height, 1, 0, 0, 0]), jnp.ones(3))
     first = state.obs["achieved_goal"]
     velocity = env.model.joint("object").dofadr[0]
@@ -114,17 +115,19 @@ def free_slide(engine):
 
 
 def between_engines(recorded, paths):
-    """Lines on how the two engines compare with one another on Slide."""
+    """Lines on how the engines compare with one another on Slide."""
     script = recorded["policy"] == KINDS.index("script")
-    apart = 1e3 * np.linalg.norm(paths["slide", "native"][1] - paths["slide", "jax"][1], axis=-1)[script, -1]
+    ends = {engine: paths["slide", engine][1][script][:, -1] for engine in ENGINES}
+    apart = {engine: 1e3 * np.linalg.norm(ends[engine] - ends["native"], axis=-1) for engine in ENGINES[1:]}
     went = 1e3 * np.linalg.norm(np.diff(paths["slide", "native"][1][script][:, [0, -1]], axis=1), axis=-1)
     coulomb = 1e3 * PUCK_SPEED**2 / (2 * FRICTION * GRAVITY)
     free = {engine: 1e3 * free_slide(engine) for engine in ENGINES}
     return [
-        f"- A puck at {PUCK_SPEED} m/s that nothing else touches slides {free['native']:.1f} mm on `native` and"
-        f" {free['jax']:.1f} mm on `jax`; v²/(2μg) is {coulomb:.1f} mm.",
-        f"- Hit by the recorded script, it ends {np.median(apart):.1f} mm (median; p95 {np.percentile(apart, 95):.0f} mm) from"
-        f" one engine to the other, after {np.median(went):.0f} mm on `native` in the median.",
+        f"- A puck at {PUCK_SPEED} m/s that nothing else touches slides"
+        f" {', '.join(f'{length:.1f} mm on `{engine}`' for engine, length in free.items())}; v²/(2μg) is {coulomb:.1f} mm.",
+        f"- Hit by the recorded script, it goes {np.median(went):.0f} mm on `native` in the median; from there it ends "
+        + ", ".join(f"{np.median(d):.1f} mm on `{engine}` (p95 {np.percentile(d, 95):.0f} mm)" for engine, d in apart.items())
+        + ".",
     ]
 
 
@@ -135,7 +138,11 @@ def report(tasks, engines):
     from mjx_dher import envs
 
     recorded = {task: load(task) for task in tasks}
-    paths = {(task, engine): replay(envs.make(task, engine=engine), recorded[task]) for task in tasks for engine in engines}
+    paths = {
+        (task, engine): replay(envs.make(task, engine=engine, **OPTIONS.get(engine, {})), recorded[task])
+        for task in tasks
+        for engine in engines
+    }
     with open(YARDSTICK) as file:
         original = [row for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
     rows = []
@@ -149,7 +156,7 @@ def report(tasks, engines):
     with contextlib.redirect_stdout(io.StringIO()) as text:
         print_table(HEAD, rows)
         if "slide" in tasks and set(ENGINES) <= set(engines):
-            print("\nSlide, the two engines against one another:\n")
+            print("\nSlide, the engines against one another:\n")
             print("\n".join(between_engines(recorded["slide"], paths)))
     return text.getvalue().strip(), recorded, paths
 

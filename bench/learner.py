@@ -1,11 +1,15 @@
-"""Gradient updates: what one costs, and how much of it is sampling and relabelling.
+"""Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
 
-python bench/learner.py [--batch-sizes 256 512 1024] [--sampler weighted]
+    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
+
+As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one. Several seeds
+are one program, vmapped; times are per update of one seed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +18,9 @@ from timing import median_seconds, print_table
 from mjx_dher import Config, HParams, ddpg, replay, samplers
 from mjx_dher.ddpg import Networks
 from mjx_dher.networks import Actor, Critic
-from mjx_dher.relabel import relabel
-from mjx_dher.types import Batch, Episode
-
-UPDATES = 40
+from mjx_dher.relabel import draw_batches
+from mjx_dher.trainer import DRAWN_AT_ONCE
+from mjx_dher.types import Episode
 
 
 def compute_reward(achieved_goal, desired_goal):
@@ -37,59 +40,67 @@ def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayS
     return jax.jit(replay.add)(replay.init(shapes, num_episodes), episodes, eventful)
 
 
+def flops(batch_size: int) -> int:
+    """Of the matrix products of an update.
+
+    In passes through a network of one kind: the actor forward as target, forward, and backward (two products a layer); the
+    critic forward as target, forward and backward, and for the actor forward and backward (to its input only: one).
+    """
+    sizes = (28, *Config().hidden_sizes)
+    hidden = sum(a * b for a, b in itertools.pairwise(sizes))
+    actor, critic = hidden + sizes[-1] * 4, hidden + 4 * sizes[1] + sizes[-1]
+    return 2 * batch_size * (4 * actor + 6 * critic)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[256, 512, 1024])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--sampler", default="weighted")
     args = parser.parse_args()
     networks = Networks(actor=Actor(4), critic=Critic(Config().hidden_sizes))
     hparams = jax.tree.map(jnp.float32, HParams(eventful_share=0.5))
     sampler, ring = samplers.make(args.sampler), full_ring()
-    learner = ddpg.init(jax.random.key(1), networks, 25, 3, 4)
+    counts = replay.count_eventful(ring)
     rows = []
-    for batch_size in args.batch_sizes:
+    for batch_size, seeds in itertools.product(args.batch_sizes, args.seeds):
+        updates = max(1, DRAWN_AT_ONCE // batch_size)
 
-        def draw(key, batch_size=batch_size):
-            keys = jax.random.split(key, 3)
-            picked = replay.draw_rows(ring, keys[0], batch_size, hparams.eventful_share, replay.count_eventful(ring))
-            sample = replay.sample(ring, keys[1], batch_size, picked)
-            return relabel(ring, sample, sampler, compute_reward, hparams, keys[2])
+        def draw(key, shape=(updates, batch_size)):
+            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)
 
         def update(learner, batch):
             learner, losses = ddpg.update(networks, learner, batch, hparams)
             return ddpg.update_target(learner, hparams), losses
 
-        @jax.jit
-        def draws_only(keys, draw=draw):
-            def step(total, key):
-                return total + sum(jnp.sum(leaf) for leaf in jax.tree.leaves(draw(key))), None
+        def updates_only(learner, batches, update=update):
+            return jax.lax.scan(update, learner, batches)
 
-            return jax.lax.scan(step, 0.0, keys)[0]
+        def both(learner, key, draw=draw, update=update):
+            return jax.lax.scan(update, learner, draw(key))
 
-        @jax.jit
-        def updates_only(learner, batch, update=update):
-            return jax.lax.scan(lambda s, _: update(s, batch), learner, length=UPDATES)
-
-        @jax.jit
-        def both(learner, keys, draw=draw, update=update):
-            return jax.lax.scan(lambda s, key: update(s, draw(key)), learner, keys)
-
-        keys = jax.random.split(jax.random.key(2), UPDATES)
-        batch: Batch = jax.jit(draw)(keys[0])
-        draw_time = median_seconds(lambda: draws_only(keys)) / UPDATES
-        update_time = median_seconds(lambda: updates_only(learner, batch)) / UPDATES
-        both_time = median_seconds(lambda: both(learner, keys)) / UPDATES
+        keys = jax.random.split(jax.random.key(2), seeds)
+        learners = jax.vmap(lambda key: ddpg.init(key, networks, 25, 3, 4))(keys)
+        drawing, updating, whole = (jax.jit(jax.vmap(function)) for function in (draw, updates_only, both))
+        batches = drawing(keys)
+        each = updates * seeds
+        draw_time = median_seconds(lambda: drawing(keys)) / each
+        update_time = median_seconds(lambda: updating(learners, batches)) / each
+        both_time = median_seconds(lambda: whole(learners, keys)) / each
         rows.append(
             (
                 batch_size,
-                f"{both_time * 1e3:.2f}",
+                seeds,
+                f"{both_time * 1e6:,.1f}",
                 f"{1 / both_time:,.0f}",
-                f"{update_time * 1e3:.2f}",
-                f"{draw_time * 1e3:.3f}",
+                f"{update_time * 1e6:,.1f}",
+                f"{draw_time * 1e6:,.1f}",
                 f"{draw_time / update_time:.1%}",
+                f"{flops(batch_size) / update_time / 1e9:,.0f}",
             )
         )
-    print_table(("batch", "ms/update", "updates/s", "of it: gradients, ms", "sampling + relabelling, ms", "share"), rows)
+    head = ("batch", "seeds", "µs/update", "updates/s", "of it: gradients, µs", "drawing, µs", "share", "GFLOP/s")
+    print_table(head, rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Time to success: trains several seeds of a preset, one after the other, and prints when each first reached a threshold.
 
     python bench/time_to_success.py [--env push] [--sampler weighted] [--seeds 5] [--threshold 0.9] [--out FILE.csv]
+        [--set num_envs=512 noise_std=0.2]
 
 Seconds are those of training, evaluations included and compilation apart. "First" is the first evaluation (eval_episodes
 episodes) at or above the threshold; the final success is over 500 fresh episodes.
@@ -29,11 +30,16 @@ def main() -> None:
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--threshold", type=float, default=0.9)
-    parser.add_argument("--total-steps", type=int)
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="what to change in the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
     static, hparams = config.preset(args.preset, args.env)
-    static = dataclasses.replace(static, sampler=args.sampler, total_steps=args.total_steps or static.total_steps)
+    static = dataclasses.replace(static, sampler=args.sampler)
+    for name, _, value in (change.partition("=") for change in args.set):
+        if name in config.HParams._fields:
+            hparams = hparams._replace(**{name: float(value)})
+        else:
+            static = dataclasses.replace(static, **{name: int(value)})
     env = envs.make(args.env, engine=args.engine)
     keep_compiled_programs()
     rows, curve, compiled = [], [], []

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import __version__, config, envs, run_folder, stats
+from mjx_dher import __version__, config, envs, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -313,6 +313,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     from mjx_dher import originals
     from mjx_dher.envs.engines.native import usable_cores
     from mjx_dher.policy import load_policy
+    from mjx_dher.stats import difference_interval
 
     policy = load_policy(args.run)
     environment = originals.default_environment()
@@ -328,7 +329,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     console.print(f"{run.config.env} here, {args.episodes} episodes, physics {_engine_name(env)} ...")
     here = play(env, policy, args.episodes, args.seed)
     report_here = report(here.success, here.reset_success, here.ret, console)
-    low, high = stats.difference_interval(
+    low, high = difference_interval(
         int(there["success"].sum()), len(there["success"]), int(here.success.sum()), len(here.success)
     )
     difference = report_there["success_rate"] - report_here["success_rate"]
@@ -360,8 +361,10 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
 
 def report(success: Any, reset_success: Any, ret: Any, console: Console) -> dict[str, Any]:
     """Prints success with its interval, success at reset and mean return of episodes (arrays [N]); returns them."""
+    from mjx_dher.stats import wilson_interval
+
     trials = len(success)
-    low, high = stats.wilson_interval(int(success.sum()), trials)
+    low, high = wilson_interval(int(success.sum()), trials)
     result = {
         "episodes": trials,
         "success_rate": float(success.mean()),

@@ -41,17 +41,17 @@ def default_environment() -> Path:
     return user_cache() / "fetch-originals"
 
 
-def set_up(environment: Path) -> None:
+def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
     """Makes a virtual environment with the original tasks, from the package index; leaves a whole one as it is.
 
     Raises:
       ValueError: pip failed, with what it said.
     """
-    if _is_ready(interpreter(environment)):
+    if _is_ready(interpreter(environment), requirements):
         return
     venv.create(environment, with_pip=True, clear=True)
     python = str(interpreter(environment))
-    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *REQUIREMENTS]
+    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise ValueError(f"{environment} could not be set up: {done.stderr.strip()}")
@@ -131,14 +131,14 @@ def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
     return outcome
 
 
-def _is_ready(python: Path) -> bool:
-    names = [requirement.split("==")[0] for requirement in REQUIREMENTS]
-    code = f"from importlib import metadata as m; print(*[f'{{n}}=={{m.version(n)}}' for n in {names}])"
+def _is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
+    names = [requirement.split("==")[0] for requirement in requirements]
+    code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
     try:
         done = subprocess.run([python, "-c", code], capture_output=True, text=True, check=False)
     except OSError:
         return False
-    return tuple(done.stdout.split()) == REQUIREMENTS
+    return tuple(done.stdout.split()) == requirements
 
 
 def main(argv: Sequence[str]) -> None:

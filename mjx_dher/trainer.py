@@ -22,7 +22,8 @@ from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, PRNGKey
 
-DRAWN_AT_ONCE = 65_536  # transitions, at most, but for a single batch and those up to a target update
+# Transitions, at most, but for a single batch and those up to a target update. More would not fit a CPU's cache.
+DRAWN_AT_ONCE = 16_384
 
 
 @struct.dataclass

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 SCRIPT = Path(__file__).parent.parent / "bench" / "bang_bang.py"
@@ -20,6 +21,8 @@ def test_physics_survives_10_000_slams_a_task():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["reach", "push", "pick_and_place", "slide"])
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", "jax", "warp"])
 def test_physics_survives_a_million_slams(task, engine):
+    if engine == "warp" and jax.default_backend() == "cpu":
+        pytest.skip("warp needs an NVIDIA GPU")
     survives("--tasks", task, "--engine", engine, "--actions", "1000000")

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import scipy.stats
 
 from mjx_dher import stats
 
@@ -32,3 +33,115 @@ def test_difference_interval():
     assert low < 0 < high
     with pytest.raises(ValueError, match="trials"):
         stats.difference_interval(1, 0, 1, 2)
+
+
+SCORES = np.random.default_rng(0).beta(4, 2, (11, 3))
+
+
+@pytest.mark.parametrize("scores", [SCORES[:, 0], SCORES, SCORES[:10], SCORES[:1], SCORES[:4, 0]])
+def test_interquartile_mean(scores):
+    """rliable defines it as scipy's trimmed mean, a quarter cut at either end, of all scores."""
+    assert stats.interquartile_mean(scores) == pytest.approx(scipy.stats.trim_mean(scores, 0.25, axis=None))
+
+
+def test_interquartile_mean_by_hand():
+    assert stats.interquartile_mean([0, 0.5, 0.7, 100]) == pytest.approx(0.6)
+    assert stats.interquartile_mean([3.0]) == 3
+
+
+def test_bootstrap_interval_is_scipy_s():
+    """The mean of one task; percentile method. Two bootstraps of 10,000 draws differ by chance: by 2 % of the width here."""
+    scores = SCORES[:, 0]
+    want = scipy.stats.bootstrap((scores,), np.mean, method="percentile", n_resamples=10_000, rng=1).confidence_interval
+    low, high = stats.bootstrap_interval(scores, np.mean)
+    assert (low, high) == pytest.approx((want.low, want.high), abs=0.03 * (want.high - want.low))
+    assert (low, high) == stats.bootstrap_interval(scores, np.mean)
+    narrow = stats.bootstrap_interval(scores, np.mean, level=0.5)
+    assert low < narrow[0] < scores.mean() < narrow[1] < high
+
+
+def test_bootstrap_is_stratified():
+    """Tasks far apart: were seeds and tasks drawn together, the mean would vary as the tasks do."""
+    scores = np.array([[0.0, 10.0], [0.1, 10.1], [0.0, 10.0], [0.1, 10.1]])
+    rng = np.random.default_rng(0)
+    low, high = stats.bootstrap_interval(scores, np.mean)
+    assert 5.0 <= low < high <= 5.1
+    # Each task's seeds are drawn on their own: one task's best seeds come with the other's worst.
+    drawn = [stats._redrawn(scores, rng).mean(axis=0) for _ in range(300)]
+    assert any(a < 0.04 and b > 10.06 for a, b in drawn)
+
+
+def test_a_95_percent_interval_covers_the_truth_19_times_in_20():
+    """300 samples of 20 standard normals; the bootstrap of so few is a little narrow."""
+    hits = 0
+    for number in range(300):
+        low, high = stats.bootstrap_interval(np.random.default_rng(number).normal(size=20), np.mean, repeats=500)
+        hits += low < 0 < high
+    assert 0.89 < hits / 300 < 0.97
+
+
+CURVES = [[0.1, 0.5, 0.9, 0.8, 1.0], [0.0, 0.0, 0.2, 0.9, 0.7], [0.0, 0.1, 0.1, 0.1, 0.2]]
+
+
+def test_first_reach_and_those_that_never_do():
+    reached = stats.first_reach([10, 20, 30, 40, 50], CURVES, 0.9)
+    np.testing.assert_array_equal(reached, [30, 40, np.inf])
+    assert np.median(reached) == 40
+    low, high = stats.bootstrap_interval(reached, np.median, repeats=1000)
+    assert (low, high) == (30, np.inf)
+    np.testing.assert_array_equal(stats.first_reach([1], [[0.5]], 0.5), [1])
+
+
+def test_area_under_curve():
+    np.testing.assert_allclose(stats.area_under_curve([0, 1, 3], [[0, 1, 1], [1, 1, 1]]), [2.5 / 3, 1])
+    with pytest.raises(ValueError, match="rising order"):
+        stats.area_under_curve([0, 0], [[1, 1]])
+    with pytest.raises(ValueError, match=r"x must be \[P\] and curves \[S, P\]; got shapes \(2,\) and \(1, 3\)"):
+        stats.area_under_curve([0, 1], [[1, 1, 1]])
+
+
+def test_probability_of_improvement():
+    """By hand, and as rliable defines it: the mean over tasks of Mann-Whitney's U divided by the pairs."""
+    assert stats.probability_of_improvement([1, 2, 3], [0, 2]) == pytest.approx(4.5 / 6)
+    assert stats.probability_of_improvement([np.inf, 1.0], [np.inf, 2.0]) == pytest.approx((0.5 + 1 + 0 + 0) / 4)
+    other = np.random.default_rng(1).beta(3, 2, (8, 3)).round(1)
+    mine = SCORES.round(1)
+    want = np.mean([scipy.stats.mannwhitneyu(mine[:, k], other[:, k]).statistic / (11 * 8) for k in range(3)])
+    assert stats.probability_of_improvement(mine, other) == pytest.approx(want)
+    low, high = stats.improvement_interval(mine, other, repeats=500)
+    assert low < want < high
+    with pytest.raises(ValueError, match="the same tasks; got 3 and 2"):
+        stats.probability_of_improvement(mine, other[:, :2])
+
+
+@pytest.mark.parametrize("seeds", [3, 10, 20])
+def test_paired_p_value_is_scipy_s(seeds):
+    """Exact up to 13 seeds in both; else by 10^5 draws in both, whose p values scatter by 0.002 each."""
+    a, b = np.random.default_rng(seeds).normal((0.3, 0), 1, (seeds, 2)).T
+    mean = lambda a, b, axis: np.mean(a - b, axis=axis)  # noqa: E731
+    want = scipy.stats.permutation_test((a, b), mean, permutation_type="samples", n_resamples=100_000, rng=0)
+    assert stats.paired_p_value(a, b) == pytest.approx(want.pvalue, abs=1e-9 if seeds <= 13 else 0.012)
+
+
+def test_paired_p_value_by_hand():
+    assert stats.paired_p_value([1, 2, 3], [0, 1, 2]) == pytest.approx(2 / 8)
+    assert stats.paired_p_value([1, 2], [1, 2]) == 1
+    with pytest.raises(ValueError, match="never reached"):
+        stats.paired_p_value([np.inf, 1], [1, 2])
+    with pytest.raises(ValueError, match="seed by seed"):
+        stats.paired_p_value([1, 2, 3], [1, 2])
+
+
+def test_holm():
+    """Holm's procedure by hand: the least times 3, the next times 2 and not below it, the last as it is."""
+    assert stats.holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
+    assert stats.holm([0.5, 0.6]) == [1, 1]
+    assert stats.holm([]) == []
+    with pytest.raises(ValueError, match="p values must lie"):
+        stats.holm([0.1, 1.1])
+
+
+@pytest.mark.parametrize("scores", [[], [np.nan, 1], np.zeros((2, 2, 2))])
+def test_what_are_no_scores_is_refused(scores):
+    with pytest.raises(ValueError, match="scores must be numbers"):
+        stats.interquartile_mean(scores)

@@ -1,0 +1,74 @@
+"""What passes before training begins: cold, and with what an earlier run has left in the caches of JAX and Warp.
+
+    python bench/compile_time.py [--env push] [--engine auto] [--preset cpu]
+
+Each row is a program of its own, with caches in a folder of its own. "Compiling" is what train.py reports: tracing, XLA, and,
+for warp, its kernels. "First epoch" is how much longer the first one takes than the second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+
+def measure(env: str, engine: str, preset: str) -> dict[str, float]:
+    start = time.perf_counter()
+    import dataclasses
+
+    from mjx_dher import config, envs
+    from mjx_dher.cli import keep_compiled_programs
+    from mjx_dher.trainer import train
+
+    keep_compiled_programs()
+    settings, hparams = config.preset(preset, env)
+    settings = dataclasses.replace(settings, sampler="weighted", total_steps=10**9)
+    compiled: list[float] = []
+    environment = envs.make(env, engine=engine)
+    ready = time.perf_counter()
+    run = train(environment, settings, hparams, 0, lambda seconds: compiled.append(seconds) if seconds else None)
+    first, second = next(run), next(run)
+    run.close()
+    return {
+        "imports": ready - start,
+        "compiling": compiled[0],
+        "first epoch": first.epoch_seconds - second.epoch_seconds,
+        "second epoch": second.epoch_seconds,
+    }
+
+
+def main() -> None:
+    from timing import print_table
+
+    from mjx_dher import config
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", nargs="+", default=["push"])
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--preset", default=config.machine_preset())
+    args = parser.parse_args()
+    rows = []
+    for env in args.env:
+        with tempfile.TemporaryDirectory() as folder:
+            caches = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/xla", "WARP_CACHE_PATH": f"{folder}/warp"}
+            for state in ("cold", "cached"):
+                command = [sys.executable, __file__, "measure", env, args.engine, args.preset]
+                done = subprocess.run(command, env={**os.environ, **caches}, check=True, stdout=subprocess.PIPE, text=True)
+                found = json.loads(done.stdout.splitlines()[-1])
+                rows.append((env, state, *(f"{seconds:.1f}" for seconds in found.values())))
+    head = ("imports, s", "compiling, s", "first epoch, s more", "an epoch, s")
+    print_table(("task", "caches", *head), rows)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["measure"]:
+        sys.path.insert(0, str(Path(__file__).parent))
+        print(json.dumps(measure(*sys.argv[2:])))
+    else:
+        main()
