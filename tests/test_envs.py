@@ -10,6 +10,7 @@ from conftest import load_recorded
 from mjx_dher import envs
 from mjx_dher.envs import fetch
 from mjx_dher.envs.engines import Physics
+from mjx_dher.envs.engines.base import with_stand_ins
 
 ENGINES = ("native", "jax")
 RECORDED = ("push", "pick_and_place", "slide")
@@ -219,6 +220,24 @@ def test_engines_agree_where_nothing_is_touched():
     assert np.linalg.norm(native - mjx, axis=-1).max() < 1e-5
 
 
+def test_a_cylinder_that_meets_a_box_has_a_sphere_to_stand_in_for_it():
+    model = envs.make("slide", engine="native").model
+    replaced = with_stand_ins(model)
+
+    def ends(model):
+        names = [[model.geom(g).name for g in pair] for pair in zip(model.pair_geom1, model.pair_geom2)]
+        return {frozenset(pair) for pair in names}
+
+    assert ends(model) - ends(replaced) == {frozenset(("object", "finger_both"))}
+    assert ends(replaced) - ends(model) == {frozenset(("object_side", "finger_both"))}
+    alone = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom name='a' type='box' size='1 1 1'/><body><freejoint/>"
+        "<geom name='b' type='cylinder' size='1 1'/></body></worldbody><contact><pair geom1='a' geom2='b'/></contact></mujoco>"
+    )
+    with pytest.raises(ValueError, match="geom 'b', a cylinder, needs one sphere beside it"):
+        with_stand_ins(alone)
+
+
 @pytest.mark.parametrize(("task", "margin", "grown"), [("push", 0.001, "box"), ("slide", 0.001, "sphere")])
 def test_jax_makes_up_for_the_margins_that_mjx_ignores(task, margin, grown):
     """One geom of each pair with a box is larger by the margin, which is 0 then; the environment's own model stays."""
@@ -231,7 +250,7 @@ def test_jax_makes_up_for_the_margins_that_mjx_ignores(task, margin, grown):
     assert kind == f"mjGEOM_{grown.upper()}"
     growth = np.asarray(there.geom_size)[larger[0]] - here.geom_size[larger[0]]
     assert np.allclose(growth[: 3 if grown == "box" else 1], margin, atol=1e-6)
-    both = np.isin(np.stack([here.pair_geom1, here.pair_geom2], axis=1), larger).any(axis=1)
+    both = np.isin(np.stack([there.pair_geom1, there.pair_geom2], axis=1), larger).any(axis=1)
     assert (np.asarray(there.pair_margin)[both] == 0).all()
     np.testing.assert_array_equal(jax_env.model.geom_size, native_env.model.geom_size)
 

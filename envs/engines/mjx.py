@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 from collections.abc import Iterator
 
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.base import Physics
+from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.envs.kinematics import quat_multiply
 from mjx_dher.types import Array
 
@@ -112,7 +111,7 @@ class MjxEngine:
     name = "jax"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5):
-        model = copy.copy(model)
+        model = with_stand_ins(model)
         _grow_for_margins(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations

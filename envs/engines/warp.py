@@ -7,7 +7,6 @@ Warp needs between the substeps stays with it, and only the state goes in and ou
 # Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
 import contextlib
-import copy
 import io
 import threading
 from typing import Any
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.base import Physics
+from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):
@@ -72,13 +71,13 @@ class WarpEngine:
                 f"engine warp needs JAX on an NVIDIA GPU, and JAX runs on {jax.default_backend()} here:"
                 ' pip install -e ".[cuda]" on a machine that has one, or use engine native or jax'
             )
-        self._model = copy.copy(model)
+        self._model = with_stand_ins(model)
         self._model.opt.iterations = iterations
         self._model.opt.ls_iterations = ls_iterations
         # Box against box as in C, analytically, not by the general convex algorithm.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._substeps = substeps
-        self.most_contacts, self.most_constraints = capacities(model)
+        self.most_contacts, self.most_constraints = capacities(self._model)
         self._contacts = contacts or self.most_contacts
         self._constraints = constraints or self.most_constraints
         self._simulations: dict[tuple[str, int], _Simulation] = {}
