@@ -14,6 +14,8 @@ their Python with --python. Three comparisons on FetchPush, theirs and ours taki
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import os
 import subprocess
@@ -39,7 +41,9 @@ def cores():
 
 def make_theirs(seed=0):
     import gymnasium
-    import gymnasium_robotics
+
+    with contextlib.redirect_stderr(io.StringIO()):  # a notice about other tasks, once a process
+        import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
     env = gymnasium.make(TASK)
