@@ -32,7 +32,7 @@ NUM_ENVS, BATCH_SIZE, UPDATES = 32, 1024, 40  # of the preset `cpu`
 SUCCESS = 0.9
 
 
-def cores():
+def cores():  # their Python has no JAX, and so not this library's usable_cores
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

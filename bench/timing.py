@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import statistics
 import time
@@ -11,6 +10,8 @@ from importlib import metadata
 from typing import Any
 
 import jax
+
+from mjx_dher.envs.engines.native import usable_cores
 
 
 def median_seconds(run: Callable[[], Any], repeats: int = 7) -> float:
@@ -26,9 +27,8 @@ def median_seconds(run: Callable[[], Any], repeats: int = 7) -> float:
 
 def machine() -> str:
     """One line: device, cores, versions."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = " ".join(f"{name} {metadata.version(name)}" for name in ("jax", "mujoco"))
-    return f"{jax.devices()[0].device_kind}, {_cpu()}, {cores} cores; Python {platform.python_version()} {versions}"
+    return f"{jax.devices()[0].device_kind}, {_cpu()}, {usable_cores()} cores; Python {platform.python_version()} {versions}"
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

@@ -346,7 +346,6 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
     from mjx_dher.evaluate import evaluate
 
     keep_compiled_programs()
-
     chunk = min(num_episodes, EVAL_CHUNK)
 
     @jax.jit

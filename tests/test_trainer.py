@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, config, ddpg, make_train, replay, trainer
+from mjx_dher import Config, HParams, config, ddpg, make_train, relabel, replay, trainer
 from mjx_dher.rollout import rollout
 from probes import Explodes, PointMass
 
@@ -48,6 +48,40 @@ def test_rollout_keeps_every_observation():
     np.testing.assert_array_equal(outcome.success, distance[:, -1] <= 0.1)
     np.testing.assert_array_equal(outcome.reset_success, distance[:, 0] <= 0.1)
     np.testing.assert_array_equal(outcome.ret, -jnp.sum(distance[:, 1:] > 0.1, axis=1))
+
+
+def test_an_environment_s_check_is_made_after_each_epoch_and_ends_the_run():
+    class Checked(PointMass):
+        checks = 0
+
+        def check(self):
+            self.checks += 1
+            if self.checks == 2:
+                raise ValueError("contacts were lost")
+
+    env = Checked()
+    run = trainer.train(env, SMALL, HParams(), seed=0)
+    assert next(run).epoch == 1
+    assert env.checks == 1
+    with pytest.raises(ValueError, match="contacts were lost"):
+        next(run)
+
+
+@pytest.mark.parametrize(("at_once", "draws"), [(32 * 2, 2), (32 * 4, 1), (1, 2)])
+def test_batches_are_drawn_up_to_so_many_at_once_and_all_are_learned_from(monkeypatch, at_once, draws):
+    """A cycle of 4 updates of 32 with a target update every 2: never less at once than between two target updates."""
+    shapes = []
+
+    def draw_batches(ring, key, shape, *args):
+        shapes.append(shape)
+        return relabel.draw_batches(ring, key, shape, *args)
+
+    monkeypatch.setattr(trainer, "DRAWN_AT_ONCE", at_once)
+    monkeypatch.setattr(trainer, "draw_batches", draw_batches)
+    program = make_train(ENV, SMALL)
+    state, _ = jax.jit(program.epoch)(program.init(jax.random.key(0), HParams()))
+    assert set(shapes) == {(2 // draws, 2, 32)}
+    assert state.learner.num_updates == 3 * 4
 
 
 def test_an_epoch_counts_what_it_does():

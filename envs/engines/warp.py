@@ -25,6 +25,8 @@ with contextlib.redirect_stdout(io.StringIO()):
     # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.
     from mujoco.mjx.third_party import mujoco_warp
 
+wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
+
 # Contacts between two geoms, at most.
 _MAX_CONTACTS = {
     frozenset(("PLANE", "BOX")): 4,
@@ -32,7 +34,6 @@ _MAX_CONTACTS = {
     frozenset(("SPHERE", "BOX")): 1,
     frozenset(("BOX",)): 8,
 }
-wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
 _OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # of which contacts or constraints are lost
 
 
