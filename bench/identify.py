@@ -116,9 +116,9 @@ def rows_of_contacts(there, here):
         "finger_l": "robot0:l_gripper_finger_link",
         "palm": "robot0:gripper_link",
         "object": "object0",
-        "object_side": "object0",
+        "object_stand_in": "object0",
         "floor": "floor0",
-        "tabletop": None,
+        "table_stand_in": None,
         "table": None,
     }
     table = int(there.body("table0").geomadr[0])

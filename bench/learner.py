@@ -2,8 +2,8 @@
 
     python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
 
-As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one. Several seeds
-are one program, vmapped; times are per update of one seed.
+As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one, until 500
+updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one seed.
 """
 
 from __future__ import annotations
@@ -64,26 +64,33 @@ def main() -> None:
     counts = replay.count_eventful(ring)
     rows = []
     for batch_size, seeds in itertools.product(args.batch_sizes, args.seeds):
-        updates = max(1, DRAWN_AT_ONCE // batch_size)
+        at_once = max(1, DRAWN_AT_ONCE // batch_size)
+        draws = -(-500 // at_once)
 
-        def draw(key, shape=(updates, batch_size)):
+        def draw(key, shape=(at_once, batch_size)):
             return draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)
+
+        def draw_all(key, draw=draw, draws=draws):
+            """[draws] one number of each batch, so that none is left out."""
+            add_up = lambda _, key: (None, sum(jnp.sum(x) for x in jax.tree.leaves(draw(key))))  # noqa: E731
+            return jax.lax.scan(add_up, None, jax.random.split(key, draws))[1]
 
         def update(learner, batch):
             learner, losses = ddpg.update(networks, learner, batch, hparams)
             return ddpg.update_target(learner, hparams), losses
 
-        def updates_only(learner, batches, update=update):
-            return jax.lax.scan(update, learner, batches)
+        def updates_only(learner, batches, update=update, draws=draws):
+            return jax.lax.scan(lambda learner, _: jax.lax.scan(update, learner, batches), learner, length=draws)
 
-        def both(learner, key, draw=draw, update=update):
-            return jax.lax.scan(update, learner, draw(key))
+        def both(learner, key, draw=draw, update=update, draws=draws):
+            draw_and_update = lambda learner, key: jax.lax.scan(update, learner, draw(key))  # noqa: E731
+            return jax.lax.scan(draw_and_update, learner, jax.random.split(key, draws))
 
         keys = jax.random.split(jax.random.key(2), seeds)
         learners = jax.vmap(lambda key: ddpg.init(key, networks, 25, 3, 4))(keys)
-        drawing, updating, whole = (jax.jit(jax.vmap(function)) for function in (draw, updates_only, both))
-        batches = drawing(keys)
-        each = updates * seeds
+        drawing, updating, whole = (jax.jit(jax.vmap(function)) for function in (draw_all, updates_only, both))
+        batches = jax.jit(jax.vmap(draw))(keys)
+        each = at_once * draws * seeds
         draw_time = median_seconds(lambda: drawing(keys)) / each
         update_time = median_seconds(lambda: updating(learners, batches)) / each
         both_time = median_seconds(lambda: whole(learners, keys)) / each

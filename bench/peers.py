@@ -137,7 +137,7 @@ def their_train(minutes):
                 obs, ended = test.reset()[0], False
                 while not ended:
                     obs, _, _, ended, info = test.step(self.model.predict(obs, deterministic=True)[0])
-                successes += info["is_success"]
+                successes += int(info["is_success"])
             self.paused += time.perf_counter() - now
             self.curve.append((round(seconds, 1), self.num_timesteps, successes / 100))
             print(*self.curve[-1], file=sys.stderr, flush=True)

@@ -45,6 +45,7 @@ class FetchTask:
     object_range: float = 0.15  # the object starts within this of the gripper, along x and along y
     min_object_distance: float = 0.1  # but at least this far from it in the plane
     max_goal_lift: float = 0.0  # half of all goals are lifted by up to this
+    finger_qvel: tuple[float, float] = (0.0, 0.0)  # settled, m/s, right and left; where there are fingers with joints
 
 
 class FetchEnv(GoalEnv):
@@ -84,8 +85,9 @@ class FetchEnv(GoalEnv):
         self.has_object = self.task.object_height is not None
         self.observation_size = 25 if self.has_object else 10
         self.arm = Chain(self.model, body="gripper", site="grip")
-        # Two finger joints, right and left, where the fingers move; an actuator for each.
-        self.has_fingers = self.model.nu > 0
+        # Two finger joints, right and left. Where nothing drives them they are blocked: put back after every step.
+        self.has_fingers = any(self.model.joint(i).name == "finger_r" for i in range(self.model.njnt))
+        self.drives_fingers = self.model.nu > 0
         if self.has_fingers:
             self._finger_qpos, self._finger_qvel = _joint_slices(self.model, "finger_r", width=2)
         if self.has_object:
@@ -118,8 +120,8 @@ class FetchEnv(GoalEnv):
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
 
-        `action[3]` opens and closes the fingers where the task has any that move. Should the physics blow up (a value that is
-        not finite, or a speed out of all reason), the state goes back to a start, and `failed` stays True until `reset`.
+        `action[3]` opens and closes the fingers where they are driven. Should the physics blow up (a value that is not finite,
+        or a speed out of all reason), the state goes back to a start, and `failed` stays True until `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be; and
@@ -127,8 +129,10 @@ class FetchEnv(GoalEnv):
         pos, quat = self.arm.pose(self._seen(state.physics).qpos[self.arm.qpos])
         quat = quat + POINTING_DOWN
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
-        ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.has_fingers else jnp.zeros(0)
+        ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.drives_fingers else jnp.zeros(0)
         physics = self.engine.advance(state.physics, target, ctrl)
+        if self.has_fingers and not self.drives_fingers:
+            physics = dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
         sound = self._is_sound(physics)
         physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._start(self._resting_place()))
         failed = state.failed | ~sound
@@ -151,6 +155,8 @@ class FetchEnv(GoalEnv):
             qpos = qpos.at[self._object_qpos].set(object_qpos)
         # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
         qvel = jnp.zeros(self.model.nv).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel))
+        if self.has_fingers:
+            qvel = qvel.at[self._finger_qvel].set(jnp.array(self.task.finger_qvel))
         return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
 
     def _resting_place(self) -> Array | None:
@@ -204,10 +210,10 @@ class FetchEnv(GoalEnv):
     def _seen(self, physics: Physics) -> Physics:
         """What the observation is made from after a step.
 
-        Where fingers move, the original does not recompute positions after its last substep: gripper and object are seen
+        Where fingers are driven, the original does not recompute positions after its last substep: gripper and object are seen
         one substep (2 ms) late, while joint positions and all velocities are fresh.
         """
-        if not self.has_fingers:
+        if not self.drives_fingers:
             return physics
         qpos, qvel = physics.qpos, physics.qvel
         late = qpos.at[self.arm.qpos].add(-TIMESTEP * qvel[self.arm.qvel])

@@ -18,4 +18,5 @@ class Slide(FetchEnv):
         target_offset=(0.4, 0.0, 0.0),
         object_height=0.41999957,
         object_range=0.1,
+        finger_qvel=(3.60453e-06, 0.00245563),
     )

@@ -1,4 +1,4 @@
-"""The command line: `train` (the default command), `eval`, `render` and `transfer`."""
+"""The command line: `train` (the default command), `eval`, `render` and `transfer`; `sweep` and `plot` are in `cli_sweep`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import __version__, config, envs, run_folder
+from mjx_dher import __version__, cli_sweep, config, envs, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -34,8 +34,8 @@ EVAL_CHUNK = 500  # episodes evaluated at once
 class TrainArgs:
     """Train a policy with DDPG and Hindsight Experience Replay.
 
-    Other commands: `eval RUN` evaluates a run again, `render RUN` draws it, `transfer RUN` plays it in the original Fetch task
-    (see `eval --help` and so on).
+    Other commands: `eval RUN` evaluates a run again, `render RUN` draws it, `transfer RUN` plays it in the original Fetch task,
+    `sweep` trains and compares many runs, `plot DIR` draws a sweep (see `eval --help` and so on).
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -119,6 +119,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "eval": eval_command,
         "render": render_command,
         "transfer": transfer_command,
+        "sweep": cli_sweep.sweep_command,
+        "plot": cli_sweep.plot_command,
     }
     name = argv.pop(0) if argv and argv[0] in commands else "train"
     try:

@@ -215,9 +215,9 @@ def validate(config: Config, hparams: HParams, episode_length: int = 50) -> None
 
 def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
     for field, value, allowed in (
-        ("sampler", c.sampler, _sampler_names()),
+        ("sampler", c.sampler, sampler_names()),
         ("weight_kernel", c.weight_kernel, WEIGHT_KERNELS),
-        ("metric", c.metric, METRICS),
+        ("metric", c.metric, metric_names()),
         ("engine", c.engine, ENGINES),
     ):
         try:
@@ -251,10 +251,16 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
 
 
-def _sampler_names() -> tuple[str, ...]:
+def sampler_names() -> tuple[str, ...]:
     """The samplers known so far: users can have registered more only once the module has been imported."""
     module = sys.modules.get("mjx_dher.samplers")
     return module.list_samplers() if module else SAMPLERS
+
+
+def metric_names() -> tuple[str, ...]:
+    """Likewise the metrics."""
+    module = sys.modules.get("mjx_dher.samplers")
+    return tuple(module.METRICS) if module else METRICS
 
 
 # field -> (least value, may it be least, greatest value, may it be greatest)

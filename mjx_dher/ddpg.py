@@ -40,7 +40,7 @@ class DDPGState:
 
     params: Params
     target: Params
-    opt_state: Params  # Adam's moments, one optimizer a network
+    opt_state: PyTree  # Adam's moments, of both networks
     observation_norm: NormalizerState  # [D]
     goal_norm: NormalizerState  # [G]
     num_updates: Array  # [] int32
@@ -62,7 +62,7 @@ def init(key: PRNGKey, networks: Networks, observation_size: int, goal_size: int
     return DDPGState(
         params=params,
         target=jax.tree.map(jnp.copy, params),
-        opt_state=Params(actor=_ADAM.init(params.actor), critic=_ADAM.init(params.critic)),
+        opt_state=_ADAM.init(params),
         observation_norm=normalizer.init(observation_size),
         goal_norm=normalizer.init(goal_size),
         num_updates=jnp.zeros((), jnp.int32),
@@ -152,14 +152,12 @@ def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams)
         params.critic
     )
     a_loss, a_grad = jax.value_and_grad(lambda actor: actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
-    critic, critic_opt = _adam_step(c_grad, state.opt_state.critic, params.critic, hparams.critic_lr)
-    actor, actor_opt = _adam_step(a_grad, state.opt_state.actor, params.actor, hparams.actor_lr)
-    state = dataclasses.replace(
-        state,
-        params=Params(actor=actor, critic=critic),
-        opt_state=Params(actor=actor_opt, critic=critic_opt),
-        num_updates=state.num_updates + 1,
+    direction, opt_state = _ADAM.update(Params(actor=a_grad, critic=c_grad), state.opt_state)
+    params = Params(
+        actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
+        critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),
     )
+    state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
     return state, Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
 
 
@@ -175,11 +173,6 @@ def _pi(networks: Networks, actor: PyTree, observation: Array, goal: Array) -> A
 
 def _q(networks: Networks, critic: PyTree, observation: Array, goal: Array, action: Array) -> Array:
     return cast(Array, networks.critic.apply(critic, observation, goal, action))
-
-
-def _adam_step(grad: PyTree, opt_state: PyTree, params: PyTree, lr: Array | float) -> tuple[PyTree, PyTree]:
-    direction, opt_state = _ADAM.update(grad, opt_state)
-    return jax.tree.map(lambda p, d: p - lr * d, params, direction), opt_state
 
 
 def _normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:

@@ -58,7 +58,7 @@ class ConsoleSink:
         line = (
             f"epoch {row['epoch']}/{self._num_epochs}  {row['env_steps']:,} steps"
             f"  {row['steps_per_second']:,.0f} steps/s  {row['updates_per_second']:,.0f} updates/s"
-            f"  success {row['success_rate']:.2f}  return {row['return_mean']:.1f}  ETA {_clock(eta)}"
+            f"  success {row['success_rate']:.2f}  return {row['return_mean']:.1f}  ETA {clock(eta)}"
         )
         if self._live is None:
             self._console.print(line, soft_wrap=True, highlight=False)
@@ -70,7 +70,8 @@ class ConsoleSink:
             self._live.stop()
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """For a reader: "1:02:03"."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -18,7 +18,10 @@ def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparam
     """[B, G] one achieved goal for each transition of `sample`, chosen by `sampler`."""
     pool_key, draw_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
-    pool = replay.sample_episode_goals(state, pool_key, batch_size) if sampler.whole_ring else sample.episode_goals
+    pool = sample.episode_goals
+    if sampler.whole_ring:
+        elsewhere = replay.sample_episode_goals(state, pool_key, batch_size)
+        pool = jnp.where(sampler.whole_ring(hparams), elsewhere, pool) if callable(sampler.whole_ring) else elsewhere
     log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
     index = samplers.draw(draw_key, log_weights)
     return pool[jnp.arange(batch_size), index]

@@ -12,7 +12,8 @@ itself.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,8 @@ class Sampler:
     """A goal sampler: its log weights, and whose achieved goals they choose from."""
 
     log_weights: LogWeightsFn = struct.field(pytree_node=False)
-    whole_ring: bool = struct.field(pytree_node=False, default=False)  # goals of any episode, not of its own
+    # Goals of any episode, not of its own. A function where the answer is traced: see `one_of`.
+    whole_ring: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
 
 
 def position(achieved: Array, desired: Array) -> Array:
@@ -162,6 +164,17 @@ def register(name: str, sampler: Sampler) -> None:
     _PLAIN[name] = sampler
 
 
+def register_metric(name: str, metric: MetricFn) -> None:
+    """Makes a distance available to `make` and to the command line's --metric.
+
+    Raises:
+      ValueError: the name is taken.
+    """
+    if name in METRICS:
+        raise ValueError(f"metric {name!r} is already registered")
+    METRICS[name] = metric
+
+
 def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
     """The sampler called `name`.
 
@@ -186,6 +199,30 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
         "weighted": functools.partial(weighted, kernel=kernel, metric=metric),
     }
     return Sampler(by_distance[name]) if name in by_distance else _PLAIN[name]
+
+
+def one_of(choices: Sequence[Sampler]) -> Sampler:
+    """Several samplers in one compiled program: `hparams.choice`, a traced number, says which of them a run uses.
+
+    All log weights are computed and one is kept, so that a run draws what it would have drawn with that sampler alone. A
+    field `choice` is not in `HParams`: the caller, `sweep`, adds it.
+    """
+    if len(choices) == 1:
+        return choices[0]
+
+    def pick(values: Sequence[Any], hparams: Any) -> Array:
+        kept = jnp.asarray(values[0])
+        for index, value in enumerate(values[1:], 1):
+            kept = jnp.where(hparams.choice == index, value, kept)
+        return kept
+
+    def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+        return pick([choice.log_weights(achieved, desired, step, hparams) for choice in choices], hparams)
+
+    elsewhere = [choice.whole_ring for choice in choices]
+    if not any(elsewhere):
+        return Sampler(log_weights)
+    return Sampler(log_weights, whole_ring=lambda hparams: pick(elsewhere, hparams))
 
 
 def probabilities(log_weights: Array) -> Array:

@@ -85,6 +85,27 @@ def bootstrap_interval(
     return _percentiles(drawn, level)
 
 
+def curve_interval(
+    curves: ArrayLike, level: float = 0.95, repeats: int = 2_000, seed: int = 0
+) -> tuple[NDArray, NDArray, NDArray]:
+    """The interquartile mean of learning curves [S, P] at each point, and its percentile bootstrap interval: three of [P].
+
+    Whole curves are drawn anew, and the interval is each point's own.
+
+    Raises:
+      ValueError: curves that are not [S, P], or a level not between 0 and 1.
+    """
+    curves = np.asarray(curves, float)
+    _curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)
+    num_seeds = len(curves)
+    cut = num_seeds // 4
+    middle = slice(cut, num_seeds - cut)
+    rng = np.random.default_rng(seed)
+    drawn = np.sort(curves[rng.integers(num_seeds, size=(repeats, num_seeds))], axis=1)[:, middle].mean(axis=1)
+    low, high = _quantiles(drawn, level)
+    return np.sort(curves, axis=0)[middle].mean(axis=0), low, high
+
+
 def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
     """[S] the first of the points x [P] at which each of the curves [S, P] is at the threshold or above; infinite if none is.
 
@@ -198,8 +219,13 @@ def _redrawn(scores: NDArray, rng: np.random.Generator) -> NDArray:
 
 
 def _percentiles(drawn: NDArray, level: float) -> tuple[float, float]:
+    low, high = _quantiles(drawn, level)
+    return float(low), float(high)
+
+
+def _quantiles(drawn: NDArray, level: float) -> tuple[NDArray, NDArray]:
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
     # Whole draws, not between two of them: times to a threshold can be infinite.
-    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2], method="inverted_cdf")
-    return float(low), float(high)
+    low, high = np.quantile(drawn, [(1 - level) / 2, (1 + level) / 2], axis=0, method="inverted_cdf")
+    return low, high

@@ -20,6 +20,7 @@ from mjx_dher.networks import Actor, Critic
 from mjx_dher.relabel import draw_batches, is_eventful, relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
+from mjx_dher.samplers import Sampler
 from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, PRNGKey
 
 # Transitions, at most, but for a single batch and those up to a target update. More would not fit a CPU's cache.
@@ -50,8 +51,10 @@ class Train(NamedTuple):
     replay_bytes: int  # of one run's ring
 
 
-def make_train(env: Env, config: Config) -> Train:
+def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Train:
     """The training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
+
+    Hindsight goals are chosen by `sampler`, or else by the one that `config` names.
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
     and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
@@ -62,7 +65,7 @@ def make_train(env: Env, config: Config) -> Train:
       ValueError: a Config that cannot run, or an observation that is not one vector.
     """
     config_lib.validate(config, HParams(), env.episode_length)
-    sampler = samplers.make(config.sampler, config.weight_kernel, config.metric)
+    chosen = samplers.make(config.sampler, config.weight_kernel, config.metric) if sampler is None else sampler
     networks = Networks(actor=Actor(env.action_size, config.hidden_sizes), critic=Critic(config.hidden_sizes))
     template = episode_template(env)
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
@@ -83,7 +86,7 @@ def make_train(env: Env, config: Config) -> Train:
                 action_size=env.action_size,
             ),
             replay=replay.init(template, num_episodes),
-            hparams=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams),
+            hparams=_arrays(hparams),
             key=key,
             env_steps=jnp.zeros((), jnp.int32),
         )
@@ -94,7 +97,7 @@ def make_train(env: Env, config: Config) -> Train:
         fresh = replay.add(replay.init(template, num_new), episodes, valid=valid)
         sample_key, relabel_key = jax.random.split(key)
         sample = replay.sample(fresh, sample_key, num_new * num_steps)
-        batch = relabel(fresh, sample, sampler, env.compute_reward, hparams, relabel_key)
+        batch = relabel(fresh, sample, chosen, env.compute_reward, hparams, relabel_key)
         return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
 
     def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
@@ -110,7 +113,7 @@ def make_train(env: Env, config: Config) -> Train:
 
         def draw_and_update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
             shape = (targets_at_once, updates_per_target, config.batch_size)
-            batches = draw_batches(ring, key, shape, sampler, env.compute_reward, hparams, counts)
+            batches = draw_batches(ring, key, shape, chosen, env.compute_reward, hparams, counts)
             return jax.lax.scan(update_with_target, learner, batches)
 
         keys = jax.random.split(key, targets_per_cycle // targets_at_once)
@@ -196,15 +199,15 @@ def episode_template(env: Env) -> Episode:
 
 
 class Progress(NamedTuple):
-    """Where a run is after an epoch."""
+    """Where a run is after an epoch, or L runs side by side."""
 
     epoch: int  # from 1
     num_epochs: int
-    env_steps: int
-    updates: int
+    env_steps: int  # of each run
+    updates: int  # of each run
     wall_seconds: float  # since the first epoch began: compilation is not counted
     epoch_seconds: float
-    metrics: dict[str, float]
+    metrics: dict[str, Any]  # a float each; of runs side by side an array [L] each
     state: TrainState  # valid until the next epoch begins, which takes over its memory
 
 
@@ -228,7 +231,7 @@ def train(
 
     Raises:
       ValueError: a Config or HParams that cannot run, a replay ring larger than the memory that is free, or what
-        `env.check` raises, where the environment has one, after an epoch.
+        `env.check` raises, where the environment has one, before the first epoch or after any.
     """
     hparams = HParams() if hparams is None else hparams
     config_lib.validate(config, hparams, env.episode_length)
@@ -236,32 +239,78 @@ def train(
     check_memory(program.replay_bytes, config)
     on_compile(None)
     started = time.perf_counter()
-    state = jax.jit(program.init)(jax.random.key(seed), hparams)
-    epoch = jax.jit(program.epoch, donate_argnums=0).lower(state).compile()
+    key = jax.random.key(seed)
+    compiled = compile_program(program, key, hparams)
+    check_env(env)
     on_compile(time.perf_counter() - started)
+    for progress in run(env, config, compiled, key, hparams):
+        yield progress._replace(metrics={name: float(value) for name, value in progress.metrics.items()})
 
+
+class Compiled(NamedTuple):
+    """A training loop, compiled."""
+
+    init: Callable[[PRNGKey, HParams], TrainState]
+    epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
+    nbytes: int  # memory that an epoch takes, all told, as the compiler planned it; 0 where it does not tell
+
+
+def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
+    """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
+
+    Their values do not matter.
+    """
+    init, epoch = (jax.vmap(program.init), jax.vmap(program.epoch)) if key.ndim else (program.init, program.epoch)
+    hparams = _arrays(hparams)
+    state = jax.eval_shape(init, key, hparams)
+    compiled = jax.jit(epoch, donate_argnums=0).lower(state).compile()
+    sizes = compiled.memory_analysis()
+    nbytes = 0
+    if sizes is not None:
+        nbytes = (
+            sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
+        )
+    return Compiled(init=jax.jit(init).lower(key, hparams).compile(), epoch=compiled, nbytes=nbytes)
+
+
+def run(env: Env, config: Config, compiled: Compiled, key: PRNGKey, hparams: HParams) -> Iterator[Progress]:
+    """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays. See `train`.
+
+    Raises:
+      ValueError: what `env.check` raises, where the environment has one, after an epoch.
+    """
     num_epochs = config_lib.num_epochs(config, env.episode_length)
+    state = jax.block_until_ready(compiled.init(key, _arrays(hparams)))
     started = previous = time.perf_counter()
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         for number in range(1, num_epochs + 1):
-            running = pool.submit(lambda state: jax.block_until_ready(epoch(state)), state)
+            running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)
             state, metrics = running.result()
-            if (check := getattr(env, "check", None)) is not None:
-                check()
+            check_env(env)
             now = time.perf_counter()
             yield Progress(
                 epoch=number,
                 num_epochs=num_epochs,
-                env_steps=int(state.env_steps),
-                updates=int(state.learner.num_updates),
+                env_steps=number * config_lib.steps_per_epoch(config, env.episode_length),
+                updates=number * config.cycles_per_epoch * config.updates_per_cycle,
                 wall_seconds=now - started,
                 epoch_seconds=now - previous,
-                metrics={name: float(value) for name, value in metrics.items()},
+                metrics=jax.device_get(metrics),
                 state=state,
             )
             previous = time.perf_counter()
+
+
+def _arrays(hparams: HParams) -> HParams:
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
+
+
+def check_env(env: Env) -> None:
+    """Calls `env.check()`, where the environment has one."""
+    if (check := getattr(env, "check", None)) is not None:
+        check()
 
 
 def check_memory(replay_bytes: int, config: Config) -> None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
-os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # nothing of a test stays in the user's cache folder
+# What one test has compiled the next one need not; but nothing of a test stays in the user's cache folder.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache = tempfile.mkdtemp()
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 

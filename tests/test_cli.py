@@ -158,7 +158,7 @@ def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(t
         "from mjx_dher import cli; cli.keep_compiled_programs(); import jax;"
         "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0); jax.jit(lambda x: x + 1)(1.0)"
     )
-    clean = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_COMPILATION_CACHE"}
+    clean = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     chosen_folder = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine")} if chosen else {}
     environment = {**clean, "XDG_CACHE_HOME": str(tmp_path), **chosen_folder}
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, env=environment)

@@ -220,7 +220,7 @@ def test_engines_agree_where_nothing_is_touched():
     assert np.linalg.norm(native - mjx, axis=-1).max() < 1e-5
 
 
-def test_a_cylinder_that_meets_a_box_has_a_sphere_to_stand_in_for_it():
+def test_where_a_cylinder_meets_a_box_one_of_them_has_a_stand_in():
     model = envs.make("slide", engine="native").model
     replaced = with_stand_ins(model)
 
@@ -228,14 +228,30 @@ def test_a_cylinder_that_meets_a_box_has_a_sphere_to_stand_in_for_it():
         names = [[model.geom(g).name for g in pair] for pair in zip(model.pair_geom1, model.pair_geom2)]
         return {frozenset(pair) for pair in names}
 
-    assert ends(model) - ends(replaced) == {frozenset(("object", "finger_both"))}
-    assert ends(replaced) - ends(model) == {frozenset(("object_side", "finger_both"))}
+    fingers = ("finger_r", "finger_l")
+    assert ends(model) - ends(replaced) == {frozenset(("object", other)) for other in ("table", *fingers)}
+    stand_ins = {frozenset(("object_stand_in", finger)) for finger in fingers}
+    assert ends(replaced) - ends(model) == {frozenset(("object", "table_stand_in"))} | stand_ins
     alone = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><geom name='a' type='box' size='1 1 1'/><body><freejoint/>"
         "<geom name='b' type='cylinder' size='1 1'/></body></worldbody><contact><pair geom1='a' geom2='b'/></contact></mujoco>"
     )
-    with pytest.raises(ValueError, match="geom 'b', a cylinder, needs one sphere beside it"):
+    with pytest.raises(ValueError, match="geoms 'b', a cylinder, and 'a', a box, meet"):
         with_stand_ins(alone)
+
+
+def test_slides_fingers_give_way_and_are_put_back():
+    """As in the original: their joints are at 0 after every step, and what is left of the push is seen as their velocity."""
+    env = envs.make("slide", engine="native")
+    down = jnp.array([0.0, 0.0, -1.0, 0.0])
+    state = env.init_state(env.reset(jax.random.key(0)).physics.qpos[env._object_qpos], jnp.ones(3))
+    assert jnp.allclose(state.obs["observation"][23:], jnp.array(env.task.finger_qvel) * 0.04)
+    speeds = []
+    for _ in range(10):
+        state = jax.jit(env.step)(state, down)
+        assert not jnp.any(state.obs["observation"][9:11])
+        speeds.append(state.obs["observation"][23:])
+    assert jnp.abs(jnp.stack(speeds)).max() > 1e-3
 
 
 @pytest.mark.parametrize(("task", "margin", "grown"), [("push", 0.001, "box"), ("slide", 0.001, "sphere")])

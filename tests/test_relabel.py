@@ -1,3 +1,5 @@
+import collections
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,3 +94,20 @@ def test_weighted_prefers_goals_near_the_desired_one(ring):
         return float(jnp.mean(jnp.linalg.norm(goals - sample.desired_goal, axis=-1)))
 
     assert mean_distance("closest") < mean_distance("epsilon_closest") < mean_distance("weighted") < mean_distance("future")
+
+
+def test_one_of_several_samplers_draws_what_it_would_alone(ring):
+    """Whichever a run is told to use by its number, to the bit; `random`, which looks elsewhere in the ring, too."""
+    names = ("future", "random", "weighted", "closest", "final")
+    together = samplers.one_of([samplers.make(name) for name in names])
+    Numbered = collections.namedtuple("Numbered", (*HParams._fields, "choice"))
+    sample = replay.sample(ring, jax.random.key(0), 64)
+    goals = set()
+    for choice, name in enumerate(names):
+        numbers = Numbered(*HParams(), choice)
+        found = hindsight_goals(ring, sample, together, numbers, jax.random.key(1))
+        alone = hindsight_goals(ring, sample, samplers.make(name), HParams(), jax.random.key(1))
+        np.testing.assert_array_equal(found, alone)
+        goals.add(found.tobytes())
+    assert len(goals) == len(names)
+    assert samplers.one_of([together]) is together

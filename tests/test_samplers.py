@@ -138,3 +138,18 @@ def test_register(monkeypatch):
 def test_unknown_names_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         samplers.make(**kwargs)
+
+
+def test_a_registered_metric_is_one_by_name(monkeypatch):
+    """Distance along x alone: of the goals after step 1, (0, 0, 1) and (0, 2, 0) lie on the desired one."""
+    monkeypatch.setattr(samplers, "METRICS", dict(samplers.METRICS))
+    along_x = lambda achieved, desired: jnp.abs(achieved[:, 0] - desired[0])  # noqa: E731
+    with pytest.raises(ValueError, match="metric must be one of position; got 'along_x'"):
+        config.validate(config.Config(metric="along_x"), HP)
+    samplers.register_metric("along_x", along_x)
+    config.validate(config.Config(metric="along_x"), HP)
+    np.testing.assert_allclose(table(samplers.make("closest", metric="along_x"), 1), [0, 0, 0.5, 0, 0.5])
+    # At 0, 3, 0 the mean is 1 and the relative distances are 0, 3, 0: weights 2, 0, 2.
+    np.testing.assert_allclose(table(samplers.make("weighted", metric="along_x"), 1), [0, 0, 0.5, 0, 0.5])
+    with pytest.raises(ValueError, match="metric 'along_x' is already registered"):
+        samplers.register_metric("along_x", along_x)

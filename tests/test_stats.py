@@ -145,3 +145,16 @@ def test_holm():
 def test_what_are_no_scores_is_refused(scores):
     with pytest.raises(ValueError, match="scores must be numbers"):
         stats.interquartile_mean(scores)
+
+
+def test_curve_interval_is_the_interval_of_each_point():
+    curves = np.random.default_rng(1).random((9, 4))
+    middle, low, high = stats.curve_interval(curves, repeats=20_000)
+    for point in range(4):
+        assert middle[point] == pytest.approx(stats.interquartile_mean(curves[:, point]))
+        want = stats.bootstrap_interval(curves[:, point])
+        assert (low[point], high[point]) == pytest.approx(want, abs=0.04 * (want[1] - want[0]))
+    with pytest.raises(ValueError, match=r"curves \[S, P\]"):
+        stats.curve_interval(curves[0])
+    with pytest.raises(ValueError, match="level"):
+        stats.curve_interval(curves, level=1.0)

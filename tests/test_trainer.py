@@ -50,19 +50,19 @@ def test_rollout_keeps_every_observation():
     np.testing.assert_array_equal(outcome.ret, -jnp.sum(distance[:, 1:] > 0.1, axis=1))
 
 
-def test_an_environment_s_check_is_made_after_each_epoch_and_ends_the_run():
+def test_an_environment_s_check_is_made_before_the_first_epoch_and_after_each_and_ends_the_run():
     class Checked(PointMass):
         checks = 0
 
         def check(self):
             self.checks += 1
-            if self.checks == 2:
+            if self.checks == 3:
                 raise ValueError("contacts were lost")
 
     env = Checked()
     run = trainer.train(env, SMALL, HParams(), seed=0)
     assert next(run).epoch == 1
-    assert env.checks == 1
+    assert env.checks == 2
     with pytest.raises(ValueError, match="contacts were lost"):
         next(run)
 

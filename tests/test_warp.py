@@ -79,8 +79,10 @@ def test_lost_contacts_are_an_error_that_names_the_memory_to_use(memory, kind, n
 
 
 def test_capacities_are_what_all_pairs_can_give_at_once():
-    """slide: fingers on a sphere 1 contact of 6 rows, fingers and puck on a plane 4 each of 4 rows; the weld 6 rows."""
-    assert capacities(with_stand_ins(envs.make("slide", engine="native").model)) == (1 + 4 + 4, 6 + 6 + 16 + 16)
+    """slide: two fingers on a sphere 1 contact of 6 rows each, two fingers on a plane and the puck on two 4 each of 4 rows; the
+    weld 6 rows, and 2 for each finger's limits."""
+    found = capacities(with_stand_ins(envs.make("slide", engine="native").model))
+    assert found == (2 * 1 + 2 * 4 + 2 * 4, 6 + 2 * 2 + 2 * 6 + 2 * 16 + 2 * 16)
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><geom name='a' type='ellipsoid' size='1 1 1'/>"
         "<body><freejoint/><geom name='b' size='1' type='capsule' fromto='0 0 0 1 0 0'/></body></worldbody>"

@@ -22,23 +22,26 @@ class Physics:
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of the model in which boxes meet, in place of each cylinder that they are paired with, the sphere on its body.
+    """A copy of the model without contacts of a cylinder with a box: one of the two gives way to the geom called NAME_stand_in.
 
-    For engines that have no contact of a cylinder with a box, or a worse one.
+    The box's takes its place if there is one, else the cylinder's. For engines that have no such contact, or a worse one.
 
     Raises:
-      ValueError: the body has no sphere, or more than one.
+      ValueError: neither has one.
     """
     model = copy.copy(model)
-    sphere, cylinder, box = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("SPHERE", "CYLINDER", "BOX"))
-    kinds = model.geom_type
+    cylinder, box = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("CYLINDER", "BOX"))
+    names = [model.geom(i).name for i in range(model.ngeom)]
     for ends, others in ((model.pair_geom1, model.pair_geom2), (model.pair_geom2, model.pair_geom1)):
-        for pair in np.flatnonzero((kinds[ends] == cylinder) & (kinds[others] == box)):
-            spheres = np.flatnonzero((model.geom_bodyid == model.geom_bodyid[ends[pair]]) & (kinds == sphere))
-            if len(spheres) != 1:
-                name = model.geom(ends[pair]).name
-                raise ValueError(f"geom {name!r}, a cylinder, needs one sphere beside it to stand in for it")
-            ends[pair] = spheres[0]
+        for pair in np.flatnonzero((model.geom_type[ends] == cylinder) & (model.geom_type[others] == box)):
+            for side in (others, ends):
+                stand_in = f"{names[side[pair]]}_stand_in"
+                if stand_in in names:
+                    side[pair] = names.index(stand_in)
+                    break
+            else:
+                both = f"{names[ends[pair]]!r}, a cylinder, and {names[others[pair]]!r}, a box,"
+                raise ValueError(f"geoms {both} meet; one of them needs another to stand in for it, called NAME_stand_in")
     return model
 
 

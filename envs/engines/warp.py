@@ -6,6 +6,7 @@ Warp needs between the substeps stays with it, and only the state goes in and ou
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
+import concurrent.futures
 import contextlib
 import io
 import threading
@@ -83,7 +84,7 @@ class WarpEngine:
         self._constraints = constraints or self.most_constraints
         self._simulations: dict[tuple[str, int], _Simulation] = {}
         self._lock = threading.Lock()
-        self._ready = False
+        self._loading: concurrent.futures.Future[None] | None = None
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -94,6 +95,7 @@ class WarpEngine:
             qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
             warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
         ):
+            self._wait()
             with self._lock:
                 simulation = self._simulation(qpos.device, qpos.shape[0])
                 simulation.advance((qpos, qvel, warmstart), inputs, (qpos_out, qvel_out, warmstart_out))
@@ -105,10 +107,11 @@ class WarpEngine:
             graph_mode=wp.JaxCallableGraphMode.NONE,  # `_Simulation` captures its own, whatever the buffers
             vmap_method="broadcast_all",
             output_dims=shapes,
+            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it, and two at once would clash
         )
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
-        self._load_kernels()
+        self._begin_loading()
         rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, physics.warmstart)]
         # Else numbered by how often it has been traced, and JAX would not find a program again that it has compiled and kept.
         self._call.call_id = 0
@@ -116,12 +119,13 @@ class WarpEngine:
         return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0])
 
     def check(self) -> None:
-        """Raises where contacts or constraints were lost since the last call, for want of memory.
+        """Raises where contacts or constraints were lost since the last call, for want of memory; waits for kernels to compile.
 
         Raises:
           ValueError: says which, and how much memory is always enough.
         """
         lost = 0
+        self._wait()
         with self._lock:
             for simulation in self._simulations.values():
                 lost |= simulation.overflow()
@@ -133,13 +137,20 @@ class WarpEngine:
                 f" constraints={self.most_constraints} are always enough"
             )
 
-    def _load_kernels(self) -> None:
-        """Compiles the kernels, a minute the first time on a machine, while the program is traced and not in its first step."""
-        with self._lock:
-            if not self._ready:
-                _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
-                wp.synchronize()
-                self._ready = True
+    def _begin_loading(self) -> None:
+        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest."""
+        if self._loading is None:
+            pool = concurrent.futures.ThreadPoolExecutor(1)
+            self._loading = pool.submit(self._load)
+            pool.shutdown(wait=False)
+
+    def _load(self) -> None:
+        _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
+        wp.synchronize()
+
+    def _wait(self) -> None:
+        if self._loading is not None:
+            self._loading.result()
 
     def _simulation(self, device: Any, num_envs: int) -> "_Simulation":
         key = (str(device), num_envs)

@@ -1,0 +1,75 @@
+"""Memory over the number of environments: what one training run holds at its peak.
+
+    python bench/memory_use.py [--env push] [--engine auto] [--preset gpu] [--num-envs 512 2048 8192]
+
+Each row is a program of its own that trains one epoch of one cycle. On a GPU: the peak of JAX's allocator, and what Warp holds
+beside it. On a CPU: the peak of the whole program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+
+def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
+    import dataclasses
+
+    import jax
+
+    from mjx_dher import config, envs, trainer
+    from mjx_dher.memory import format_bytes
+
+    settings, hparams = config.preset(preset, env)
+    settings = dataclasses.replace(
+        settings, num_envs=int(num_envs), sampler="weighted", cycles_per_epoch=1, updates_per_cycle=100, target_period=1
+    )
+    environment = envs.make(env, engine=engine)
+    program = trainer.make_train(environment, settings)
+    run = trainer.train(environment, settings, hparams)
+    next(run)
+    run.close()
+    found = [format_bytes(program.replay_bytes)]
+    stats = jax.devices()[0].memory_stats()
+    if stats is None:
+        return [*found, format_bytes(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)]
+    import warp
+
+    return [*found, format_bytes(stats["peak_bytes_in_use"]), format_bytes(warp.get_mempool_used_mem_high("cuda:0"))]
+
+
+def main() -> None:
+    import jax
+    from timing import print_table
+
+    from mjx_dher import config
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", nargs="+", default=["push"])
+    parser.add_argument("--engine", default="auto")
+    parser.add_argument("--preset", default=config.machine_preset())
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[512, 2048, 8192])
+    args = parser.parse_args()
+    rows = []
+    # This program and those that it measures share the device.
+    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    for env in args.env:
+        for num_envs in args.num_envs:
+            command = [sys.executable, __file__, "measure", env, args.engine, args.preset, str(num_envs)]
+            done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+            rows.append((env, num_envs, *json.loads(done.stdout.splitlines()[-1])))
+    on_gpu = jax.default_backend() != "cpu"
+    print_table(("task", "num_envs", "of it: replay ring", *(("JAX, peak", "Warp, peak") if on_gpu else ("peak",))), rows)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["measure"]:
+        sys.path.insert(0, str(Path(__file__).parent))
+        print(json.dumps(measure(*sys.argv[2:])))
+    else:
+        main()

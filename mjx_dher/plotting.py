@@ -1,0 +1,138 @@
+"""Pictures of a sweep, with Matplotlib (extra `plot`): readable without colour, too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher import stats
+from mjx_dher.comparison import Group, Row
+
+# Okabe and Ito's colours, which colour-blind readers tell apart, from dark to light; each with a line and a marker of its own.
+_STYLES = (
+    ("#000000", "-", "o"),
+    ("#0072B2", "--", "s"),
+    ("#D55E00", "-.", "^"),
+    ("#009E73", ":", "D"),
+    ("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v"),
+    ("#E69F00", (0, (8, 2)), "P"),
+    ("#56B4E9", (0, (1, 1)), "X"),
+)
+FORMATS = ("png", "svg", "pdf")
+
+
+def check(formats: Sequence[str]) -> None:
+    """Raises ValueError where Matplotlib is not installed or a format is not one of FORMATS."""
+    import importlib.util
+
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError('plot needs Matplotlib: pip install -e ".[plot]"')
+
+
+def curves(groups: Sequence[Group], threshold: float) -> Any:
+    """Success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
+    plt = _pyplot()
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True, layout="constrained")
+    for group, (color, line, marker) in zip(groups, _styles(len(groups))):
+        middle, low, high = stats.curve_interval(group.success)
+        every = max(1, len(group.epoch) // 8)
+        for axis, x in zip(axes, (group.epoch, group.env_steps / 1e6, group.seconds)):
+            axis.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0)
+            axis.plot(x, middle, color=color, linestyle=line, marker=marker, markevery=every, markersize=4, label=group.label)
+    for axis, label in zip(axes, ("epoch", "million environment steps", "seconds (all runs side by side)")):
+        axis.axhline(threshold, color="0.6", linewidth=0.8)
+        axis.axhline(groups[0].at_reset, color="0.6", linewidth=0.8, linestyle=":")
+        axis.set_xlabel(label)
+        axis.set_xlim(left=0)
+        axis.grid(alpha=0.2)
+    axes[0].set_ylim(-0.02, 1.02)
+    axes[0].set_ylabel("success rate")
+    figure.suptitle(f"{groups[0].env}: interquartile mean of {len(groups[0].seeds)} seeds, 95 % interval", fontsize=11)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    return figure
+
+
+def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> Any:
+    """Epochs to the threshold: a mark a seed, the median with its interval; seeds that never got there lie above the line."""
+    plt = _pyplot()
+    figure, axis = plt.subplots(figsize=(1.6 + 1.3 * len(groups), 3.8), layout="constrained")
+    last = max(float(group.epoch[-1]) for group in groups)
+    never = 1.1 * last
+    for place, (group, row, (color, _, marker)) in enumerate(zip(groups, rows, _styles(len(groups)))):
+        reach = np.minimum(stats.first_reach(group.epoch, group.success, threshold), never)
+        spread = np.linspace(-0.18, 0.18, len(reach)) if len(reach) > 1 else np.zeros(1)
+        axis.plot(place + spread, reach, linestyle="none", marker=marker, color=color, markersize=4, alpha=0.55)
+        middle, low, high = (min(value, never) for value in (row.epochs, row.epochs_low, row.epochs_high))
+        axis.errorbar(place + 0.32, middle, [[middle - low], [high - middle]], color=color, marker=marker, capsize=4)
+    axis.axhline(1.05 * last, color="0.6", linewidth=0.8, linestyle="--")
+    axis.text(-0.45, never, "never", fontsize=8, va="center", color="0.3")
+    axis.set_xticks(range(len(groups)), [group.label.replace(", ", "\n") for group in groups], fontsize=8)
+    axis.set_xlim(-0.5, len(groups) - 0.3)
+    axis.set_ylim(0, 1.16 * last)
+    axis.set_ylabel(f"epochs to {threshold:g}")
+    axis.set_title(f"{groups[0].env}: each seed, and the median with its 95 % interval", fontsize=10)
+    axis.grid(axis="y", alpha=0.2)
+    return figure
+
+
+def comparison(rows: Sequence[Row]) -> Any:
+    """Final success, mean success over all epochs, and the probability of improvement on the baseline, with intervals."""
+    plt = _pyplot()
+    figure, axes = plt.subplots(1, 3, figsize=(11, 1.2 + 0.45 * len(rows)), sharey=True, layout="constrained")
+    panels = (
+        ("final success (IQM)", [(r.final_iqm, r.final_low, r.final_high) for r in rows]),
+        ("mean success over epochs (IQM)", [(r.area, r.area_low, r.area_high) for r in rows]),
+        ("P(better than the baseline)", [(r.better, r.better_low, r.better_high) for r in rows]),
+    )
+    for axis, (label, values) in zip(axes, panels):
+        for place, ((middle, low, high), (color, _, marker)) in enumerate(zip(values, _styles(len(rows)))):
+            if np.isfinite(middle):
+                around = [[max(0.0, middle - low)], [max(0.0, high - middle)]]
+                axis.errorbar(middle, place, xerr=around, color=color, marker=marker, markersize=5, capsize=3)
+        axis.set_xlabel(label)
+        axis.grid(axis="x", alpha=0.2)
+    axes[2].axvline(0.5, color="0.6", linewidth=0.8)
+    axes[2].set_xlim(-0.03, 1.03)
+    axes[0].set_yticks(range(len(rows)), [row.setting for row in rows])
+    axes[0].invert_yaxis()
+    figure.suptitle(f"{rows[0].env}: {rows[0].seeds} seeds, 95 % intervals", fontsize=11)
+    return figure
+
+
+def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
+    """Writes the three pictures of an environment into `folder`; returns their files."""
+    plt = _pyplot()
+    written = []
+    pictures = {
+        "curves": curves(groups, threshold),
+        "thresholds": thresholds(groups, rows, threshold),
+        "comparison": comparison(rows),
+    }
+    for name, figure in pictures.items():
+        for ending in formats:
+            path = folder / f"{groups[0].env.replace(':', '-')}_{name}.{ending}"
+            # Without a date and with fixed names within, so that the same sweep draws the same file.
+            with plt.rc_context({"svg.hashsalt": "mjx-dher"}):
+                figure.savefig(path, dpi=130, metadata={"Date": None} if ending == "svg" else None)
+            written.append(path)
+        plt.close(figure)
+    return written
+
+
+def _styles(number: int) -> list[tuple[Any, Any, str]]:
+    return [_STYLES[i % len(_STYLES)] for i in range(number)]
+
+
+def _pyplot() -> Any:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt

@@ -1,0 +1,303 @@
+"""Many runs: every environment, sampler, number and seed of a grid, side by side in as few compiled programs as there can be.
+
+Runs that differ in seed, sampler, weight kernel or HParams are *lanes* of one vmapped program; environments are programs of
+their own. A lane follows the same draws as that run alone. A run is a *cell* of the grid: a run folder, written when it has
+ended and named after its settings and a digest of them; so a sweep that was cut short, or made larger, trains what is missing.
+"""
+
+from __future__ import annotations
+
+import collections
+import csv
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mjx_dher import config as config_lib
+from mjx_dher import run_folder
+from mjx_dher.config import Config, HParams
+from mjx_dher.run_folder import RunConfig, RunFolderError
+
+if TYPE_CHECKING:
+    from mjx_dher.trainer import Progress
+
+CELLS = "cells"
+RESULTS = "results.csv"
+FINALS = "finals.csv"
+
+# Where only some of the built-in samplers read a setting, the others' cells do not differ in it.
+_READ_BY = {
+    "temperature": ("weighted",),
+    "weight_kernel": ("weighted",),
+    "epsilon": ("epsilon_closest",),
+    "metric": ("closest", "epsilon_closest", "weighted"),
+}
+
+# HParams, and which of a program's samplers a lane uses; see samplers.one_of.
+Lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))  # type: ignore[misc]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One run of a sweep."""
+
+    config: Config
+    hparams: HParams
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder: what it is, to be read, and a digest of all that it depends on."""
+        settings = [run_folder.SCHEMA, dataclasses.asdict(self.config), self.hparams._asdict(), self.seed]
+        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:10]
+        return f"{re.sub(r'[^a-z0-9_]+', '-', self.config.env.lower())}-{self.config.sampler}-s{self.seed}-{digest}"
+
+
+def cells(configs: Iterable[Config], hparams: Iterable[Sequence[HParams]], seeds: Sequence[int]) -> list[Cell]:
+    """All combinations, seed by seed, so that what is to be compared ends together; settings that a sampler does not read
+    are put to those of the first, and what is then the same is there once.
+
+    Args:
+      configs: environments, samplers, kernels; the first of an environment lends the others what they do not read.
+      hparams: for each config, its numbers.
+      seeds: of every setting.
+    """
+    settings: dict[tuple[Config, HParams], None] = {}
+    first: dict[str, tuple[Config, HParams]] = {}
+    for static, points in zip(configs, hparams):
+        for point in points:
+            base, numbers = first.setdefault(static.env, (static, point))
+            changes = {name: getattr(base, name) for name in ("weight_kernel", "metric") if not reads(static.sampler, name)}
+            same = {name: getattr(numbers, name) for name in ("temperature", "epsilon") if not reads(static.sampler, name)}
+            settings[dataclasses.replace(static, **changes), point._replace(**same)] = None
+    grouped = itertools.groupby(settings, key=lambda setting: setting[0].env)
+    return [Cell(*setting, seed) for _, group in grouped for setting, seed in _seed_by_seed(list(group), seeds)]
+
+
+def _seed_by_seed(settings: list[tuple[Config, HParams]], seeds: Sequence[int]) -> Iterator[tuple[tuple[Config, HParams], int]]:
+    return ((setting, seed) for seed in seeds for setting in settings)
+
+
+def reads(sampler: str, name: str) -> bool:
+    """Whether the setting `name` makes a difference to runs with this sampler."""
+    return sampler not in config_lib.SAMPLERS or sampler in _READ_BY.get(name, (sampler,))
+
+
+def is_done(folder: Path, cell: Cell) -> bool:
+    """Whether the cell has been trained."""
+    return (_path(folder, cell) / run_folder.RESULT_FILE).exists()
+
+
+def run(
+    folder: Path,
+    todo: Sequence[Cell],
+    lanes: int | None = None,
+    final_episodes: int = 500,
+    on_program: Callable[[str], None] = lambda text: None,
+    on_epoch: Callable[[Sequence[Cell], Progress], None] = lambda cells, progress: None,
+    make_env: Callable[[Config], Any] | None = None,
+) -> None:
+    """Trains the cells, and writes each one's folder when its lanes have ended.
+
+    Args:
+      folder: of the sweep; it is made where it is not there.
+      todo: cells, in order. Neighbours that can share a program do.
+      lanes: side by side at most; by default one on a CPU, whose cores one run fills, and elsewhere what its memory holds.
+      final_episodes: of the evaluation that ends each run.
+      on_program: called with a line about each program, before it is compiled and after.
+      on_epoch: called after every epoch of those side by side.
+      make_env: makes the environment of a Config; by name where None.
+
+    Raises:
+      ValueError: a setting that cannot run, or a ring that does not fit into memory even alone.
+    """
+    import jax
+
+    from mjx_dher import envs
+
+    (folder / CELLS).mkdir(parents=True, exist_ok=True)
+    make_env = make_env or (lambda static: envs.make(static.env, engine=static.engine))
+    if lanes is None and jax.default_backend() == "cpu":
+        lanes = 1
+    for static, group in itertools.groupby(todo, key=lambda cell: _shared(cell.config)):
+        _run_group(folder, make_env(static), list(group), lanes, final_episodes, on_program, on_epoch)
+
+
+def _shared(static: Config) -> Config:
+    """What runs must agree in to be lanes of one program."""
+    return dataclasses.replace(static, sampler="future", weight_kernel="linear", metric="position")
+
+
+def _run_group(
+    folder: Path,
+    env: Any,
+    group: list[Cell],
+    lanes: int | None,
+    final_episodes: int,
+    on_program: Callable[[str], None],
+    on_epoch: Callable[[Sequence[Cell], Progress], None],
+) -> None:
+    import jax
+
+    from mjx_dher import memory, samplers, trainer
+
+    static = group[0].config
+    config_lib.validate(static, group[0].hparams, env.episode_length)
+    choices = list(dict.fromkeys((c.config.sampler, c.config.weight_kernel, c.config.metric) for c in group))
+    program = trainer.make_train(env, static, samplers.one_of([samplers.make(*choice) for choice in choices]))
+    trainer.check_memory(program.replay_bytes, static)
+    size = min(len(group), lanes or len(group))
+    available = memory.available_bytes()
+    if available is not None:  # the rings alone must fit before the compiler is asked
+        size = max(1, min(size, int(available / program.replay_bytes)))
+    while True:
+        size = math.ceil(len(group) / math.ceil(len(group) / size))  # chunks of equal size
+        on_program(f"{static.env}: compiling for {size} runs side by side, of {len(group)} ...")
+        started = time.perf_counter()
+        compiled = trainer.compile_program(program, *_stack(group, choices, size))
+        trainer.check_env(env)
+        needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
+        on_program(f"{static.env}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
+        if available is None or compiled.nbytes <= available or size == 1:
+            break
+        size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
+    evaluate = jax.jit(jax.vmap(lambda state, key: _final(env, program.networks, state, key, final_episodes)))
+    for start in range(0, len(group), size):
+        chunk = group[start : start + size]
+        keys, hparams = _stack(chunk, choices, size)
+        curves: list[tuple[dict[str, float], dict[str, Any]]] = []  # what is the same for all lanes, and arrays over them
+        for progress in trainer.run(env, static, compiled, keys, hparams):
+            counts = {name: getattr(progress, name) for name in ("epoch", "env_steps", "updates", "wall_seconds")}
+            curves.append((counts, progress.metrics))
+            on_epoch(chunk, progress)
+        final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
+        final = jax.device_get(evaluate(progress.state, final_keys))
+        trainer.check_env(env)
+        learners = jax.device_get(progress.state.learner)
+        for lane, cell in enumerate(chunk):
+            learner = jax.tree.map(lambda x, lane=lane: x[lane], learners)
+            curve = [{**counts, **{name: float(values[lane]) for name, values in found.items()}} for counts, found in curves]
+            result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": final_episodes}
+            _write(folder, cell, _engine(env), size, curve, result, learner)
+
+
+def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size: int) -> tuple[Any, Any]:
+    """Keys [size] and Lanes of [size] each; where there are fewer cells, the last is repeated."""
+    import jax
+    import jax.numpy as jnp
+
+    padded = [group[min(i, len(group) - 1)] for i in range(size)]
+    names = [choices.index((c.config.sampler, c.config.weight_kernel, c.config.metric)) for c in padded]
+    numbers = [Lane._make((*cell.hparams, choice)) for cell, choice in zip(padded, names)]
+    keys = jnp.stack([jax.random.key(cell.seed) for cell in padded])
+    return keys, jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *numbers)
+
+
+def _final(env: Any, networks: Any, state: Any, key: Any, episodes: int) -> dict[str, Any]:
+    from mjx_dher import ddpg, evaluate
+
+    outcome = evaluate.evaluate(env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), key, episodes)
+    return evaluate.summary(outcome)
+
+
+def _engine(env: Any) -> str:
+    return getattr(getattr(env, "engine", None), "name", "none")
+
+
+def _path(folder: Path, cell: Cell) -> Path:
+    return folder / CELLS / cell.name
+
+
+def _write(
+    folder: Path, cell: Cell, engine: str, lanes: int, curve: list[dict[str, Any]], result: dict[str, Any], learner: Any
+) -> None:
+    from mjx_dher import metrics, policy
+
+    path = _path(folder, cell)
+    run_folder.create(path, RunConfig(cell.config, cell.hparams, cell.seed, engine), {"lanes": lanes})
+    policy.from_learner(learner, cell.hparams).save(path / run_folder.POLICY_FILE)
+    sink = metrics.CsvSink(path / run_folder.METRICS_FILE)
+    for row in curve:
+        sink.write(row)
+    sink.close()
+    last = {"epochs": curve[-1]["epoch"], "env_steps": curve[-1]["env_steps"], "wall_seconds": curve[-1]["wall_seconds"]}
+    # Last of all: the cell is done when this is there.
+    run_folder.write_json(path / run_folder.RESULT_FILE, {**last, "lanes": lanes, **result})
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """The finished cells of a sweep: config, hparams, seed, engine, lanes; curve, lists by column; final, the last evaluation.
+
+    Raises:
+      RunFolderError: no sweep, none finished, or a folder that cannot be read.
+    """
+    paths = sorted(path.parent for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}"))
+    if not paths:
+        raise RunFolderError(f"{folder} holds no finished run of a sweep")
+    found = [_read_cell(path) for path in paths]
+    key = lambda c: (c["config"]["env"], c["config"]["sampler"], str(c["config"]), str(c["hparams"]), c["seed"])  # noqa: E731
+    return sorted(found, key=key)
+
+
+def _read_cell(path: Path) -> dict[str, Any]:
+    run = run_folder.read_config(path)
+    try:
+        result = json.loads((path / run_folder.RESULT_FILE).read_text())
+        with (path / run_folder.METRICS_FILE).open() as file:
+            rows = list(csv.DictReader(file))
+        curve = {name: [_number(row[name]) for row in rows] for name in rows[0]}
+        names = ("success_rate", "reset_success_rate", "return_mean", "episodes")
+        return {
+            "config": dataclasses.asdict(run.config),
+            "hparams": run.hparams._asdict(),
+            "seed": run.seed,
+            "engine": run.engine,
+            "lanes": result["lanes"],
+            "final": {name: result[name] for name in names},
+            "curve": curve,
+        }
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise RunFolderError(f"{path} is not a finished run of a sweep ({type(error).__name__}: {error})") from error
+
+
+def _number(text: str) -> int | float:
+    return int(text) if text.isdigit() else float(text)
+
+
+def write_tables(folder: Path) -> None:
+    """Writes results.csv, results.npz and finals.csv, of all cells in the folder; docs/sweeps.md describes the columns."""
+    import numpy as np
+
+    results: list[dict[str, Any]] = []
+    finals: list[dict[str, Any]] = []
+    for cell in read(folder):
+        static = {name: value for name, value in cell["config"].items() if name not in ("engine", "hidden_sizes")}
+        sizes = "x".join(map(str, cell["config"]["hidden_sizes"]))
+        settings = {**static, "hidden_sizes": sizes, "engine": cell["engine"], **cell["hparams"], "seed": cell["seed"]}
+        curve = cell["curve"]
+        for index in range(len(curve["epoch"])):
+            results.append({**settings, "lanes": cell["lanes"], **{name: values[index] for name, values in curve.items()}})
+        last = {name: curve[name][-1] for name in ("epoch", "env_steps", "updates", "wall_seconds")}
+        finals.append({**settings, "lanes": cell["lanes"], **last, **cell["final"]})
+    _write_csv(folder / RESULTS, results)
+    _write_csv(folder / FINALS, finals)
+    partial = folder / "results.partial.npz"
+    np.savez_compressed(partial, **{name: np.array([row[name] for row in results]) for name in results[0]})  # type: ignore[arg-type]
+    partial.replace(folder / "results.npz")
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+    os.replace(partial, path)

@@ -1,0 +1,98 @@
+import math
+
+import numpy as np
+import pytest
+
+from mjx_dher import HParams, comparison, stats
+from mjx_dher.config import Config
+
+
+def cell(sampler, seed, success, env="push", final=None, **numbers):
+    curve = {
+        "epoch": list(range(1, len(success) + 1)),
+        "env_steps": [1000 * i for i in range(1, len(success) + 1)],
+        "wall_seconds": [2.0 * i for i in range(1, len(success) + 1)],
+        "success_rate": list(success),
+    }
+    final = {"success_rate": success[-1] if final is None else final, "reset_success_rate": 0.07}
+    settings = {"config": {**vars(Config(env=env, sampler=sampler))}, "hparams": {**HParams()._asdict(), **numbers}}
+    return {"seed": seed, "curve": curve, "final": final, **settings}
+
+
+SLOW = [[0.0, 0.2, 0.5, 0.9], [0.1, 0.3, 0.5, 0.8], [0.0, 0.2, 0.6, 0.9]]
+FAST = [[0.2, 0.9, 0.9, 1.0], [0.3, 0.8, 0.9, 0.9], [0.2, 0.9, 1.0, 1.0]]
+CELLS = [cell(s, i, c) for s, curves in (("weighted", FAST), ("future", SLOW)) for i, c in enumerate(curves)]
+
+
+def test_a_setting_against_the_baseline_by_hand():
+    (groups,) = comparison.groups(CELLS).values()
+    assert [g.label for g in groups] == ["future", "weighted"]
+    slow, fast = comparison.compare(groups, "future", 0.9)
+    # Areas by trapezoids over three epochs: (first + last) / 2 + the two between, divided by 3.
+    areas = {"slow": [1.15 / 3, 1.25 / 3, 1.25 / 3], "fast": [2.4 / 3, 2.3 / 3, 2.5 / 3]}
+    assert fast.area == pytest.approx(2.4 / 3)
+    assert slow.area == pytest.approx(np.mean(areas["slow"]))
+    assert fast.area_gain == pytest.approx(np.mean(np.subtract(areas["fast"], areas["slow"])))
+    # To 0.9: epochs 2, 3, 2 against 4, never, 4.
+    assert (fast.epochs, fast.reached, fast.env_steps) == (2, 3, 2000)
+    assert (slow.epochs, slow.reached, slow.epochs_high) == (4, 2, math.inf)
+    assert fast.better == 1.0
+    # All three differences are positive: of 8 changes of sign, two are as extreme.
+    assert fast.p_value == fast.p_corrected == 0.25
+    assert math.isnan(slow.better)
+    assert math.isnan(slow.p_corrected)
+    assert fast.final == pytest.approx(2.9 / 3)
+    assert fast.at_reset == pytest.approx(0.07)
+    assert fast.final_low <= fast.final_iqm <= fast.final_high
+
+
+def test_p_values_are_corrected_over_the_settings_of_an_environment():
+    cells = [*CELLS, *(cell("closest", i, [x / 2 for x in curve]) for i, curve in enumerate(SLOW))]
+    rows = {row.setting: row for row in comparison.compare(comparison.groups(cells)["push"], "future", 0.9)}
+    assert rows["weighted"].p_corrected == rows["closest"].p_corrected == stats.holm([0.25, 0.25])[0] == 0.5
+
+
+def test_seeds_that_differ_are_not_paired():
+    cells = [c for c in CELLS if c["config"]["sampler"] != "weighted" or c["seed"] < 2]
+    fast = comparison.compare(comparison.groups(cells)["push"], "future", 0.9)[1]
+    assert fast.better == 1.0
+    assert math.isnan(fast.p_value)
+
+
+def test_labels_say_what_differs_and_the_baseline_shares_it():
+    """A sampler as the baseline stands for its setting with the same other numbers, as far as it reads them."""
+    cells = [
+        cell(sampler, seed, curve, her_k=k, temperature=t)
+        for sampler, curves in (("future", SLOW), ("weighted", FAST))
+        for k in (2.0, 4.0)
+        for t in ((0.5, 1.0) if sampler == "weighted" else (1.0,))
+        for seed, curve in enumerate(curves)
+    ]
+    groups = comparison.groups(cells)["push"]
+    labels = ["future, her_k 2", "future, her_k 4"]
+    weighted = [f"weighted, her_k {k}, temperature {t}" for k in (2, 4) for t in (0.5, 1)]
+    assert [g.label for g in groups] == [*labels, *weighted]
+    bases = {g.label: comparison._baseline_of(g, groups, "future") for g in groups}
+    assert [bases[label] for label in labels] == [None, None]
+    assert [bases[label].label for label in weighted] == [labels[0]] * 2 + [labels[1]] * 2
+    assert comparison._baseline_of(groups[3], groups, "future, her_k 2").label == "future, her_k 2"
+    assert comparison._baseline_of(groups[3], groups, "episode") is None
+
+
+def test_environments_are_compared_apart():
+    found = comparison.groups([*CELLS, *(cell("future", i, c, env="slide") for i, c in enumerate(SLOW))])
+    assert {env: [g.label for g in groups] for env, groups in found.items()} == {
+        "push": ["future", "weighted"],
+        "slide": ["future"],
+    }
+
+
+def test_the_table_says_never_where_no_seed_got_there(tmp_path):
+    rows = comparison.compare(comparison.groups(CELLS)["push"], "future", 0.95)
+    _, cells = comparison.table(rows)
+    assert cells[0][5] == "never"
+    assert cells[1][5].endswith("2 of 3")
+    comparison.write(tmp_path, rows)
+    lines = (tmp_path / comparison.COMPARISON).read_text().splitlines()
+    assert lines[0].split(",") == list(comparison.Row._fields)
+    assert len(lines) == 3

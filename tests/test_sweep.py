@@ -1,0 +1,278 @@
+import csv
+import dataclasses
+import json
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_trainer import SMALL
+
+from mjx_dher import HParams, cli, config, envs, memory, policy, sweep, trainer
+from mjx_dher.run_folder import RunFolderError
+from mjx_dher.sweep import Cell
+from probes import PointMass
+
+CONFIG = dataclasses.replace(SMALL, num_envs=8, updates_per_cycle=8, hidden_sizes=(16,))  # an epoch of 240 steps
+
+
+DEFAULT = HParams()
+
+
+def make_env(static):
+    return PointMass()
+
+
+def grid(samplers=("future", "weighted"), seeds=(0, 1), points=(DEFAULT,), static=CONFIG):
+    statics = [dataclasses.replace(static, sampler=sampler) for sampler in samplers]
+    return sweep.cells(statics, [points] * len(statics), seeds)
+
+
+def run(folder, cells, **options):
+    sweep.run(folder, cells, final_episodes=16, make_env=make_env, **options)
+
+
+def test_cells_are_all_combinations_seed_by_seed():
+    found = grid(points=(HParams(her_k=2.0), HParams(her_k=4.0)))
+    assert [(c.seed, c.config.sampler, c.hparams.her_k) for c in found] == [
+        (seed, sampler, k) for seed in (0, 1) for sampler in ("future", "weighted") for k in (2.0, 4.0)
+    ]
+    assert len({c.name for c in found}) == 8
+    assert found[0].name == Cell(found[0].config, found[0].hparams, 0).name
+    assert found[0].name.startswith("point_mass-future-s0-")
+    assert found[0].name != Cell(dataclasses.replace(found[0].config, batch_size=33), found[0].hparams, 0).name
+
+
+def test_what_a_sampler_does_not_read_makes_no_cells_of_its_own():
+    """future once, closest once, epsilon_closest for each epsilon, weighted for each kernel and temperature."""
+    statics = [
+        dataclasses.replace(CONFIG, sampler=sampler, weight_kernel=kernel)
+        for sampler in ("future", "closest", "epsilon_closest", "weighted")
+        for kernel in ("linear", "softmax")
+    ]
+    points = [HParams(temperature=t, epsilon=e) for t in (0.5, 1.0) for e in (0.1, 0.2, 0.3)]
+    found = sweep.cells(statics, [points] * len(statics), [0])
+    count = lambda sampler: sum(c.config.sampler == sampler for c in found)  # noqa: E731
+    assert {name: count(name) for name in ("future", "closest", "epsilon_closest", "weighted")} == {
+        "future": 1,
+        "closest": 1,
+        "epsilon_closest": 3,
+        "weighted": 4,
+    }
+
+
+def test_environments_stay_together():
+    statics = [dataclasses.replace(CONFIG, env=env) for env in ("reach", "push")]
+    found = sweep.cells(statics, [[HParams()]] * 2, [0, 1, 2])
+    assert [c.config.env for c in found] == ["reach"] * 3 + ["push"] * 3
+
+
+def test_a_lane_is_that_run_alone(tmp_path):
+    """The same first parameters, to the bit, and the same draws; afterwards rounding, because XLA sums products of another
+    shape in another order, which 24 updates let grow to less than 1e-4 here."""
+    cells = grid(("future", "random", "weighted"), (3, 4))
+    curves, learned = {}, {}
+
+    def note(chunk, progress):
+        for lane, cell in enumerate(chunk):
+            curves[cell] = {name: values[lane] for name, values in progress.metrics.items()}
+            learned[cell] = jax.tree.map(lambda x, lane=lane: np.asarray(x[lane]), progress.state.learner.params)
+
+    run(tmp_path, cells, lanes=6, on_epoch=note)
+    assert len({jax.tree.leaves(params)[0].tobytes() for params in learned.values()}) == len(cells)
+    for sampler in ("future", "random", "weighted"):
+        own = [cell for cell in cells if cell.config.sampler == sampler]
+        program = trainer.make_train(PointMass(), own[0].config)
+        compiled = trainer.compile_program(program, jax.random.key(0), HParams())
+        for cell in own:
+            (alone,) = trainer.run(PointMass(), cell.config, compiled, jax.random.key(cell.seed), cell.hparams)
+            for name, value in alone.metrics.items():
+                assert curves[cell][name] == pytest.approx(value, rel=1e-3, abs=1e-4), (cell.name, name)
+            for a, b in zip(jax.tree.leaves(learned[cell]), jax.tree.leaves(alone.state.learner.params), strict=True):
+                np.testing.assert_allclose(a, b, atol=1e-4)
+    keys, hparams = jnp.stack([jax.random.key(3), jax.random.key(4)]), HParams(*(jnp.full(2, x) for x in HParams()))
+    together = jax.jit(jax.vmap(program.init))(keys, hparams)
+    for lane, key in enumerate(keys):
+        alone = jax.jit(program.init)(key, HParams())
+        for a, b in zip(jax.tree.leaves(together.learner), jax.tree.leaves(alone.learner), strict=True):
+            np.testing.assert_array_equal(a[lane], b)
+
+
+def table(folder, name=sweep.RESULTS, without=("wall_seconds",)):
+    sweep.write_tables(folder)
+    with (folder / name).open() as file:
+        return [{k: v for k, v in row.items() if k not in without} for row in csv.DictReader(file)]
+
+
+def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had_not_been(tmp_path):
+    cells, cut, whole = grid(seeds=(0, 1, 2)), tmp_path / "cut", tmp_path / "whole"
+    trained = []
+
+    def stop_in_the_second_chunk(chunk, progress):
+        trained.extend(c.name for c in chunk)
+        if len(trained) > 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(cut, cells, lanes=2, on_epoch=stop_in_the_second_chunk)
+    assert [sweep.is_done(cut, cell) for cell in cells] == [True] * 2 + [False] * 4
+    assert len(table(cut)) == 2
+    run(cut, [cell for cell in cells if not sweep.is_done(cut, cell)], lanes=2)
+    run(whole, cells, lanes=2)
+    assert table(cut) == table(whole)
+    assert table(cut, sweep.FINALS) == table(whole, sweep.FINALS)
+
+
+def test_the_tables_hold_every_epoch_and_every_setting(tmp_path):
+    static = dataclasses.replace(CONFIG, total_steps=480)
+    run(tmp_path, grid(("weighted",), (5,), (HParams(her_k=2.0), HParams(her_k=8.0)), static), lanes=2)
+    rows = table(tmp_path, without=())
+    assert [(row["her_k"], row["seed"], row["epoch"], row["env_steps"], row["updates"]) for row in rows] == [
+        (k, "5", epoch, steps, updates)
+        for k in ("2.0", "8.0")
+        for epoch, steps, updates in (("1", "240", "24"), ("2", "480", "48"))
+    ]
+    names = ("env", "sampler", "engine", "lanes", "wall_seconds", "success_rate", "return_mean")
+    assert {*HParams._fields, *names} <= set(rows[0])
+    assert 0 < float(rows[0]["wall_seconds"]) < float(rows[1]["wall_seconds"])
+    arrays = np.load(tmp_path / "results.npz")
+    np.testing.assert_array_equal(arrays["success_rate"], [float(row["success_rate"]) for row in rows])
+    assert arrays["epoch"].dtype.kind == "i"
+    finals = table(tmp_path, sweep.FINALS)
+    assert [row["episodes"] for row in finals] == ["16"] * 2
+    assert all(row["env_steps"] == "480" for row in finals)
+    for cell in (tmp_path / sweep.CELLS).iterdir():
+        learned = policy.load_policy(cell)
+        assert learned({"observation": np.zeros(2), "achieved_goal": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
+
+
+def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, monkeypatch):
+    """Three rings alone would fit; three whole programs do not."""
+    cells = grid(seeds=range(4))
+    available = int(3.5 * trainer.make_train(PointMass(), CONFIG).replay_bytes)
+    monkeypatch.setattr(memory, "available_bytes", lambda: available)
+    told, sizes = [], []
+    run(tmp_path, cells, lanes=8, on_program=told.append, on_epoch=lambda chunk, _: sizes.append(len(chunk)))
+    assert "compiling for 3 runs side by side, of 8" in told[0]
+    assert "compiling for 3 runs" not in told[2]
+    assert sum(sizes) == 8
+    assert max(sizes) < 3
+    assert len(sweep.read(tmp_path)) == 8
+
+
+def test_what_is_no_sweep_is_named(tmp_path):
+    with pytest.raises(RunFolderError, match="holds no finished run of a sweep"):
+        sweep.read(tmp_path)
+    cells = grid(("future",), (0,))
+    run(tmp_path, cells)
+    cell = tmp_path / sweep.CELLS / cells[0].name
+    for name, content, message in (
+        ("metrics.csv", "epoch,success_rate\n", "is not a finished run of a sweep"),
+        ("result.json", "{", "is not a finished run of a sweep"),
+        ("config.json", json.dumps({"schema": 0}), "is not of this program's schema 1"),
+    ):
+        (cell / name).write_text(content)
+        with pytest.raises(RunFolderError, match=message):
+            sweep.read(tmp_path)
+    (cell / "result.json").unlink()  # as if the write had been cut short
+    assert not sweep.is_done(tmp_path, cells[0])
+
+
+@pytest.fixture
+def point_mass(monkeypatch):
+    monkeypatch.setitem(envs._REGISTRY, "point_mass", lambda engine, **options: PointMass())
+
+
+COMMAND = [
+    *(
+        "sweep",
+        "--preset",
+        "cpu",
+        "--env",
+        "point_mass",
+        "--sampler",
+        "future",
+        "weighted",
+        "--seeds",
+        "2",
+        "--final-episodes",
+        "20",
+    ),
+    *("--num-envs", "8", "--cycles-per-epoch", "3", "--updates-per-cycle", "4", "--batch-size", "32", "--total-steps", "800"),
+    *("--replay-size", "400", "--hidden-sizes", "16", "--eval-episodes", "20", "--lanes", "4", "--threshold", "0.2"),
+]
+
+
+def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, capsys):
+    pytest.importorskip("matplotlib")
+    out = ["--out", str(tmp_path / "sweep")]
+    assert cli.main([*COMMAND, *out]) == 0
+    first = capsys.readouterr().out
+    assert "4 runs; writing to" in first
+    assert "100%  point_mass, 4 runs: epoch 4/4" in first
+    assert cli.main([*COMMAND, *out, "--sweep.her-k", "4", "8"]) == 0
+    # The preset's k is 16; two samplers, two numbers, two seeds are new.
+    assert "8 runs; writing to" in capsys.readouterr().out
+    assert cli.main([*COMMAND, *out]) == 0
+    assert "4 runs; 4 of them are done already" in capsys.readouterr().out
+    assert len(table(tmp_path / "sweep", sweep.FINALS)) == 12
+    assert cli.main(["plot", str(tmp_path / "sweep"), "--out", str(tmp_path / "pictures"), "--threshold", "0.2"]) == 0
+    written = {path.name: path.stat().st_size for path in (tmp_path / "pictures").iterdir()}
+    names = [f"point_mass_{name}.{end}" for name in ("curves", "thresholds", "comparison") for end in ("png", "svg")]
+    assert sorted(written) == sorted(names)
+    assert min(written.values()) > 5000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--env", "pusj"], "env must be one of .*; got 'pusj' .did you mean 'push'"),
+        (["--sampler", "future", "weihgted"], "sampler must be one of .*did you mean 'weighted'"),
+        (["--sampler"], "sampler must be one of"),
+        (["--weight-kernel", "cubic"], "weight_kernel must be one of linear, inverse, softmax; got 'cubic'"),
+        (["--metric", "speed"], "metric must be one of position; got 'speed'"),
+        (["--preset", "tpu"], "preset must be one of"),
+        (["--seeds", "0"], "seeds must be an integer of at least 1; got 0"),
+        (["--first-seed", "-1"], "first_seed must be an integer of at least 0; got -1"),
+        (["--lanes", "0"], "lanes must be an integer of at least 1; got 0"),
+        (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
+        (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 1\); got 1.5"),
+        (["--batch-size", "0"], "batch_size must be an integer of at least 1; got 0"),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_written(tmp_path, arguments, said, capsys):
+    assert cli.main(["sweep", "--out", str(tmp_path / "new"), *arguments]) == 2
+    assert not (tmp_path / "new").exists()
+    assert re.search(said, capsys.readouterr().err)
+
+
+def test_a_folder_that_holds_something_else_is_refused(tmp_path, capsys):
+    (tmp_path / "thesis.tex").write_text("")
+    assert cli.main(["sweep", "--out", str(tmp_path)]) == 2
+    assert "holds something else than a sweep" in capsys.readouterr().err
+    assert cli.main(["plot", str(tmp_path)]) == 2
+    assert "holds no finished run" in capsys.readouterr().err
+    assert cli.main(["plot", str(tmp_path), "--formats", "jpg"]) == 2
+    assert "formats must be among png, svg, pdf; got jpg" in capsys.readouterr().err
+
+
+def test_every_number_and_every_shape_can_be_set():
+    args, cells = cli_args("--sweep.her-k", "2", "4", "--num-envs", "4", "--hidden-sizes", "8", "8", "--seeds", "3")
+    assert {c.hparams.her_k for c in cells} == {2.0, 4.0}
+    assert {c.config.num_envs for c in cells} == {4}
+    assert {c.config.hidden_sizes for c in cells} == {(8, 8)}
+    assert len(cells) == 4 * 2 * 3
+    assert {*vars(args.sweep)} == set(HParams._fields)
+    assert {*vars(args.changes)} == {f.name for f in dataclasses.fields(config.Config)} - {
+        "env",
+        "sampler",
+        "weight_kernel",
+        "metric",
+    }
+
+
+def cli_args(*argv):
+    from mjx_dher.cli_sweep import parse_sweep_args
+
+    return parse_sweep_args(["--out", "nowhere", "--preset", "cpu", *argv])
