@@ -205,7 +205,6 @@ COMMAND = [
 
 
 def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, capsys):
-    pytest.importorskip("matplotlib")
     out = ["--out", str(tmp_path / "sweep")]
     assert cli.main([*COMMAND, *out]) == 0
     first = capsys.readouterr().out
