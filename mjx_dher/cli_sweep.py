@@ -160,7 +160,8 @@ def sweep_command(argv: list[str], console: Console) -> int:
         keep_compiled_programs()
         screen = _Screen(console, todo)
         try:
-            sweep.run(args.out, todo, args.lanes, args.final_episodes, console.print, screen.show)
+            make_env = lambda static: envs.make(static.env, engine=static.engine)  # noqa: E731
+            sweep.run(args.out, todo, make_env, args.lanes, args.final_episodes, console.print, screen.show)
         except KeyboardInterrupt:
             left = sum(not sweep.is_done(args.out, cell) for cell in cells)
             console.print(f"stopped; {len(cells) - left} runs are done, and the same command trains the other {left}")

@@ -99,32 +99,29 @@ def is_done(folder: Path, cell: Cell) -> bool:
 def run(
     folder: Path,
     todo: Sequence[Cell],
+    make_env: Callable[[Config], Any],
     lanes: int | None = None,
     final_episodes: int = 500,
     on_program: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[Cell], Progress], None] = lambda cells, progress: None,
-    make_env: Callable[[Config], Any] | None = None,
 ) -> None:
     """Trains the cells, and writes each one's folder when its lanes have ended.
 
     Args:
       folder: of the sweep; it is made where it is not there.
       todo: cells, in order. Neighbours that can share a program do.
+      make_env: makes the environment of a Config.
       lanes: side by side at most; by default one on a CPU, whose cores one run fills, and elsewhere what its memory holds.
       final_episodes: of the evaluation that ends each run.
       on_program: called with a line about each program, before it is compiled and after.
       on_epoch: called after every epoch of those side by side.
-      make_env: makes the environment of a Config; by name where None.
 
     Raises:
       ValueError: a setting that cannot run, or a ring that does not fit into memory even alone.
     """
     import jax
 
-    from mjx_dher import envs
-
     (folder / CELLS).mkdir(parents=True, exist_ok=True)
-    make_env = make_env or (lambda static: envs.make(static.env, engine=static.engine))
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     for static, group in itertools.groupby(todo, key=lambda cell: _shared(cell.config)):

@@ -20,17 +20,13 @@ CONFIG = dataclasses.replace(SMALL, num_envs=8, updates_per_cycle=8, hidden_size
 DEFAULT = HParams()
 
 
-def make_env(static):
-    return PointMass()
-
-
 def grid(samplers=("future", "weighted"), seeds=(0, 1), points=(DEFAULT,), static=CONFIG):
     statics = [dataclasses.replace(static, sampler=sampler) for sampler in samplers]
     return sweep.cells(statics, [points] * len(statics), seeds)
 
 
 def run(folder, cells, **options):
-    sweep.run(folder, cells, final_episodes=16, make_env=make_env, **options)
+    sweep.run(folder, cells, lambda static: PointMass(), final_episodes=16, **options)
 
 
 def test_cells_are_all_combinations_seed_by_seed():
