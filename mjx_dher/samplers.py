@@ -42,7 +42,9 @@ class Sampler:
 
 def position(achieved: Array, desired: Array) -> Array:
     """The metric `position`: Euclidean distance of [T+1, G] to [G]."""
-    return jnp.linalg.norm(achieved - desired, axis=-1)
+    # Coordinate by coordinate: XLA on a CPU takes three times as long for a sum over an axis of 3.
+    squares = jnp.square(achieved - desired)
+    return jnp.sqrt(sum(squares[..., i] for i in range(squares.shape[-1])))
 
 
 def future_mask(num_goals: int, step: Array) -> Array:
