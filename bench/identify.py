@@ -153,6 +153,10 @@ def _names(model):
     return {model.geom(index).name for index in range(model.ngeom)}
 
 
+def _joints(model):
+    return {model.joint(index).name for index in range(model.njnt)}
+
+
 def rows_of_object(there, here):
     a, b = there.body("object0"), here.body("object")
     yield "object mass, kg", "object", a.mass, b.mass
@@ -195,7 +199,8 @@ def read(tasks):
         env, numbers, here = gym.make(ORIGINALS[task]).unwrapped, task_numbers(task), our_model(task)
         env.reset(seed=0)
         there, here_data = env.model, settle(here, numbers)
-        rows = [*rows_of_start(env, numbers), *rows_of_bodies(there, here, env.data, here_data, here.nu > 0)]
+        jointed = "finger_r" in _joints(here)
+        rows = [*rows_of_start(env, numbers), *rows_of_bodies(there, here, env.data, here_data, jointed)]
         rows += [*rows_of_weld(there, here), *rows_of_contacts(there, here)]
         if env.has_object:
             rows += rows_of_object(there, here)
@@ -248,6 +253,9 @@ def replay(model, task, recorded):
         qvel[:, int(model.joint(name).dofadr[0])] = rate
     obj = int(model.joint("object").qposadr[0])
     qpos[:, obj : obj + 7] = recorded["object_qpos"][:, 0]
+    if "finger_r" in _joints(model):
+        finger, rate = int(model.joint("finger_r").qposadr[0]), int(model.joint("finger_r").dofadr[0])
+        qvel[:, rate : rate + 2] = numbers.get("finger_qvel", (0.0, 0.0))
     gripper, site = model.body("gripper").id, model.site("grip").id
 
     def look():
@@ -268,11 +276,12 @@ def replay(model, task, recorded):
         batch.bind("mocap_pos")[:, 0] = pose[:, :3] + ACTION_SCALE * action[:, :3]
         batch.bind("mocap_quat")[:, 0] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
         if model.nu:
-            finger = int(model.joint("finger_r").qposadr[0])
             batch.bind("ctrl")[:] = qpos[:, finger : finger + 2] + action[:, 3:]
-        # Where fingers move, the original sees positions one substep late.
+        # Where fingers are driven, the original sees positions one substep late; where they are blocked, it puts them back.
         late = int(model.nu > 0)
         batch.step(nstep=SUBSTEPS - late)
+        if not late and "finger_r" in _joints(model):
+            qpos[:, finger : finger + 2] = 0
         pose, seen = look()
         if late:
             batch.step(nstep=late)
