@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import os
+import signal
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -159,6 +162,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
     if todo:
         keep_compiled_programs()
         screen = _Screen(console, todo)
+        previous_handler = signal.signal(signal.SIGINT, screen.on_interrupt)
         try:
             make_env = lambda static: envs.make(static.env, engine=static.engine)  # noqa: E731
             sweep.run(args.out, todo, make_env, args.lanes, args.final_episodes, console.print, screen.show)
@@ -167,6 +171,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
             console.print(f"stopped; {len(cells) - left} runs are done, and the same command trains the other {left}")
             return 130
         finally:
+            signal.signal(signal.SIGINT, previous_handler)
             screen.close()
     sweep.write_tables(args.out)
     _compare(args.out, args.baseline, args.threshold, console)
@@ -223,15 +228,28 @@ class _Screen:
         self._done = 0.0
         self._seconds = 0.0
         self._printed = time.monotonic()
+        self._stop_asked = False
         self._bar: Bar | None = None
         if console.is_terminal:
             self._bar = Bar(BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
             self._task = self._bar.add_task("...", total=self._total)
             self._bar.start()
 
+    def on_interrupt(self, signum: int, frame: Any) -> None:
+        """Ctrl-C: the epoch under way cannot be cut short, so the first one waits for its end."""
+        if self._stop_asked:
+            self._console.show_cursor(True)
+            sys.stdout.flush()
+            os._exit(130)  # what has ended is on the disk already
+        self._stop_asked = True
+        self._console.print("stopping when this epoch has ended; Ctrl-C again stops at once. Finished runs are kept either way")
+
     def show(self, cells: Sequence[Cell], progress: Any) -> None:
+        """After each epoch of those side by side; raises KeyboardInterrupt where a stop was asked for."""
         from mjx_dher.metrics import clock
 
+        if self._stop_asked:
+            raise KeyboardInterrupt
         total = cells[0].config.total_steps
         self._done += len(cells) * total / progress.num_epochs
         self._seconds += progress.epoch_seconds

@@ -157,7 +157,8 @@ def _run_group(
         size = max(1, min(size, int(available / program.replay_bytes)))
     while True:
         size = math.ceil(len(group) / math.ceil(len(group) / size))  # chunks of equal size
-        on_program(f"{static.env}: compiling for {size} runs side by side, of {len(group)} ...")
+        together = f"{size} runs side by side" if size > 1 else "one run at a time"
+        on_program(f"{static.env}: compiling for {together}, of {len(group)} ...")
         started = time.perf_counter()
         compiled = trainer.compile_program(program, *_stack(group, choices, size))
         trainer.check_env(env)

@@ -2,6 +2,7 @@ import csv
 import dataclasses
 import json
 import re
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import HParams, cli, config, envs, memory, policy, sweep, trainer
+from mjx_dher import HParams, cli, cli_sweep, config, envs, memory, policy, sweep, trainer
 from mjx_dher.run_folder import RunFolderError
 from mjx_dher.sweep import Cell
 from probes import PointMass
@@ -219,6 +220,27 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     assert min(written.values()) > 5000
 
 
+def test_ctrl_c_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys):
+    """In the first epoch of the second of two programs."""
+    show, seen = cli_sweep._Screen.show, []
+
+    def interrupt(screen, cells, progress):
+        seen.append(progress.epoch)
+        if len(seen) == 5:
+            signal.raise_signal(signal.SIGINT)
+        show(screen, cells, progress)
+
+    monkeypatch.setattr(cli_sweep._Screen, "show", interrupt)
+    handler = signal.getsignal(signal.SIGINT)
+    assert cli.main([*COMMAND, "--lanes", "2", "--out", str(tmp_path)]) == 130
+    said = capsys.readouterr().out
+    assert "stopping when this epoch has ended" in said
+    assert "stopped; 2 runs are done, and the same command trains the other 2" in said
+    assert seen == [1, 2, 3, 4, 1]
+    assert signal.getsignal(signal.SIGINT) == handler
+    assert len(table(tmp_path, sweep.FINALS)) == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -268,6 +290,4 @@ def test_every_number_and_every_shape_can_be_set():
 
 
 def cli_args(*argv):
-    from mjx_dher.cli_sweep import parse_sweep_args
-
-    return parse_sweep_args(["--out", "nowhere", "--preset", "cpu", *argv])
+    return cli_sweep.parse_sweep_args(["--out", "nowhere", "--preset", "cpu", *argv])
