@@ -9,13 +9,10 @@ for warp, its kernels. "First epoch" is how much longer the first one takes than
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
-from pathlib import Path
+
+import apart
 
 
 def measure(env: str, engine: str, preset: str) -> dict[str, float]:
@@ -58,17 +55,11 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             caches = {"JAX_COMPILATION_CACHE_DIR": f"{folder}/xla", "WARP_CACHE_PATH": f"{folder}/warp"}
             for state in ("cold", "cached"):
-                command = [sys.executable, __file__, "measure", env, args.engine, args.preset]
-                done = subprocess.run(command, env={**os.environ, **caches}, check=True, stdout=subprocess.PIPE, text=True)
-                found = json.loads(done.stdout.splitlines()[-1])
+                found = apart.measured(__file__, (env, args.engine, args.preset), caches)
                 rows.append((env, state, *(f"{seconds:.1f}" for seconds in found.values())))
     head = ("imports, s", "compiling, s", "first epoch, s more", "an epoch, s")
     print_table(("task", "caches", *head), rows)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["measure"]:
-        sys.path.insert(0, str(Path(__file__).parent))
-        print(json.dumps(measure(*sys.argv[2:])))
-    else:
-        main()
+    apart.main(measure, main)

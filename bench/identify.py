@@ -253,7 +253,8 @@ def replay(model, task, recorded):
         qvel[:, int(model.joint(name).dofadr[0])] = rate
     obj = int(model.joint("object").qposadr[0])
     qpos[:, obj : obj + 7] = recorded["object_qpos"][:, 0]
-    if "finger_r" in _joints(model):
+    jointed = "finger_r" in _joints(model)
+    if jointed:
         finger, rate = int(model.joint("finger_r").qposadr[0]), int(model.joint("finger_r").dofadr[0])
         qvel[:, rate : rate + 2] = numbers.get("finger_qvel", (0.0, 0.0))
     gripper, site = model.body("gripper").id, model.site("grip").id
@@ -280,7 +281,7 @@ def replay(model, task, recorded):
         # Where fingers are driven, the original sees positions one substep late; where they are blocked, it puts them back.
         late = int(model.nu > 0)
         batch.step(nstep=SUBSTEPS - late)
-        if not late and "finger_r" in _joints(model):
+        if jointed and not late:
             qpos[:, finger : finger + 2] = 0
         pose, seen = look()
         if late:

@@ -9,12 +9,9 @@ beside it. On a CPU: the peak of the whole program.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import resource
-import subprocess
-import sys
-from pathlib import Path
+
+import apart
 
 
 def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
@@ -57,19 +54,14 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     # This program and those that it measures share the device.
-    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    environ = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     for env in args.env:
         for num_envs in args.num_envs:
-            command = [sys.executable, __file__, "measure", env, args.engine, args.preset, str(num_envs)]
-            done = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
-            rows.append((env, num_envs, *json.loads(done.stdout.splitlines()[-1])))
+            found = apart.measured(__file__, (env, args.engine, args.preset, str(num_envs)), environ)
+            rows.append((env, num_envs, *found))
     on_gpu = jax.default_backend() != "cpu"
     print_table(("task", "num_envs", "of it: replay ring", *(("JAX, peak", "Warp, peak") if on_gpu else ("peak",))), rows)
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["measure"]:
-        sys.path.insert(0, str(Path(__file__).parent))
-        print(json.dumps(measure(*sys.argv[2:])))
-    else:
-        main()
+    apart.main(measure, main)

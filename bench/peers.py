@@ -16,14 +16,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-import json
 import os
-import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
 
+import apart
 import numpy as np
 
 REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0", "stable-baselines3==2.9.2", "torch==2.13.0")
@@ -204,33 +203,33 @@ def our_train():
     return progress.wall_seconds, progress.env_steps, progress.metrics["success_rate"]
 
 
-def theirs(python, part, minutes):
-    """What `their_...` returns, run in their Python."""
-    command = [str(python), __file__, "theirs", "--parts", part, "--minutes", str(minutes)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{python} failed; see above")
-    return json.loads(done.stdout.splitlines()[-1])
+def measure(part, minutes):
+    """What `their_...` returns; their Python runs this."""
+    warnings.filterwarnings("ignore")
+    return {"env": their_env, "relabel": their_relabel, "train": their_train}[part](float(minutes))
 
 
 def compare(python, parts, minutes):
     from timing import print_table
 
+    def theirs(part):
+        return apart.measured(__file__, (part, str(minutes)), python=str(python))
+
     rows = []
     if "env" in parts:
-        there, here = theirs(python, "env", minutes), our_env()
+        there, here = theirs("env"), our_env()
         for name, rate in there.items():
             for num_envs, ours in here.items():
                 rows.append(
                     ("env steps/s", name, f"{rate:,.0f}", f"native, {num_envs} envs", f"{ours:,.0f}", f"{ours / rate:.1f}")
                 )
     if "relabel" in parts:
-        rate, here = theirs(python, "relabel", minutes)["transitions"], our_relabel()
+        rate, here = theirs("relabel")["transitions"], our_relabel()
         for name, ours in here.items():
             what = f"HerReplayBuffer, batch {BATCH_SIZE}"
             rows.append(("transitions relabelled/s", what, f"{rate:,.0f}", name, f"{ours:,.0f}", f"{ours / rate:.1f}"))
     if "train" in parts:
-        (seconds, steps, success), curve = our_train(), theirs(python, "train", minutes)["curve"]
+        (seconds, steps, success), curve = our_train(), theirs("train")["curve"]
         their_seconds, their_steps, their_success = curve[-1]
         reached = their_success >= SUCCESS
         there = f"{their_seconds:,.0f} s, {their_steps:,} steps: {their_success:.2f}"
@@ -242,17 +241,11 @@ def compare(python, parts, minutes):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("mode", nargs="?", choices=("compare", "theirs"), default="compare", help=argparse.SUPPRESS)
     parser.add_argument("--parts", nargs="+", choices=("env", "relabel", "train"), default=("env", "relabel", "train"))
     parser.add_argument("--minutes", type=float, default=20)
     parser.add_argument("--set-up", action="store_true")
     parser.add_argument("--python", type=Path)
     args = parser.parse_args()
-    if args.mode == "theirs":
-        warnings.filterwarnings("ignore")
-        (part,) = args.parts
-        print(json.dumps({"env": their_env, "relabel": their_relabel, "train": their_train}[part](args.minutes)))
-        return
     from mjx_dher import originals
     from mjx_dher.run_folder import user_cache
 
@@ -263,4 +256,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    apart.main(measure, main)

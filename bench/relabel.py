@@ -1,6 +1,9 @@
 """Sampling and relabelling: transitions a second, for each goal sampler, from a ring of 10^6 transitions.
 
-python bench/relabel.py [--batch-size 1024]
+    python bench/relabel.py [--batch-size 1024] [--flashbax]
+
+Batches are drawn as the trainer draws them, many at once. `--flashbax` adds a row for the item buffer of flashbax (pip install
+flashbax==0.1.3) with the same transitions, as many batches at once: drawn uniformly, and not relabelled.
 """
 
 from __future__ import annotations
@@ -13,37 +16,70 @@ from learner import compute_reward, full_ring
 from timing import median_seconds, print_table
 
 from mjx_dher import HParams, replay, samplers
-from mjx_dher.relabel import relabel
+from mjx_dher.relabel import draw_batches
+from mjx_dher.trainer import DRAWN_AT_ONCE
+from mjx_dher.types import Batch
 
-BATCHES = 40
+ROUNDS = 10
+
+
+def total(tree):
+    """Reads all that was drawn, so that the compiler cannot leave it out."""
+    return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree))
+
+
+def transitions_a_second(draw, num_drawn):
+    """Of `draw(key)`, which draws `num_drawn` of them."""
+
+    @jax.jit
+    def run(keys):
+        return jax.lax.scan(lambda found, key: (found + total(draw(key)), None), 0.0, keys)[0]
+
+    keys = jax.random.split(jax.random.key(0), ROUNDS)
+    return ROUNDS * num_drawn / median_seconds(lambda: run(keys))
+
+
+def flashbax(ring, shape):
+    """A function key -> transitions [*shape] from an item buffer that holds those of `ring`."""
+    import flashbax as fbx
+
+    episodes = ring.episodes
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    desired = jnp.repeat(episodes.desired_goal, episodes.action.shape[1], axis=0)
+    items = Batch(
+        observation=flat(episodes.observation[:, :-1]),
+        action=flat(episodes.action),
+        reward=jnp.zeros(len(desired)),
+        next_observation=flat(episodes.observation[:, 1:]),
+        desired_goal=desired,
+    )
+    num_drawn = shape[0] * shape[1]
+    buffer = fbx.make_item_buffer(max_length=len(desired), min_length=1, sample_batch_size=num_drawn, add_batches=True)
+    state = buffer.add(buffer.init(jax.tree.map(lambda x: x[0], items)), items)
+    return lambda key: buffer.sample(state, key).experience
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch-size", type=int, default=1024)
+    parser.add_argument("--flashbax", action="store_true")
     args = parser.parse_args()
     hparams, ring = HParams(), full_ring()
-    keys = jax.random.split(jax.random.key(0), BATCHES)
-    times = {}
+    counts = replay.count_eventful(ring)
+    shape = (max(1, DRAWN_AT_ONCE // args.batch_size), args.batch_size)
+    num_drawn = shape[0] * shape[1]
+    rates = {}
     for name in samplers.list_samplers():
         sampler = samplers.make(name)
-
-        @jax.jit
-        def run(keys, sampler=sampler):
-            def step(total, key):
-                sample_key, relabel_key = jax.random.split(key)
-                sample = replay.sample(ring, sample_key, args.batch_size)
-                batch = relabel(ring, sample, sampler, compute_reward, hparams, relabel_key)
-                return total + sum(jnp.sum(leaf) for leaf in jax.tree.leaves(batch)), None
-
-            return jax.lax.scan(step, 0.0, keys)[0]
-
-        times[name] = median_seconds(lambda run=run: run(keys)) / BATCHES
+        draw = lambda key, sampler=sampler: draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)  # noqa: E731
+        rates[name] = transitions_a_second(draw, num_drawn)
+    if args.flashbax:
+        rates["flashbax, not relabelled"] = transitions_a_second(flashbax(ring, shape), num_drawn)
     rows = [
-        (name, f"{args.batch_size / seconds:,.0f}", f"{seconds * 1e6:.0f}", f"{seconds / times['future']:.2f}")
-        for name, seconds in times.items()
+        (name, f"{rate:,.0f}", f"{1e6 * args.batch_size / rate:.1f}", f"{rates['future'] / rate:.2f}")
+        for name, rate in rates.items()
     ]
-    print_table(("sampler", "transitions/s", f"µs per batch of {args.batch_size}", "against future"), rows)
+    print_table(("sampler", "transitions/s", f"µs per batch of {args.batch_size}", "time against future"), rows)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-import platform
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import __version__, cli_sweep, config, envs, run_folder
+from mjx_dher import cli_sweep, config, envs, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -159,7 +158,7 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     checks = (
         lambda: config.check_name("env", args.config.env, envs.list_envs()),
         lambda: config.validate(args.config, args.hparams),
-        lambda: _check_count("final_episodes", args.final_episodes),
+        lambda: config.check_count("final_episodes", args.final_episodes),
     )
     problems = [problem for problem in map(_problem, checks) if problem]
     if problems:
@@ -182,11 +181,11 @@ class _Training:
         keep_compiled_programs()
         args, console = self.args, self.console
         env = envs.make(args.config.env, engine=args.config.engine)
-        engine = _engine_name(env)
+        engine = run_folder.engine_name(env)
         program = trainer.make_train(env, args.config)
         trainer.check_memory(program.replay_bytes, args.config)
         run = RunConfig(config=args.config, hparams=args.hparams, seed=args.seed, engine=engine)
-        run_folder.create(self.folder, run, {"preset": args.preset, "versions": _versions()})
+        run_folder.create(self.folder, run, {"preset": args.preset})
         device = jax.devices()[0]
         console.print(
             f"{args.config.env}, sampler {args.config.sampler}, seed {args.seed}; physics {engine}, learner on"
@@ -253,7 +252,7 @@ class _Training:
 def eval_command(argv: list[str], console: Console) -> int:
     """`eval RUN`: evaluates the policy of a run folder."""
     args = tyro.cli(EvalArgs, prog="train.py eval", args=argv)
-    _check_count("episodes", args.episodes)
+    config.check_count("episodes", args.episodes)
     if args.engine is not None:
         config.check_name("engine", args.engine, config.ENGINES)
     run = run_folder.read_config(args.run)
@@ -261,7 +260,7 @@ def eval_command(argv: list[str], console: Console) -> int:
 
     policy = load_policy(args.run)
     env = envs.make(run.config.env, engine=args.engine or run.config.engine)
-    console.print(f"{run.config.env}: {args.episodes} episodes, seed {args.seed}, physics {_engine_name(env)} ...")
+    console.print(f"{run.config.env}: {args.episodes} episodes, seed {args.seed}, physics {run_folder.engine_name(env)} ...")
     outcome = play(env, policy, args.episodes, args.seed)
     report(outcome.success, outcome.reset_success, outcome.ret, console)
     return 0
@@ -273,7 +272,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
     args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
-    _check_count("episodes", args.episodes)
+    config.check_count("episodes", args.episodes)
     if args.engine is not None:
         config.check_name("engine", args.engine, config.ENGINES)
     if args.run is not None and args.env is None:
@@ -298,7 +297,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
     console.print(
         f"{played.env}: {args.episodes} episodes{'' if policy else ' of random actions'}, seed {args.seed},"
-        f" physics {_engine_name(env)}, drawn with {gl} ..."
+        f" physics {run_folder.engine_name(env)}, drawn with {gl} ..."
     )
     qpos, goals, success = render.play(env, act, args.seed, args.episodes)
     pictures = (env.model, qpos, goals, args.width, args.height)
@@ -310,7 +309,7 @@ def render_command(argv: list[str], console: Console) -> int:
 def transfer_command(argv: list[str], console: Console) -> int:
     """`transfer RUN`: plays the policy of a run folder in the original task."""
     args = tyro.cli(TransferArgs, prog="train.py transfer", args=argv)
-    _check_count("episodes", args.episodes)
+    config.check_count("episodes", args.episodes)
     run = run_folder.read_config(args.run)
     from mjx_dher import originals
     from mjx_dher.envs.engines.native import usable_cores
@@ -328,7 +327,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     console.print(f"{name}, {args.episodes} episodes ...")
     there = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
     report_there = report(there["success"], there["reset_success"], there["ret"], console)
-    console.print(f"{run.config.env} here, {args.episodes} episodes, physics {_engine_name(env)} ...")
+    console.print(f"{run.config.env} here, {args.episodes} episodes, physics {run_folder.engine_name(env)} ...")
     here = play(env, policy, args.episodes, args.seed)
     report_here = report(here.success, here.reset_success, here.ret, console)
     low, high = difference_interval(
@@ -418,19 +417,3 @@ def _problem(check: Callable[[], None]) -> str | None:
     except ValueError as error:
         return str(error)
     return None
-
-
-def _check_count(field: str, value: int) -> None:
-    if value < 1:
-        raise ValueError(f"{field} must be an integer of at least 1; got {value}")
-
-
-def _engine_name(env: Any) -> str:
-    return getattr(getattr(env, "engine", None), "name", "none")
-
-
-def _versions() -> dict[str, str]:
-    from importlib import metadata
-
-    names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
-    return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}

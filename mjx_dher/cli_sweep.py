@@ -124,8 +124,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
             config.check_name(field, value, allowed)
     config.check_name("preset", args.preset, ("auto", *config.PRESETS))
     for field in ("seeds", "final_episodes", *(("lanes",) if args.lanes is not None else ())):
-        if getattr(args, field) < 1:
-            raise ValueError(f"{field} must be an integer of at least 1; got {getattr(args, field)}")
+        config.check_count(field, getattr(args, field))
     if args.first_seed < 0:
         raise ValueError(f"first_seed must be an integer of at least 0; got {args.first_seed}")
     _check_threshold(args.threshold)
@@ -173,8 +172,9 @@ def sweep_command(argv: list[str], console: Console) -> int:
         finally:
             signal.signal(signal.SIGINT, previous_handler)
             screen.close()
-    sweep.write_tables(args.out)
-    _compare(args.out, args.baseline, args.threshold, console)
+    found = sweep.read(args.out)
+    sweep.write_tables(args.out, found)
+    _compare(args.out, comparison.groups(found), args.baseline, args.threshold, console)
     console.print(f"wrote {sweep.RESULTS}, {sweep.FINALS} and {comparison.COMPARISON} in {args.out}", soft_wrap=True)
     return 0
 
@@ -187,7 +187,7 @@ def plot_command(argv: list[str], console: Console) -> int:
     _check_threshold(args.threshold)
     plotting.check(args.formats)
     found = comparison.groups(sweep.read(args.folder))
-    rows = _compare(args.folder, args.baseline, args.threshold, console)
+    rows = _compare(args.folder, found, args.baseline, args.threshold, console)
     out = args.out or args.folder
     out.mkdir(parents=True, exist_ok=True)
     for env, groups in found.items():
@@ -202,9 +202,10 @@ def _check_threshold(threshold: float) -> None:
         raise ValueError(f"threshold must lie in (0, 1]; got {threshold:g}")
 
 
-def _compare(folder: Path, baseline: str, threshold: float, console: Console) -> list[comparison.Row]:
-    """Prints and writes the comparison of all that is in the folder."""
-    found = comparison.groups(sweep.read(folder))
+def _compare(
+    folder: Path, found: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
+) -> list[comparison.Row]:
+    """Prints the comparison of all settings, and writes it into the folder."""
     rows = [row for groups in found.values() for row in comparison.compare(groups, baseline, threshold)]
     comparison.write(folder, rows)
     head, lines = comparison.table(rows)

@@ -121,6 +121,16 @@ def num_epochs(config: Config, episode_length: int) -> int:
     return math.ceil(config.total_steps / steps_per_epoch(config, episode_length))
 
 
+def check_count(field: str, value: int) -> None:
+    """Refuses what is no number of things.
+
+    Raises:
+      ValueError: less than 1.
+    """
+    if value < 1:
+        raise ValueError(f"{field} must be an integer of at least 1; got {value}")
+
+
 def preset(name: str, env: str) -> tuple[Config, HParams]:
     """The Config and HParams of a preset for an environment.
 

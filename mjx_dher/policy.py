@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher import run_folder
 from mjx_dher.run_folder import POLICY_FILE, RunFolderError, read_config
 
 _SCALARS = ("norm_clip", "obs_clip")
@@ -76,10 +77,8 @@ class Policy:
         arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
         for field in ("observation_mean", "observation_std", "goal_mean", "goal_std", *_SCALARS):
             arrays[field] = np.asarray(getattr(self, field), np.float32)
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
+        with run_folder.whole(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
-        partial.replace(path)
 
 
 def from_learner(learner: Any, hparams: Any) -> Policy:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import json
 import os
+import platform
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from mjx_dher import __version__
 from mjx_dher.config import Config, HParams
 
 SCHEMA = 1
@@ -53,8 +57,13 @@ def choose(out: Path | None, config: Config, seed: int) -> Path:
     return out
 
 
+def engine_name(env: Any) -> str:
+    """Of the physics that an environment runs on; none for one without an engine."""
+    return getattr(getattr(env, "engine", None), "name", "none")
+
+
 def create(path: Path, run: RunConfig, extra: dict[str, Any]) -> None:
-    """Makes the folder and writes config.json; `extra` is added to it for the reader (versions, machine)."""
+    """Makes the folder and writes config.json; versions, and `extra`, are added to it for the reader."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -66,15 +75,30 @@ def create(path: Path, run: RunConfig, extra: dict[str, Any]) -> None:
         "config": dataclasses.asdict(run.config),
         "hparams": run.hparams._asdict(),
         **extra,
+        "versions": _versions(),
     }
     write_json(path / CONFIG_FILE, content)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes `content`; what was there stays whole until the new file is."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
+    """Writes `content` as JSON, whole or not at all."""
+    with whole(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A path to write to that takes the place of `path` when it is complete; until then, what was there stays."""
+    partial = path.with_name(path.name + ".partial")
+    yield partial
     partial.replace(path)
+
+
+def _versions() -> dict[str, str]:
+    from importlib import metadata
+
+    names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
 
 
 def read_config(path: Path) -> RunConfig:

@@ -56,8 +56,7 @@ def interquartile_mean(scores: ArrayLike) -> float:
       ValueError: no scores.
     """
     ordered = np.sort(_scores(scores), axis=None)
-    cut = len(ordered) // 4
-    return float(ordered[cut : len(ordered) - cut].mean())
+    return float(ordered[_middle(len(ordered))].mean())
 
 
 def bootstrap_interval(
@@ -98,8 +97,7 @@ def curve_interval(
     curves = np.asarray(curves, float)
     _curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)
     num_seeds = len(curves)
-    cut = num_seeds // 4
-    middle = slice(cut, num_seeds - cut)
+    middle = _middle(num_seeds)
     rng = np.random.default_rng(seed)
     drawn = np.sort(curves[rng.integers(num_seeds, size=(repeats, num_seeds))], axis=1)[:, middle].mean(axis=1)
     low, high = _quantiles(drawn, level)
@@ -197,6 +195,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
         least = max(least, min(1.0, (len(p_values) - rank) * p_values[index]))
         adjusted[index] = least
     return adjusted
+
+
+def _middle(count: int) -> slice:
+    """Of that many sorted scores, those that are left when a quarter (rounded down) is cut off at either end."""
+    return slice(count // 4, count - count // 4)
 
 
 def _scores(scores: ArrayLike) -> NDArray:

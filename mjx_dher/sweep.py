@@ -14,7 +14,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -52,6 +51,11 @@ class Cell:
     config: Config
     hparams: HParams
     seed: int
+
+    @property
+    def choice(self) -> tuple[str, str, str]:
+        """What `samplers.make` takes."""
+        return self.config.sampler, self.config.weight_kernel, self.config.metric
 
     @property
     def name(self) -> str:
@@ -148,7 +152,7 @@ def _run_group(
 
     static = group[0].config
     config_lib.validate(static, group[0].hparams, env.episode_length)
-    choices = list(dict.fromkeys((c.config.sampler, c.config.weight_kernel, c.config.metric) for c in group))
+    choices = list(dict.fromkeys(cell.choice for cell in group))
     program = trainer.make_train(env, static, samplers.one_of([samplers.make(*choice) for choice in choices]))
     trainer.check_memory(program.replay_bytes, static)
     size = min(len(group), lanes or len(group))
@@ -167,7 +171,7 @@ def _run_group(
         if available is None or compiled.nbytes <= available or size == 1:
             break
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
-    evaluate = jax.jit(jax.vmap(lambda state, key: _final(env, program.networks, state, key, final_episodes)))
+    evaluate = jax.jit(jax.vmap(lambda state, key: trainer.evaluate_state(env, program.networks, state, key, final_episodes)))
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
@@ -184,7 +188,7 @@ def _run_group(
             learner = jax.tree.map(lambda x, lane=lane: x[lane], learners)
             curve = [{**counts, **{name: float(values[lane]) for name, values in found.items()}} for counts, found in curves]
             result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": final_episodes}
-            _write(folder, cell, _engine(env), size, curve, result, learner)
+            _write(folder, cell, run_folder.engine_name(env), size, curve, result, learner)
 
 
 def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size: int) -> tuple[Any, Any]:
@@ -193,21 +197,9 @@ def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size:
     import jax.numpy as jnp
 
     padded = [group[min(i, len(group) - 1)] for i in range(size)]
-    names = [choices.index((c.config.sampler, c.config.weight_kernel, c.config.metric)) for c in padded]
-    numbers = [Lane._make((*cell.hparams, choice)) for cell, choice in zip(padded, names)]
+    numbers = [Lane._make((*cell.hparams, choices.index(cell.choice))) for cell in padded]
     keys = jnp.stack([jax.random.key(cell.seed) for cell in padded])
     return keys, jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *numbers)
-
-
-def _final(env: Any, networks: Any, state: Any, key: Any, episodes: int) -> dict[str, Any]:
-    from mjx_dher import ddpg, evaluate
-
-    outcome = evaluate.evaluate(env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), key, episodes)
-    return evaluate.summary(outcome)
-
-
-def _engine(env: Any) -> str:
-    return getattr(getattr(env, "engine", None), "name", "none")
 
 
 def _path(folder: Path, cell: Cell) -> Path:
@@ -270,13 +262,13 @@ def _number(text: str) -> int | float:
     return int(text) if text.isdigit() else float(text)
 
 
-def write_tables(folder: Path) -> None:
-    """Writes results.csv, results.npz and finals.csv, of all cells in the folder; docs/sweeps.md describes the columns."""
+def write_tables(folder: Path, cells: Sequence[dict[str, Any]]) -> None:
+    """Writes results.csv, results.npz and finals.csv of the cells that `read` gave; docs/sweeps.md describes the columns."""
     import numpy as np
 
     results: list[dict[str, Any]] = []
     finals: list[dict[str, Any]] = []
-    for cell in read(folder):
+    for cell in cells:
         static = {name: value for name, value in cell["config"].items() if name not in ("engine", "hidden_sizes")}
         sizes = "x".join(map(str, cell["config"]["hidden_sizes"]))
         settings = {**static, "hidden_sizes": sizes, "engine": cell["engine"], **cell["hparams"], "seed": cell["seed"]}
@@ -287,15 +279,13 @@ def write_tables(folder: Path) -> None:
         finals.append({**settings, "lanes": cell["lanes"], **last, **cell["final"]})
     _write_csv(folder / RESULTS, results)
     _write_csv(folder / FINALS, finals)
-    partial = folder / "results.partial.npz"
-    np.savez_compressed(partial, **{name: np.array([row[name] for row in results]) for name in results[0]})  # type: ignore[arg-type]
-    partial.replace(folder / "results.npz")
+    columns = {name: np.array([row[name] for row in results]) for name in results[0]}
+    with run_folder.whole(folder / "results.npz") as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **columns)  # type: ignore[arg-type]
 
 
 def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
+    with run_folder.whole(path) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), restval="")
         writer.writeheader()
         writer.writerows(rows)
-    os.replace(partial, path)

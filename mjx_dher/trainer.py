@@ -154,14 +154,18 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
     def epoch(state: TrainState) -> tuple[TrainState, Metrics]:
         state, cycles = jax.lax.scan(cycle, state, length=config.cycles_per_epoch)
         key, eval_key = jax.random.split(state.key)
-        outcome = evaluate.evaluate(
-            env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), eval_key, config.eval_episodes
-        )
         discarded = jnp.sum(cycles.pop("discarded_episodes"))
-        metrics = evaluate.summary(outcome) | jax.tree.map(jnp.mean, cycles) | {"discarded_episodes": discarded}
+        found = evaluate_state(env, networks, state, eval_key, config.eval_episodes)
+        metrics = found | jax.tree.map(jnp.mean, cycles) | {"discarded_episodes": discarded}
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def evaluate_state(env: Env, networks: Networks, state: TrainState, key: PRNGKey, num_episodes: int) -> Metrics:
+    """Plays the learner's policy without exploration: success_rate, reset_success_rate and return_mean, each []."""
+    outcome = evaluate.evaluate(env, lambda obs: ddpg.act(networks, state.learner, obs, state.hparams), key, num_episodes)
+    return evaluate.summary(outcome)
 
 
 def _largest_divisor(number: int, limit: int) -> int:

@@ -97,7 +97,7 @@ def test_a_lane_is_that_run_alone(tmp_path):
 
 
 def table(folder, name=sweep.RESULTS, without=("wall_seconds",)):
-    sweep.write_tables(folder)
+    sweep.write_tables(folder, sweep.read(folder))
     with (folder / name).open() as file:
         return [{k: v for k, v in row.items() if k not in without} for row in csv.DictReader(file)]
 
