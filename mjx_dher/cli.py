@@ -1,10 +1,14 @@
-"""The command line: `train` (the default command), `eval`, `render` and `transfer`; `sweep` and `plot` are in `cli_sweep`."""
+"""The command line: `train` (the default command), `resume`, `eval`, `render` and `transfer`.
+
+`sweep` and `plot` are in `cli_sweep`.
+"""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
     from mjx_dher.metrics import Sink
     from mjx_dher.policy import Policy
     from mjx_dher.rollout import Outcome
-    from mjx_dher.trainer import Progress
+    from mjx_dher.trainer import Progress, Start, TrainState
 
 FINAL_EPISODES = 500
 EVAL_CHUNK = 500  # episodes evaluated at once
@@ -33,8 +37,9 @@ EVAL_CHUNK = 500  # episodes evaluated at once
 class TrainArgs:
     """Train a policy with DDPG and Hindsight Experience Replay.
 
-    Other commands: `eval RUN` evaluates a run again, `render RUN` draws it, `transfer RUN` plays it in the original Fetch task,
-    `sweep` trains and compares many runs, `plot DIR` draws a sweep (see `eval --help` and so on).
+    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates one again, `render RUN` draws it,
+    `transfer RUN` plays it in the original Fetch task, `sweep` trains and compares many runs, `plot DIR` draws a sweep (see
+    `eval --help` and so on).
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -48,6 +53,29 @@ class TrainArgs:
     """Run folder to write; a fresh one under runs/ unless given. Never overwrites."""
     final_episodes: int = FINAL_EPISODES
     """Episodes of the last evaluation."""
+    checkpoint_every: int = 10
+    """Epochs between checkpoints, from which `resume` goes on; 0: only when the run is stopped (Ctrl-C, SIGTERM)."""
+    keep: int = 2
+    """Checkpoints to keep, the newest; they are deleted when the run has ended."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ResumeArgs:
+    """Go on with a run that was stopped, or killed, from its newest checkpoint that is whole.
+
+    With the engine that it had, on a CPU, it ends as if it had never stopped, to the bit.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """The run folder."""
+    engine: str | None = None
+    """Physics: native, jax, warp or auto; the run's own unless given."""
+    final_episodes: int | None = None
+    """Episodes of the last evaluation; as the run was started with unless given."""
+    checkpoint_every: int | None = None
+    """Epochs between checkpoints, or 0; as the run was started with unless given."""
+    keep: int | None = None
+    """Checkpoints to keep; as the run was started with unless given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str], Console], int]] = {
         "train": train_command,
+        "resume": resume_command,
         "eval": eval_command,
         "render": render_command,
         "transfer": transfer_command,
@@ -136,8 +165,43 @@ def train_command(argv: list[str], console: Console) -> int:
     """`train`: trains a policy and writes a run folder."""
     args = parse_train_args(argv)
     folder = run_folder.choose(args.out, args.config, args.seed)
-    run = _Training(args, folder, console)
-    return run()
+    keep_compiled_programs()
+    env = envs.make(args.config.env, engine=args.config.engine)
+    run = RunConfig(config=args.config, hparams=args.hparams, seed=args.seed, engine=run_folder.engine_name(env))
+    options = {name: getattr(args, name) for name in _OPTIONS}
+    training = _Training(env, run, folder, options, console)
+    return training(lambda: run_folder.create(folder, run, {"preset": args.preset, **options}))
+
+
+def resume_command(argv: list[str], console: Console) -> int:
+    """`resume RUN`: goes on with a run that was stopped."""
+    args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
+    if args.engine is not None:
+        config.check_name("engine", args.engine, config.ENGINES)
+    run = run_folder.read_config(args.run)
+    started = run_folder.read_extra(args.run)
+    defaults = {field.name: field.default for field in dataclasses.fields(TrainArgs)}
+    options = {name: getattr(args, name) for name in _OPTIONS}
+    options = {name: started.get(name, defaults[name]) if value is None else value for name, value in options.items()}
+    _check_options(**options)
+    if (args.run / run_folder.RESULT_FILE).exists():
+        raise run_folder.RunFolderError(f"{args.run} has ended; there is nothing to go on with")
+    if not (args.run / run_folder.CHECKPOINTS).is_dir():
+        raise run_folder.RunFolderError(f"{args.run} has no checkpoint to go on from: it was stopped before it had saved any")
+    keep_compiled_programs()
+    env = envs.make(run.config.env, engine=args.engine or run.engine)
+    return _Training(env, run, args.run, options, console)()
+
+
+_OPTIONS = ("final_episodes", "checkpoint_every", "keep")
+
+
+def _check_options(final_episodes: int, checkpoint_every: int, keep: int) -> None:
+    """Raises ValueError where one of _OPTIONS cannot be used."""
+    config.check_count("final_episodes", final_episodes)
+    config.check_count("keep", keep)
+    if checkpoint_every < 0:
+        raise ValueError(f"checkpoint_every must be a number of epochs, or 0; got {checkpoint_every}")
 
 
 def parse_train_args(argv: list[str]) -> TrainArgs:
@@ -158,7 +222,7 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     checks = (
         lambda: config.check_name("env", args.config.env, envs.list_envs()),
         lambda: config.validate(args.config, args.hparams),
-        lambda: config.check_count("final_episodes", args.final_episodes),
+        lambda: _check_options(args.final_episodes, args.checkpoint_every, args.keep),
     )
     problems = [problem for problem in map(_problem, checks) if problem]
     if problems:
@@ -167,71 +231,112 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
 
 
 class _Training:
-    """One run of the `train` command, with what its signal handler needs to see."""
+    """One run of the `train` or `resume` command, with what its signal handler needs to see.
 
-    def __init__(self, args: TrainArgs, folder: Path, console: Console):
-        self.args, self.folder, self.console = args, folder, console
-        self.stop_asked = False
+    Args:
+      env: what to train in.
+      run: what the run was started with.
+      folder: of the run.
+      options: _OPTIONS by name.
+      console: to print to.
+    """
 
-    def __call__(self) -> int:
+    def __init__(self, env: GoalEnv, run: RunConfig, folder: Path, options: dict[str, Any], console: Console):
+        self.env, self.run, self.folder, self.options, self.console = env, run, folder, options, console
+        self.stop_asked: int | None = None  # the signal
+
+    def __call__(self, create: Callable[[], None] | None = None) -> int:
+        """Trains; `create` makes the folder of a new run, and without it the one that is there is resumed."""
         import jax
 
-        from mjx_dher import memory, policy, trainer
+        from mjx_dher import memory, trainer
 
-        keep_compiled_programs()
-        args, console = self.args, self.console
-        env = envs.make(args.config.env, engine=args.config.engine)
-        engine = run_folder.engine_name(env)
-        program = trainer.make_train(env, args.config)
-        trainer.check_memory(program.replay_bytes, args.config)
-        run = RunConfig(config=args.config, hparams=args.hparams, seed=args.seed, engine=engine)
-        run_folder.create(self.folder, run, {"preset": args.preset})
-        device = jax.devices()[0]
-        console.print(
-            f"{args.config.env}, sampler {args.config.sampler}, seed {args.seed}; physics {engine}, learner on"
-            f" {device.device_kind}; replay ring {memory.format_bytes(program.replay_bytes)}; writing to {self.folder}",
-            soft_wrap=True,
-        )
-        previous_handler = signal.signal(signal.SIGINT, self._on_interrupt)
-        last: Progress | None = None
-        learned: Policy | None = None
+        run, console = self.run, self.console
+        program = trainer.make_train(self.env, run.config)
+        trainer.check_memory(program.replay_bytes, run.config)
+        if create is not None:
+            create()
+        with run_folder.lock(self.folder):
+            start = None if create is not None else self._restore(trainer.state_template(program))
+            console.print(
+                f"{run.config.env}, sampler {run.config.sampler}, seed {run.seed}; physics {run_folder.engine_name(self.env)},"
+                f" learner on {jax.devices()[0].device_kind}; replay ring {memory.format_bytes(program.replay_bytes)};"
+                f" writing to {self.folder}",
+                soft_wrap=True,
+            )
+            handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+            try:
+                last, learned = self._train(start)
+            except OSError as error:
+                raise run_folder.RunFolderError(f"{self.folder} cannot be written to ({error}); {self._last()}") from error
+            finally:
+                for number, handler in handlers.items():
+                    signal.signal(number, handler)
+            if last.epoch < last.num_epochs:
+                console.print(
+                    f"stopped after epoch {last.epoch} of {last.num_epochs}; the policy so far is in {self.folder}, and"
+                    f" `train.py resume {self.folder}` goes on",
+                    soft_wrap=True,
+                )
+                return 128 + (self.stop_asked or 0)
+            outcome = play(self.env, learned, self.options["final_episodes"], run.seed + 1)
+            result = report(outcome.success, outcome.reset_success, outcome.ret, console)
+            ended = {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result}
+            run_folder.write_json(self.folder / run_folder.RESULT_FILE, ended)
+            shutil.rmtree(self.folder / run_folder.CHECKPOINTS, ignore_errors=True)
+        console.print(f"run folder: {self.folder}", soft_wrap=True)
+        return 0
+
+    def _restore(self, template: TrainState) -> Start:
+        from mjx_dher import checkpoint, trainer
+
+        found = checkpoint.restore(self.folder, template)
+        for why in found.refused:
+            self.console.print(f"not used: {why}", soft_wrap=True)
+        self.console.print(f"going on from {found.path}", soft_wrap=True)
+        return trainer.Start(found.state, found.epoch, found.wall_seconds)
+
+    def _train(self, start: Start | None) -> tuple[Progress, Policy]:
+        """Trains to the end or until a stop is asked for, writing metrics, policies and checkpoints; the last of each."""
+        from mjx_dher import checkpoint, policy, trainer
+
+        run, every = self.run, self.options["checkpoint_every"]
         sinks: list[Sink] = []
         try:
-            for progress in trainer.train(env, args.config, args.hparams, args.seed, self._on_compile):
+            for progress in trainer.train(self.env, run.config, run.hparams, run.seed, self._on_compile, start):
+                if not trainer.is_finite(progress.state.learner):
+                    raise ValueError(
+                        f"epoch {progress.epoch}: the networks or normalizers hold numbers that are not finite, so training"
+                        f" was stopped (smaller actor_lr and critic_lr may help); {self._last()}"
+                    )
                 if not sinks:
-                    sinks = self._open_sinks(progress.num_epochs)
-                row = _row(progress, last)
-                last = progress
-                learned = policy.from_learner(progress.state.learner, args.hparams)
+                    sinks = self._open_sinks(progress.num_epochs, start.epoch if start else 0)
+                learned = policy.from_learner(progress.state.learner, run.hparams)
                 learned.save(self.folder / run_folder.POLICY_FILE)
                 for sink in sinks:
-                    sink.write(row)
-                if self.stop_asked:
+                    sink.write(_row(progress))
+                stop = self.stop_asked is not None
+                if progress.epoch < progress.num_epochs and (stop or (every and progress.epoch % every == 0)):
+                    keep = self.options["keep"]
+                    path = checkpoint.save(self.folder, progress.state, progress.epoch, progress.wall_seconds, keep)
+                    if stop:
+                        self.console.print(f"saved {path}", soft_wrap=True)
+                if stop:
                     break
         finally:
             for sink in sinks:
                 sink.close()
-            signal.signal(signal.SIGINT, previous_handler)
-        if last is None or learned is None:
-            return 1
-        if self.stop_asked:
-            console.print(
-                f"stopped after epoch {last.epoch} of {last.num_epochs}; the policy so far is in {self.folder}",
-                soft_wrap=True,
-            )
-        outcome = play(env, learned, args.final_episodes, args.seed + 1)
-        result = report(outcome.success, outcome.reset_success, outcome.ret, console)
-        run_folder.write_json(
-            self.folder / run_folder.RESULT_FILE,
-            {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result},
-        )
-        console.print(f"run folder: {self.folder}", soft_wrap=True)
-        return 130 if self.stop_asked else 0
+        return progress, learned
 
-    def _open_sinks(self, num_epochs: int) -> list[Sink]:
+    def _last(self) -> str:
+        """What is left, for an error."""
+        found = run_folder.checkpoints(self.folder)
+        return f"`train.py resume {self.folder}` goes on from {found[0]}" if found else "there is no checkpoint"
+
+    def _open_sinks(self, num_epochs: int, epochs: int) -> list[Sink]:
         from mjx_dher.metrics import ConsoleSink, CsvSink
 
-        return [CsvSink(self.folder / run_folder.METRICS_FILE), ConsoleSink(self.console, num_epochs)]
+        return [CsvSink(self.folder / run_folder.METRICS_FILE, epochs), ConsoleSink(self.console, num_epochs)]
 
     def _on_compile(self, seconds: float | None) -> None:
         if seconds is None:
@@ -239,14 +344,14 @@ class _Training:
         else:
             self.console.print(f"compiled in {seconds:.1f} s")
 
-    def _on_interrupt(self, signum: int, frame: Any) -> None:
-        if self.stop_asked:
+    def _on_signal(self, signum: int, frame: Any) -> None:
+        if self.stop_asked is not None:
             self.console.show_cursor(True)
             self.console.print(f"stopped at once; what was saved is in {self.folder}", soft_wrap=True)
             sys.stdout.flush()
-            os._exit(130)  # a compiled epoch cannot be interrupted, and all that was saved is on the disk already
-        self.stop_asked = True
-        self.console.print("stopping when this epoch has ended; Ctrl-C again stops at once, keeping the last saved policy")
+            os._exit(128 + signum)  # a compiled epoch cannot be interrupted, and all that was saved is on the disk already
+        self.stop_asked = signum
+        self.console.print("stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved")
 
 
 def eval_command(argv: list[str], console: Console) -> int:
@@ -392,10 +497,9 @@ def keep_compiled_programs() -> None:
         jax.config.update("jax_compilation_cache_dir", str(run_folder.user_cache() / "xla"))
 
 
-def _row(progress: Progress, previous: Progress | None) -> dict[str, Any]:
+def _row(progress: Progress) -> dict[str, Any]:
     """What the sinks take, in the order of metrics.csv."""
-    steps = progress.env_steps - (previous.env_steps if previous else 0)
-    updates = progress.updates - (previous.updates if previous else 0)
+    steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
     metrics = dict(progress.metrics)
     return {
         "epoch": progress.epoch,

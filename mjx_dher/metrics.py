@@ -9,6 +9,8 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
+from mjx_dher.run_folder import RunFolderError, whole
+
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
 FIRST_COLUMNS = ("epoch", "env_steps", "updates", "wall_seconds", "success_rate", "return_mean")
 
@@ -22,11 +24,29 @@ class Sink(Protocol):
 
 
 class CsvSink:
-    """metrics.csv: one line an epoch, on disk before the next begins."""
+    """metrics.csv: one line an epoch, on disk before the next begins.
 
-    def __init__(self, path: Path):
-        self._file = path.open("w", newline="")
+    Args:
+      path: of the file.
+      epochs: of a run that is resumed, those that had ended; their lines stay, and later ones go.
+
+    Raises:
+      RunFolderError: the file has not the lines of all these epochs.
+    """
+
+    def __init__(self, path: Path, epochs: int = 0):
         self._writer: csv.DictWriter[str] | None = None
+        if epochs == 0:
+            self._file = path.open("w", newline="")
+            return
+        lines = path.read_bytes().decode().splitlines(keepends=True) if path.exists() else []
+        kept = lines[: 1 + epochs]
+        if [line.split(",")[0] for line in kept] != ["epoch", *map(str, range(1, 1 + epochs))] or not kept[-1].endswith("\n"):
+            raise RunFolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
+        with whole(path) as partial:
+            partial.write_bytes("".join(kept).encode())
+        self._file = path.open("a", newline="")
+        self._writer = csv.DictWriter(self._file, kept[0].strip().split(","))
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:

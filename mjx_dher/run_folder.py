@@ -1,4 +1,4 @@
-"""What is on disk: a run (config.json, metrics.csv, policy.npz, result.json), and where the cache is."""
+"""What is on disk: a run (config.json, metrics.csv, policy.npz, checkpoints, result.json), and where the cache is."""
 
 from __future__ import annotations
 
@@ -15,11 +15,17 @@ from typing import Any
 from mjx_dher import __version__
 from mjx_dher.config import Config, HParams
 
+try:
+    import fcntl
+except ImportError:  # not on Windows, where two programs on one run are not told apart
+    fcntl = None  # type: ignore[assignment]
+
 SCHEMA = 1
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.csv"
 POLICY_FILE = "policy.npz"
 RESULT_FILE = "result.json"
+CHECKPOINTS = "checkpoints"
 
 
 def user_cache() -> Path:
@@ -87,6 +93,22 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """Keeps other programs off the run in `path`. The system lets go of the lock when this one ends, however it ends.
+
+    Raises:
+      RunFolderError: another program is at work there.
+    """
+    with (path / CONFIG_FILE).open("r+") as file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise RunFolderError(f"{path} is being trained by another program") from None
+        yield
+
+
+@contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A path to write to that takes the place of `path` when it is complete; until then, what was there stays."""
     partial = path.with_name(path.name + ".partial")
@@ -99,6 +121,16 @@ def _versions() -> dict[str, str]:
 
     names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
+
+
+def checkpoints(path: Path) -> list[Path]:
+    """The checkpoints of the run in `path`, the newest first."""
+    return sorted((path / CHECKPOINTS).glob("epoch-*"), reverse=True)
+
+
+def read_extra(path: Path) -> dict[str, Any]:
+    """All of config.json; see `read_config`, which checks it."""
+    return json.loads((path / CONFIG_FILE).read_text())
 
 
 def read_config(path: Path) -> RunConfig:

@@ -176,7 +176,7 @@ def _run_group(
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
         curves: list[tuple[dict[str, float], dict[str, Any]]] = []  # what is the same for all lanes, and arrays over them
-        for progress in trainer.run(env, static, compiled, keys, hparams):
+        for progress in trainer.run(env, static, compiled, trainer.Start(compiled.init(keys, hparams))):
             counts = {name: getattr(progress, name) for name in ("epoch", "env_steps", "updates", "wall_seconds")}
             curves.append((counts, progress.metrics))
             on_epoch(chunk, progress)

@@ -179,6 +179,17 @@ def anneal(hparams: HParams, progress: Array | float) -> HParams:
     return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 
 
+def state_template(program: Train) -> TrainState:
+    """The shapes and types of a run's TrainState, for `checkpoint.restore`."""
+    return jax.eval_shape(program.init, jax.random.key(0), _arrays(HParams()))
+
+
+@jax.jit
+def is_finite(learner: DDPGState) -> Array:
+    """[] whether all of the learner's numbers are: once they are not, no epoch will mend them."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(learner)]))
+
+
 def episode_template(env: Env) -> Episode:
     """The shapes and types of one episode of `env`, without running it.
 
@@ -202,6 +213,14 @@ def episode_template(env: Env) -> Episode:
     )
 
 
+class Start(NamedTuple):
+    """Where a run, or L side by side, goes on from."""
+
+    state: TrainState
+    epoch: int = 0  # epochs that have ended
+    wall_seconds: float = 0.0
+
+
 class Progress(NamedTuple):
     """Where a run is after an epoch, or L runs side by side."""
 
@@ -221,6 +240,7 @@ def train(
     hparams: HParams | None = None,
     seed: int = 0,
     on_compile: Callable[[float | None], None] = lambda seconds: None,
+    start: Start | None = None,
 ) -> Iterator[Progress]:
     """Trains, yielding after every epoch. Stop by not asking for more.
 
@@ -232,6 +252,7 @@ def train(
       hparams: numbers; the defaults where None.
       seed: of everything random.
       on_compile: called with None when compilation begins and with its seconds when it has ended.
+      start: what to go on from, as `checkpoint.restore` gives it; a new run where None.
 
     Raises:
       ValueError: a Config or HParams that cannot run, a replay ring larger than the memory that is free, or what
@@ -247,7 +268,7 @@ def train(
     compiled = compile_program(program, key, hparams)
     check_env(env)
     on_compile(time.perf_counter() - started)
-    for progress in run(env, config, compiled, key, hparams):
+    for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
         yield progress._replace(metrics={name: float(value) for name, value in progress.metrics.items()})
 
 
@@ -274,20 +295,22 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
         nbytes = (
             sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
         )
-    return Compiled(init=jax.jit(init).lower(key, hparams).compile(), epoch=compiled, nbytes=nbytes)
+    compiled_init = jax.jit(init).lower(key, hparams).compile()
+    return Compiled(init=lambda key, hparams: compiled_init(key, _arrays(hparams)), epoch=compiled, nbytes=nbytes)
 
 
-def run(env: Env, config: Config, compiled: Compiled, key: PRNGKey, hparams: HParams) -> Iterator[Progress]:
+def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:
     """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays. See `train`.
 
     Raises:
       ValueError: what `env.check` raises, where the environment has one, after an epoch.
     """
     num_epochs = config_lib.num_epochs(config, env.episode_length)
-    state = jax.block_until_ready(compiled.init(key, _arrays(hparams)))
-    started = previous = time.perf_counter()
+    state = jax.block_until_ready(start.state)
+    previous = time.perf_counter()
+    started = previous - start.wall_seconds
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        for number in range(1, num_epochs + 1):
+        for number in range(start.epoch + 1, num_epochs + 1):
             running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)

@@ -83,7 +83,8 @@ def test_a_lane_is_that_run_alone(tmp_path):
         program = trainer.make_train(PointMass(), own[0].config)
         compiled = trainer.compile_program(program, jax.random.key(0), HParams())
         for cell in own:
-            (alone,) = trainer.run(PointMass(), cell.config, compiled, jax.random.key(cell.seed), cell.hparams)
+            start = trainer.Start(compiled.init(jax.random.key(cell.seed), cell.hparams))
+            (alone,) = trainer.run(PointMass(), cell.config, compiled, start)
             for name, value in alone.metrics.items():
                 assert curves[cell][name] == pytest.approx(value, rel=1e-3, abs=1e-4), (cell.name, name)
             for a, b in zip(jax.tree.leaves(learned[cell]), jax.tree.leaves(alone.state.learner.params), strict=True):

@@ -1,0 +1,221 @@
+"""A run in progress on disk: written whole or not at all, restored as it was or not at all.
+
+A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, the leaves of the TrainState as orbax stores arrays, and
+manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype. Orbax alone does not
+notice a flipped bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher.run_folder import CHECKPOINTS, RunFolderError, checkpoints
+
+SCHEMA = 1
+MANIFEST = "manifest.json"
+_STATE = "state"
+_PARTIAL = ".partial-"
+
+
+class CheckpointError(RunFolderError):
+    """A checkpoint that cannot be written, or must not be used."""
+
+
+class Restored(NamedTuple):
+    """What `restore` found."""
+
+    path: Path
+    epoch: int  # epochs that had ended
+    wall_seconds: float
+    state: Any
+    refused: tuple[str, ...]  # why newer checkpoints were not used
+
+
+def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -> Path:
+    """Writes a checkpoint of the run in `folder`, and deletes all but the newest `keep`.
+
+    Args:
+      folder: of the run.
+      state: a TrainState, or any pytree of arrays.
+      epoch: epochs that have ended.
+      wall_seconds: of training, so far.
+      keep: at least 1.
+
+    Raises:
+      CheckpointError: it cannot be written; earlier ones are as they were.
+    """
+    parent = folder / CHECKPOINTS
+    target, partial = parent / f"epoch-{epoch:06d}", parent / f"{_PARTIAL}{epoch:06d}"
+    try:
+        parent.mkdir(exist_ok=True)
+        for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
+            shutil.rmtree(left)
+        leaves = _to_arrays(state)
+        _write_arrays(partial / _STATE, list(leaves.values()))
+        content = {
+            "schema": SCHEMA,
+            "epoch": epoch,
+            "wall_seconds": wall_seconds,
+            "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
+            "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
+        }
+        with (partial / MANIFEST).open("w") as file:
+            json.dump({**content, "sha256": _digest_of(content)}, file, indent=1)
+        for path in _files(partial):
+            _flush(path)
+        if target.exists():
+            shutil.rmtree(target)
+        partial.rename(target)
+        _flush(parent)
+        for old in checkpoints(folder)[keep:]:
+            shutil.rmtree(old)
+    except Exception as error:  # orbax raises errors of its own, of many kinds
+        shutil.rmtree(partial, ignore_errors=True)
+        kept = checkpoints(folder)
+        last = f"the last one is {kept[0]}" if kept else "there is none before it"
+        raise CheckpointError(f"cannot write the checkpoint {target} ({error}); {last}") from error
+    return target
+
+
+def restore(folder: Path, template: Any) -> Restored:
+    """The newest checkpoint of the run in `folder` that is whole.
+
+    Args:
+      folder: of the run.
+      template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
+
+    Raises:
+      CheckpointError: there is none; says why each that is there cannot be used.
+    """
+    refused: list[str] = []
+    for path in checkpoints(folder):
+        try:
+            manifest, state = _load(path, template)
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, tuple(refused))
+        except CheckpointError as error:
+            refused.append(str(error))
+    why = "\n".join(refused) or "it was stopped before it had saved any (see --checkpoint-every)"
+    raise CheckpointError(f"{folder} has no checkpoint to go on from: {why}")
+
+
+def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
+    manifest = _read_manifest(path)
+    for name, digest in manifest["files"].items():
+        try:
+            found = _digest(path / name)
+        except OSError as error:
+            raise CheckpointError(f"{path} is damaged: {name} cannot be read ({error.strerror})") from error
+        if found != digest:
+            raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
+    expected = [[name, list(leaf.shape), str(leaf.dtype)] for name, leaf in _to_shapes(template).items()]
+    for saved, wanted in zip(manifest["leaves"], expected):
+        if saved != wanted:
+            raise CheckpointError(f"{path} does not fit this run: it holds {_say(saved)} where {_say(wanted)} is needed")
+    if len(manifest["leaves"]) != len(expected):
+        raise CheckpointError(f"{path} does not fit this run: {len(manifest['leaves'])} arrays, not {len(expected)}")
+    arrays = _read_arrays(path / _STATE, len(expected))
+    for array, (name, shape, dtype) in zip(arrays, expected):
+        if (list(array.shape), str(array.dtype)) != (shape, dtype):
+            found = _say([name, list(array.shape), str(array.dtype)])
+            raise CheckpointError(f"{path} was read as {found}, and was written as {_say([name, shape, dtype])}")
+    return manifest, _from_arrays(arrays, template)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads((path / MANIFEST).read_text())
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is damaged: {MANIFEST} cannot be read ({error})") from error
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        found = content.get("schema") if isinstance(content, dict) else None
+        raise CheckpointError(f"{path} is not of this program's checkpoint schema {SCHEMA} (found {found!r})")
+    if content.pop("sha256", None) != _digest_of(content):
+        raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
+    return content
+
+
+def _say(leaf: list[Any]) -> str:
+    name, shape, dtype = leaf
+    return f"{name} {dtype}{shape}"
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _digest_of(content: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _flush(path: Path) -> None:
+    """Onto the disk, so that a name never stands for what is not there."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def _to_arrays(state: Any) -> dict[str, np.ndarray]:
+    return {name: np.asarray(jax.random.key_data(x) if _is_key(x) else x) for name, x in _named(state).items()}
+
+
+def _to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    shape_of = lambda x: jax.eval_shape(jax.random.key_data, x) if _is_key(x) else x  # noqa: E731
+    return {name: shape_of(leaf) for name, leaf in _named(template).items()}
+
+
+def _from_arrays(arrays: list[np.ndarray], template: Any) -> Any:
+    leaves, treedef = jax.tree.flatten(template)
+
+    def put(array: np.ndarray, leaf: Any) -> Any:
+        value = jnp.array(array)  # a copy: the next epoch takes over its memory
+        return jax.random.wrap_key_data(value) if _is_key(leaf) else value
+
+    return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
+
+
+def _checkpointer() -> Any:
+    import orbax.checkpoint
+
+    logging.getLogger("absl").setLevel(logging.ERROR)  # orbax tells how long each step took
+    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler())
+
+
+def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
+    with _checkpointer() as checkpointer:
+        checkpointer.save(path.absolute(), {f"{index:04d}": array for index, array in enumerate(arrays)})
+
+
+def _read_arrays(path: Path, count: int) -> list[np.ndarray]:
+    try:
+        with _checkpointer() as checkpointer:
+            found = checkpointer.restore(path.absolute())
+        return [np.asarray(found[f"{index:04d}"]) for index in range(count)]
+    except Exception as error:
+        raise CheckpointError(f"{path} cannot be read ({error})") from error

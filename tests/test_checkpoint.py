@@ -1,0 +1,289 @@
+import dataclasses
+import errno
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from conftest import ROOT
+from test_trainer import SMALL
+
+from mjx_dher import HParams, checkpoint, cli, ddpg, run_folder, trainer
+from mjx_dher.checkpoint import CheckpointError
+from probes import PointMass
+
+CONFIG = dataclasses.replace(SMALL, total_steps=480)  # 4 epochs
+ENV = PointMass()
+
+
+@pytest.fixture(scope="module")
+def program():
+    program = trainer.make_train(ENV, CONFIG)
+    return program, trainer.compile_program(program, jax.random.key(0), HParams())
+
+
+def bits(state):
+    return [np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x).tobytes()
+            for x in jax.tree.leaves(state)]  # fmt: skip
+
+
+def train(program, folder=None, save_at=(), start=None):
+    """Metrics of each epoch, and the last state's bits."""
+    _, compiled = program
+    start = start or trainer.Start(compiled.init(jax.random.key(7), HParams()))
+    rows = []
+    for progress in trainer.run(ENV, CONFIG, compiled, start):
+        rows.append({name: float(value) for name, value in progress.metrics.items()} | {"steps": progress.env_steps})
+        if progress.epoch in save_at:
+            checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, keep=2)
+    return rows, bits(progress.state)
+
+
+@pytest.fixture(scope="module")
+def saved(program, tmp_path_factory):
+    """A run's folder with checkpoints of epochs 2 and 3, of four."""
+    folder = tmp_path_factory.mktemp("run")
+    return folder, *train(program, folder, save_at=(1, 2, 3))
+
+
+@pytest.fixture
+def copy(saved, tmp_path):
+    shutil.copytree(saved[0], tmp_path / "run")
+    return tmp_path / "run"
+
+
+def restore(folder, program):
+    return checkpoint.restore(folder, trainer.state_template(program[0]))
+
+
+def test_a_resumed_run_is_the_uninterrupted_one_to_the_bit(program, saved):
+    folder, rows, last = saved
+    found = restore(folder, program)
+    assert (found.path.name, found.epoch, found.refused) == ("epoch-000003", 3, ())
+    again, end = train(program, start=trainer.Start(found.state, found.epoch, found.wall_seconds))
+    assert again == rows[3:]
+    assert end == last
+    shutil.copytree(folder, elsewhere := folder.parent / "older")
+    shutil.rmtree(elsewhere / "checkpoints" / "epoch-000003")
+    found = restore(elsewhere, program)
+    again, end = train(program, start=trainer.Start(found.state, found.epoch, found.wall_seconds))
+    assert again == rows[2:]
+    assert end == last
+
+
+def test_time_goes_on_where_it_stopped(program, saved):
+    found = restore(saved[0], program)
+    _, compiled = program
+    (progress,) = trainer.run(ENV, CONFIG, compiled, trainer.Start(found.state, found.epoch, 1000.0))
+    assert 1000 < progress.wall_seconds < 1100
+    assert progress.epoch_seconds < 100
+
+
+def test_only_the_newest_are_kept_and_what_a_kill_has_left_goes(program, copy):
+    assert [path.name for path in run_folder.checkpoints(copy)] == ["epoch-000003", "epoch-000002"]
+    left = copy / "checkpoints" / ".partial-000009"
+    left.mkdir()
+    (left / "state").write_text("half")
+    checkpoint.save(copy, restore(copy, program).state, 4, 1.0, keep=1)
+    assert [path.name for path in (copy / "checkpoints").iterdir()] == ["epoch-000004"]
+
+
+def files(folder):
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_flipped_bit_is_never_restored_as_it_is(program, copy):
+    """Of any file, the manifest too: it is refused, or what was restored is right to the bit (a blank of the manifest)."""
+    newest, older = run_folder.checkpoints(copy)
+    right = bits(restore(copy, program).state)
+    shutil.rmtree(older)
+    rng = random.Random(0)
+    refused = 0
+    for _ in range(30):
+        path = rng.choice(files(newest))
+        whole = path.read_bytes()
+        if not whole:
+            continue
+        damaged = bytearray(whole)
+        damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            assert bits(restore(copy, program).state) == right
+        except CheckpointError:
+            refused += 1
+        path.write_bytes(whole)
+    assert refused > 15
+    assert bits(restore(copy, program).state) == right
+
+
+def cut(path):
+    biggest = max(files(path), key=lambda file: file.stat().st_size)
+    biggest.write_bytes(biggest.read_bytes()[:-1])
+
+
+def change_manifest(path, **changes):
+    content = json.loads((path / "manifest.json").read_text()) | changes
+    del content["sha256"]
+    digest = checkpoint._digest_of(content)
+    (path / "manifest.json").write_text(json.dumps({**content, "sha256": digest}))
+
+
+@pytest.mark.parametrize(
+    ("damage", "why"),
+    [
+        (cut, "is not as it was written"),
+        (lambda path: (path / "manifest.json").unlink(), "it has no manifest.json"),
+        (lambda path: (path / "manifest.json").write_text('{"schema": 1'), "manifest.json cannot be read"),
+        (lambda path: (path / "manifest.json").write_text("[]"), r"schema 1 \(found None\)"),
+        (lambda path: shutil.rmtree(path / "state"), "cannot be read"),
+        (lambda path: change_manifest(path, schema=0), r"schema 1 \(found 0\)"),
+        (lambda path: change_manifest(path, leaves=[]), "does not fit this run"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_by_name_and_the_one_before_it_is_used(program, copy, damage, why):
+    newest, older = run_folder.checkpoints(copy)
+    damage(newest)
+    found = restore(copy, program)
+    assert (found.path, found.epoch) == (older, 2)
+    shutil.rmtree(older)
+    with pytest.raises(CheckpointError, match=why):
+        restore(copy, program)
+
+
+@pytest.mark.parametrize(
+    ("config", "why"),
+    [
+        (dataclasses.replace(CONFIG, hidden_sizes=(16, 17)), r"float32\[16\] where .* float32\[17\] is needed"),
+        (dataclasses.replace(CONFIG, hidden_sizes=(16,)), "does not fit this run"),
+        (dataclasses.replace(CONFIG, replay_size=210), "where .* is needed"),
+    ],
+)
+def test_the_state_of_another_run_is_refused(saved, config, why):
+    other = trainer.make_train(ENV, config)
+    with pytest.raises(CheckpointError, match=why):
+        checkpoint.restore(saved[0], trainer.state_template(other))
+
+
+def test_another_dtype_is_refused(saved, program):
+    template = trainer.state_template(program[0])
+    template = dataclasses.replace(template, env_steps=jax.ShapeDtypeStruct((), "float32"))
+    with pytest.raises(CheckpointError, match=r"env_steps int32\[\] where .*env_steps float32\[\] is needed"):
+        checkpoint.restore(saved[0], template)
+
+
+def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch):
+    read = checkpoint._read_arrays
+    monkeypatch.setattr(checkpoint, "_read_arrays", lambda *args: [x.astype(np.float64) for x in read(*args)])
+    with pytest.raises(CheckpointError, match=r"was read as .* float64"):
+        restore(saved[0], program)
+
+
+def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeypatch):
+    state = restore(copy, program).state
+    write = checkpoint._write_arrays
+
+    def fill(path, arrays):
+        write(path, arrays[:3])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(checkpoint, "_write_arrays", fill)
+    with pytest.raises(CheckpointError, match=r"epoch-000004 \(.*No space left.*\); the last one is .*epoch-000003"):
+        checkpoint.save(copy, state, 4, 1.0, keep=1)
+    assert sorted(path.name for path in (copy / "checkpoints").iterdir()) == ["epoch-000002", "epoch-000003"]
+    assert restore(copy, program).epoch == 3
+
+
+# The command line, on the real thing.
+
+TINY = """
+    --env reach --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --replay-size 1000
+    --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4 --checkpoint-every 3
+""".split()  # noqa: SIM905
+TIMES = ("wall_seconds", "steps_per_second", "updates_per_second")
+
+
+def table(folder):
+    lines = [line.split(",") for line in (folder / "metrics.csv").read_text().splitlines()]
+    keep = [i for i, name in enumerate(lines[0]) if name not in TIMES]
+    return [[line[i] for i in keep] for line in lines]
+
+
+def start(*args):
+    return subprocess.Popen(
+        [sys.executable, "-u", "train.py", *map(str, args)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(condition, process):
+    deadline = time.time() + 200
+    while not condition() and process.poll() is None and time.time() < deadline:
+        time.sleep(0.02)
+
+
+def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
+    """SIGKILL after a checkpoint, then SIGTERM, then to the end: metrics and policy are those of a run in one go."""
+    steps = ["--total-steps", "8000"]
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    alone = start(*TINY, *steps, "--out", whole)
+    first = start(*TINY, *steps, "--out", out)
+    wait_for(lambda: (out / "checkpoints" / "epoch-000006").exists(), first)
+    busy = subprocess.run([sys.executable, "train.py", "resume", out], cwd=ROOT, capture_output=True, text=True, check=False)
+    first.kill()
+    first.communicate()
+    assert (busy.returncode, busy.stderr) == (2, f"error: {out} is being trained by another program\n")
+    epochs = len(table(out)) - 1
+    second = start("resume", out)
+    wait_for(lambda: len(table(out)) - 1 > epochs + 3, second)
+    second.send_signal(signal.SIGTERM)
+    stdout, stderr = second.communicate(timeout=100)
+    assert (second.returncode, stderr) == (128 + signal.SIGTERM, ""), stdout
+    newest = run_folder.checkpoints(out)[0]
+    assert f"saved {newest}" in stdout
+    assert f"`train.py resume {out}` goes on" in stdout
+    assert len(table(out)) - 1 == int(newest.name[-6:])
+    third = start("resume", out)
+    stdout, stderr = third.communicate(timeout=200)
+    assert (third.returncode, stderr) == (0, "")
+    assert f"going on from {newest}" in stdout
+    alone.communicate(timeout=200)
+    assert len(table(whole)) == 81
+    assert table(out) == table(whole)
+    for name, array in np.load(whole / "policy.npz").items():
+        np.testing.assert_array_equal(np.load(out / "policy.npz")[name], array)
+    results = [json.loads((path / "result.json").read_text()) for path in (out, whole)]
+    assert all(results[0][name] == results[1][name] for name in results[0] if name not in TIMES)
+    assert not (out / "checkpoints").exists()
+
+
+def refusal(capsys, *args):
+    assert cli.main([str(arg) for arg in args]) == 2
+    return capsys.readouterr().err
+
+
+def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
+    assert "no such folder" in refusal(capsys, "resume", tmp_path / "none")
+    run = run_folder.RunConfig(CONFIG, HParams(), 0, "native")
+    run_folder.create(tmp_path / "run", run, {})
+    assert "no checkpoint to go on from" in refusal(capsys, "resume", tmp_path / "run")
+    assert "engine must be" in refusal(capsys, "resume", tmp_path / "run", "--engine", "bullet")
+    assert "keep must be" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")
+    assert "checkpoint_every must be" in refusal(capsys, "resume", tmp_path / "run", "--checkpoint-every", "-1")
+    assert "checkpoint_every must be" in refusal(capsys, "--env", "push", "--checkpoint-every", "-1")
+    run_folder.write_json(tmp_path / "run" / "result.json", {})
+    assert "has ended" in refusal(capsys, "resume", tmp_path / "run")
+
+
+def test_networks_that_are_not_finite_stop_the_run_and_no_policy_is_written(tmp_path, capsys, monkeypatch):
+    init = ddpg.init
+    monkeypatch.setattr(ddpg, "init", lambda *args, **options: jax.tree.map(lambda x: x / 0, init(*args, **options)))
+    error = refusal(capsys, *TINY, "--total-steps", "300", "--out", tmp_path / "run")
+    assert "epoch 1: the networks or normalizers hold numbers that are not finite" in error
+    assert "there is no checkpoint" in error
+    assert not (tmp_path / "run" / "policy.npz").exists()
