@@ -89,7 +89,7 @@ class EvalArgs:
     seed: int = 1
     """Of the starts and goals."""
     engine: str | None = None
-    """Physics: native, jax or auto; the run's own unless given."""
+    """Physics: native, jax, warp or auto; the run's own unless given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +110,7 @@ class RenderArgs:
     seed: int = 1
     """Of the starts, the goals and the random actions."""
     engine: str | None = None
-    """Physics: native, jax or auto; the run's own unless given."""
+    """Physics: native, jax, warp or auto; the run's own unless given."""
     width: int = 640
     """Of a picture, pixels."""
     height: int = 480
@@ -136,6 +136,8 @@ class TransferArgs:
     """Make the originals' environment in the user's cache folder, if it is not there yet (a download of 200 MB)."""
     python: Path | None = None
     """The Python of an environment that has the original tasks; the one that --set-up makes unless given."""
+    engine: str | None = None
+    """Physics here: native, jax, warp or auto; the run's own unless given."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -176,8 +178,7 @@ def train_command(argv: list[str], console: Console) -> int:
 def resume_command(argv: list[str], console: Console) -> int:
     """`resume RUN`: goes on with a run that was stopped."""
     args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
-    if args.engine is not None:
-        config.check_name("engine", args.engine, config.ENGINES)
+    _check_engine(args.engine)
     run = run_folder.read_config(args.run)
     started = run_folder.read_extra(args.run)
     defaults = {field.name: field.default for field in dataclasses.fields(TrainArgs)}
@@ -191,6 +192,11 @@ def resume_command(argv: list[str], console: Console) -> int:
     keep_compiled_programs()
     env = envs.make(run.config.env, engine=args.engine or run.engine)
     return _Training(env, run, args.run, options, console)()
+
+
+def _check_engine(engine: str | None) -> None:
+    if engine is not None:
+        config.check_name("engine", engine, config.ENGINES)
 
 
 _OPTIONS = ("final_episodes", "checkpoint_every", "keep")
@@ -358,8 +364,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     """`eval RUN`: evaluates the policy of a run folder."""
     args = tyro.cli(EvalArgs, prog="train.py eval", args=argv)
     config.check_count("episodes", args.episodes)
-    if args.engine is not None:
-        config.check_name("engine", args.engine, config.ENGINES)
+    _check_engine(args.engine)
     run = run_folder.read_config(args.run)
     from mjx_dher.policy import load_policy
 
@@ -378,8 +383,7 @@ def render_command(argv: list[str], console: Console) -> int:
     args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     config.check_count("episodes", args.episodes)
-    if args.engine is not None:
-        config.check_name("engine", args.engine, config.ENGINES)
+    _check_engine(args.engine)
     if args.run is not None and args.env is None:
         from mjx_dher.policy import load_policy
 
@@ -414,6 +418,7 @@ def render_command(argv: list[str], console: Console) -> int:
 def transfer_command(argv: list[str], console: Console) -> int:
     """`transfer RUN`: plays the policy of a run folder in the original task."""
     args = tyro.cli(TransferArgs, prog="train.py transfer", args=argv)
+    _check_engine(args.engine)
     config.check_count("episodes", args.episodes)
     run = run_folder.read_config(args.run)
     from mjx_dher import originals
@@ -428,7 +433,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
         originals.set_up(environment)
     python = args.python or originals.interpreter(environment)
     name = originals.check(run.config.env, python)
-    env = envs.make(run.config.env, engine=run.config.engine)
+    env = envs.make(run.config.env, engine=args.engine or run.config.engine)
     console.print(f"{name}, {args.episodes} episodes ...")
     there = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
     report_there = report(there["success"], there["reset_success"], there["ret"], console)

