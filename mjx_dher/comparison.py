@@ -51,7 +51,8 @@ def _groups_of(env: str, cells: list[dict[str, Any]]) -> list[Group]:
         by_label.setdefault(label, (own, []))[1].append(cell)
     order = {name: number for number, name in enumerate(config_lib.SAMPLERS)}
     found = [_group(env, label, *rest) for label, rest in by_label.items()]
-    return sorted(found, key=lambda group: order.get(group.sampler, len(order)))
+    # Numbers in rising order; names of one setting are all strings.
+    return sorted(found, key=lambda group: (order.get(group.sampler, len(order)), list(group.others.values())))
 
 
 def _say(name: str, value: Any) -> str:

@@ -79,6 +79,12 @@ def test_labels_say_what_differs_and_the_baseline_shares_it():
     assert comparison._baseline_of(groups[3], groups, "episode") is None
 
 
+def test_numbers_are_in_rising_order():
+    cells = [cell("future", 0, SLOW[0], her_k=k) for k in (16.0, 2.0, 4.0)]
+    (groups,) = comparison.groups(cells).values()
+    assert [g.label for g in groups] == ["future, her_k 2", "future, her_k 4", "future, her_k 16"]
+
+
 def test_environments_are_compared_apart():
     found = comparison.groups([*CELLS, *(cell("future", i, c, env="slide") for i, c in enumerate(SLOW))])
     assert {env: [g.label for g in groups] for env, groups in found.items()} == {
