@@ -55,7 +55,11 @@ def main() -> None:
         low, high = stats.wilson_interval(int(outcome.success.sum()), len(outcome.success))
         reached = (f"{first.wall_seconds:.0f}", f"{first.env_steps:,}", f"{first.updates:,}") if first else ("never",) * 3
         total = (f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")
-        final = (f"{outcome.success.mean():.3f} ({low:.3f}-{high:.3f})", f"{outcome.reset_success.mean():.3f}")
+        final = (
+            f"{outcome.success.mean():.3f} ({low:.3f}-{high:.3f})",
+            f"{outcome.reset_success.mean():.3f}",
+            f"{outcome.ret.mean():.1f}",
+        )
         rows.append((seed, *reached, *total, *final))
         print(rows[-1], flush=True)
     if args.out:
@@ -69,6 +73,7 @@ def main() -> None:
         "env steps in all",
         "final success (95 %)",
         "at reset",
+        "mean return",
     )
     print_table(("seed", *head), rows)
     times = [float(row[1]) if row[1] != "never" else float("inf") for row in rows]
