@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import cli_sweep, config, envs, run_folder
+from mjx_dher import cli_sweep, config, envs, metrics, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -57,6 +58,8 @@ class TrainArgs:
     """Epochs between checkpoints, from which `resume` goes on; 0: only when the run is stopped (Ctrl-C, SIGTERM)."""
     keep: int = 2
     """Checkpoints to keep, the newest; they are deleted when the run has ended."""
+    log: tuple[str, ...] = ()
+    """Where the metrics go beside metrics.csv: jsonl, tensorboard, wandb."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +79,8 @@ class ResumeArgs:
     """Epochs between checkpoints, or 0; as the run was started with unless given."""
     keep: int | None = None
     """Checkpoints to keep; as the run was started with unless given."""
+    log: tuple[str, ...] | None = None
+    """Where the metrics go beside metrics.csv: jsonl, tensorboard, wandb; as the run was started with unless given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +185,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
     _check_engine(args.engine)
     run = run_folder.read_config(args.run)
-    started = run_folder.read_extra(args.run)
+    started = run_folder.read_content(args.run)
     defaults = {field.name: field.default for field in dataclasses.fields(TrainArgs)}
     options = {name: getattr(args, name) for name in _OPTIONS}
     options = {name: started.get(name, defaults[name]) if value is None else value for name, value in options.items()}
@@ -199,11 +204,12 @@ def _check_engine(engine: str | None) -> None:
         config.check_name("engine", engine, config.ENGINES)
 
 
-_OPTIONS = ("final_episodes", "checkpoint_every", "keep")
+_OPTIONS = ("final_episodes", "checkpoint_every", "keep", "log")
 
 
-def _check_options(final_episodes: int, checkpoint_every: int, keep: int) -> None:
+def _check_options(final_episodes: int, checkpoint_every: int, keep: int, log: Sequence[str]) -> None:
     """Raises ValueError where one of _OPTIONS cannot be used."""
+    metrics.check(log)
     config.check_count("final_episodes", final_episodes)
     config.check_count("keep", keep)
     if checkpoint_every < 0:
@@ -228,7 +234,7 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     checks = (
         lambda: config.check_name("env", args.config.env, envs.list_envs()),
         lambda: config.validate(args.config, args.hparams),
-        lambda: _check_options(args.final_episodes, args.checkpoint_every, args.keep),
+        lambda: _check_options(**{name: getattr(args, name) for name in _OPTIONS}),
     )
     problems = [problem for problem in map(_problem, checks) if problem]
     if problems:
@@ -316,7 +322,12 @@ class _Training:
                         f" was stopped (smaller actor_lr and critic_lr may help); {self._last()}"
                     )
                 if not sinks:
-                    sinks = self._open_sinks(progress.num_epochs, start.epoch if start else 0)
+                    ended = start.epoch if start else 0
+                    steps = ended * (progress.env_steps // progress.epoch)
+                    sinks = [
+                        *metrics.open_sinks(self.folder, self.options["log"], ended, steps),
+                        metrics.ConsoleSink(self.console, progress.num_epochs),
+                    ]
                 learned = policy.from_learner(progress.state.learner, run.hparams)
                 learned.save(self.folder / run_folder.POLICY_FILE)
                 for sink in sinks:
@@ -338,11 +349,6 @@ class _Training:
         """What is left, for an error."""
         found = run_folder.checkpoints(self.folder)
         return f"`train.py resume {self.folder}` goes on from {found[0]}" if found else "there is no checkpoint"
-
-    def _open_sinks(self, num_epochs: int, epochs: int) -> list[Sink]:
-        from mjx_dher.metrics import ConsoleSink, CsvSink
-
-        return [CsvSink(self.folder / run_folder.METRICS_FILE, epochs), ConsoleSink(self.console, num_epochs)]
 
     def _on_compile(self, seconds: float | None) -> None:
         if seconds is None:
@@ -504,19 +510,22 @@ def keep_compiled_programs() -> None:
 
 def _row(progress: Progress) -> dict[str, Any]:
     """What the sinks take, in the order of metrics.csv."""
+    from mjx_dher import memory
+
     steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
-    metrics = dict(progress.metrics)
+    found = dict(progress.metrics)
     return {
         "epoch": progress.epoch,
         "env_steps": progress.env_steps,
         "updates": progress.updates,
         "wall_seconds": progress.wall_seconds,
-        "success_rate": metrics.pop("success_rate"),
-        "return_mean": metrics.pop("return_mean"),
-        "reset_success_rate": metrics.pop("reset_success_rate"),
-        **metrics,
+        "success_rate": found.pop("success_rate"),
+        "return_mean": found.pop("return_mean"),
+        "reset_success_rate": found.pop("reset_success_rate"),
+        **found,
         "steps_per_second": steps / progress.epoch_seconds,
         "updates_per_second": updates / progress.epoch_seconds,
+        "memory_bytes": memory.used_bytes() or math.nan,
     }
 
 

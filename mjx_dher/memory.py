@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import jax
@@ -18,6 +19,18 @@ def available_bytes() -> int | None:
         return stats["bytes_limit"] - stats["bytes_in_use"] if stats and "bytes_limit" in stats else None
     found = [amount for amount in (_meminfo_available(), _container_available()) if amount is not None]
     return min(found, default=None)
+
+
+def used_bytes() -> int | None:
+    """Bytes that the default device holds for JAX; on a CPU, that this program holds (Linux only). None where unknown."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        stats = device.memory_stats()
+        return stats["bytes_in_use"] if stats else None
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return None
 
 
 def format_bytes(amount: float) -> str:

@@ -1,18 +1,27 @@
-"""Where a run's numbers go: the screen and a CSV file."""
+"""Where a run's numbers go: the screen, a CSV file, and, where asked for, JSON lines, TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
+import importlib.util
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
-from mjx_dher.run_folder import RunFolderError, whole
+from mjx_dher.config import check_name
+from mjx_dher.run_folder import METRICS_FILE, RunFolderError, read_content, whole
 
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
-FIRST_COLUMNS = ("epoch", "env_steps", "updates", "wall_seconds", "success_rate", "return_mean")
+COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
+FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
+LOGS = ("jsonl", "tensorboard", "wandb")
 
 
 class Sink(Protocol):
@@ -36,17 +45,12 @@ class CsvSink:
 
     def __init__(self, path: Path, epochs: int = 0):
         self._writer: csv.DictWriter[str] | None = None
-        if epochs == 0:
-            self._file = path.open("w", newline="")
-            return
-        lines = path.read_bytes().decode().splitlines(keepends=True) if path.exists() else []
-        kept = lines[: 1 + epochs]
-        if [line.split(",")[0] for line in kept] != ["epoch", *map(str, range(1, 1 + epochs))] or not kept[-1].endswith("\n"):
+        kept = _keep_lines(path, 1 + epochs if epochs else 0)
+        if kept and [line.split(",")[0] for line in kept] != ["epoch", *map(str, range(1, 1 + epochs))]:
             raise RunFolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
-        with whole(path) as partial:
-            partial.write_bytes("".join(kept).encode())
         self._file = path.open("a", newline="")
-        self._writer = csv.DictWriter(self._file, kept[0].strip().split(","))
+        if kept:
+            self._writer = csv.DictWriter(self._file, kept[0].strip().split(","))
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:
@@ -58,6 +62,103 @@ class CsvSink:
 
     def close(self) -> None:
         self._file.close()
+
+
+class JsonlSink:
+    """metrics.jsonl: an object a line, an epoch each; numbers that are not finite are null. See `CsvSink`."""
+
+    def __init__(self, path: Path, epochs: int = 0):
+        _keep_lines(path, epochs)
+        self._file = path.open("a")
+
+    def write(self, row: dict[str, Any]) -> None:
+        self._file.write(json.dumps({name: v if math.isfinite(v) else None for name, v in row.items()}) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _keep_lines(path: Path, count: int) -> list[str]:
+    """Cuts a file after `count` lines, or makes it, and returns them."""
+    lines = path.read_bytes().decode().splitlines(keepends=True)[:count] if count and path.exists() else []
+    if len(lines) < count or not all(line.endswith("\n") for line in lines):
+        raise RunFolderError(f"{path} is damaged: it has {len(lines)} whole lines, not {count}")
+    with whole(path) as partial:
+        partial.write_bytes("".join(lines).encode())
+    return lines
+
+
+class TensorBoardSink:
+    """An event file for TensorBoard in `path`, over environment steps. Extra `tensorboard`."""
+
+    def __init__(self, path: Path, env_steps: int = 0):
+        from tensorboardX import SummaryWriter
+
+        self._writer = SummaryWriter(str(path), purge_step=env_steps + 1 if env_steps else None)
+
+    def write(self, row: dict[str, Any]) -> None:
+        for name, value in row.items():
+            if name not in COUNTS:
+                self._writer.add_scalar(name, value, row["env_steps"])
+        self._writer.flush()
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class WandbSink:
+    """A run of Weights & Biases, whose own variables rule it (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
+
+    Args:
+      folder: of the run; what is logged offline is kept in it, and a resumed run goes on with the same one.
+      content: of config.json.
+    """
+
+    def __init__(self, folder: Path, content: dict[str, Any]):
+        import wandb
+
+        identity = hashlib.sha256(json.dumps([folder.absolute().name, content], sort_keys=True).encode()).hexdigest()[:16]
+        self._run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
+            name=folder.absolute().name,
+            id=identity,
+            resume="allow",
+            dir=folder,
+            config={**content["config"], **content["hparams"], "seed": content["seed"], "engine": content["engine"]},
+            settings=wandb.Settings(silent=True),
+        )
+
+    def write(self, row: dict[str, Any]) -> None:
+        self._run.log(row, step=row["epoch"], commit=True)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # of LOGS, and the package that each needs
+
+
+def check(logs: Sequence[str]) -> None:
+    """Refuses names that are not in LOGS, and those whose packages are missing.
+
+    Raises:
+      ValueError: names the log, and the extra to install.
+    """
+    for log in logs:
+        check_name("log", log, LOGS)
+        if log in EXTRAS and importlib.util.find_spec(EXTRAS[log]) is None:
+            raise ValueError(f'log {log} needs {EXTRAS[log]}, which is not installed: pip install -e ".[{log}]"')
+
+
+def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0) -> list[Sink]:
+    """metrics.csv, and `logs`, of the run in `folder`, of which so many epochs and environment steps had ended."""
+    makers: dict[str, Callable[[], Sink]] = {
+        "jsonl": lambda: JsonlSink(folder / "metrics.jsonl", epochs),
+        "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
+        "wandb": lambda: WandbSink(folder, read_content(folder)),
+    }
+    return [CsvSink(folder / METRICS_FILE, epochs), *(makers[log]() for log in dict.fromkeys(logs))]
 
 
 class ConsoleSink:

@@ -128,8 +128,8 @@ def checkpoints(path: Path) -> list[Path]:
     return sorted((path / CHECKPOINTS).glob("epoch-*"), reverse=True)
 
 
-def read_extra(path: Path) -> dict[str, Any]:
-    """All of config.json; see `read_config`, which checks it."""
+def read_content(path: Path) -> dict[str, Any]:
+    """All of config.json; `read_config` checks it."""
     return json.loads((path / CONFIG_FILE).read_text())
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from mjx_dher import config as config_lib
@@ -59,7 +60,9 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
     and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
     evaluation; train_success_rate and train_return_mean of the exploring policy, and the eventful_share of its episodes;
-    critic_loss, actor_loss and q_mean; discarded_episodes, of which the physics blew up and which were not learned from.
+    of the transitions in them, the relabelled_share and, over these, relabel_distance, the mean Euclidean distance from the
+    episode's goal to the hindsight goal; critic_loss, actor_loss and q_mean; actor_norm and critic_norm, the Euclidean norms of
+    all parameters at the end; discarded_episodes, of which the physics blew up and which were not learned from.
 
     Raises:
       ValueError: a Config that cannot run, or an observation that is not one vector.
@@ -91,14 +94,15 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
             env_steps=jnp.zeros((), jnp.int32),
         )
 
-    def see(learner: DDPGState, episodes: Episode, valid: Array, hparams: HParams, key: PRNGKey) -> DDPGState:
+    def see(learner: DDPGState, episodes: Episode, valid: Array, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Metrics]:
         """Shows the new episodes to the normalizers, with goals distributed as the learner will meet them."""
         num_new, num_steps = episodes.action.shape[:2]
         fresh = replay.add(replay.init(template, num_new), episodes, valid=valid)
         sample_key, relabel_key = jax.random.split(key)
         sample = replay.sample(fresh, sample_key, num_new * num_steps)
         batch = relabel(fresh, sample, chosen, env.compute_reward, hparams, relabel_key)
-        return ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
+        learner = ddpg.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
+        return learner, _moved(sample.desired_goal, batch.desired_goal)
 
     def learn(learner: DDPGState, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[DDPGState, Losses]:
         counts = replay.count_eventful(ring)
@@ -131,7 +135,7 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise)
         eventful = is_eventful(episodes, env.compute_reward)
         ring = replay.add(state.replay, episodes, eventful, outcome.valid)
-        learner = see(state.learner, episodes, outcome.valid, hparams, see_key)
+        learner, seen = see(state.learner, episodes, outcome.valid, hparams, see_key)
         learned, losses = learn(learner, ring, hparams, learn_key)
         # No episode yet: nothing was learned.
         learner = jax.tree.map(lambda new, old: jnp.where(replay.can_sample(ring), new, old), learned, learner)
@@ -140,6 +144,7 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
             "train_return_mean": evaluate.return_mean(outcome),
             "discarded_episodes": jnp.sum(~outcome.valid),
             "eventful_share": jnp.mean(eventful),
+            **seen,
             **losses._asdict(),
         }
         state = TrainState(
@@ -156,10 +161,25 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         key, eval_key = jax.random.split(state.key)
         discarded = jnp.sum(cycles.pop("discarded_episodes"))
         found = evaluate_state(env, networks, state, eval_key, config.eval_episodes)
-        metrics = found | jax.tree.map(jnp.mean, cycles) | {"discarded_episodes": discarded}
+        metrics = found | jax.tree.map(jnp.mean, cycles) | _norms(state.learner) | {"discarded_episodes": discarded}
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def _moved(goal: Array, hindsight: Array) -> Metrics:
+    """The share of goals [B, G] that were replaced, and how far away, in the mean, those are that took their place."""
+    distance = jnp.linalg.norm(hindsight - goal, axis=-1)
+    replaced = distance > 0
+    return {
+        "relabelled_share": jnp.mean(replaced),
+        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1),
+    }
+
+
+def _norms(learner: DDPGState) -> Metrics:
+    params = learner.params
+    return {"actor_norm": optax.tree.norm(params.actor), "critic_norm": optax.tree.norm(params.critic)}
 
 
 def evaluate_state(env: Env, networks: Networks, state: TrainState, key: PRNGKey, num_episodes: int) -> Metrics:

@@ -206,7 +206,7 @@ TINY = """
     --env reach --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --replay-size 1000
     --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4 --checkpoint-every 3
 """.split()  # noqa: SIM905
-TIMES = ("wall_seconds", "steps_per_second", "updates_per_second")
+TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
 
 
 def table(folder):

@@ -95,8 +95,13 @@ def test_an_epoch_counts_what_it_does():
     assert state.learner.goal_norm.count == 4 * 3 * 10
     assert set(metrics) == {
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "eventful_share"),
-        *("critic_loss", "actor_loss", "q_mean", "discarded_episodes"),
+        *("relabelled_share", "relabel_distance", "critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"),
+        "discarded_episodes",
     }
+    squares = sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(state.learner.params.actor))
+    assert float(metrics["actor_norm"]) == pytest.approx(float(squares) ** 0.5, rel=1e-5)
+    # Of 120 transitions, each with probability 0.8: 0.8 within four standard deviations.
+    assert abs(metrics["relabelled_share"] - 0.8) < 4 * (0.16 / 120) ** 0.5
     assert metrics["discarded_episodes"] == 0
     assert all(value.shape == () and jnp.isfinite(value) for value in metrics.values())
 

@@ -1,0 +1,125 @@
+import csv
+import json
+import math
+import struct
+
+import jax.numpy as jnp
+import pytest
+
+from mjx_dher import Config, HParams, memory, metrics, run_folder, trainer
+
+
+def row(epoch, **more):
+    counts = {"epoch": epoch, "env_steps": 100 * epoch, "updates": 2 * epoch, "wall_seconds": 0.5 * epoch}
+    return {**counts, "success_rate": epoch / 10, "return_mean": -50.0 + epoch, "q_mean": math.nan, **more}
+
+
+def write(sink, epochs):
+    for epoch in epochs:
+        sink.write(row(epoch))
+    sink.close()
+
+
+def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
+    path = tmp_path / "metrics.csv"
+    write(metrics.CsvSink(path), [1, 2, 3, 4])
+    in_one_go = path.read_bytes()
+    write(metrics.CsvSink(path, epochs=2), [3, 4])
+    assert path.read_bytes() == in_one_go
+    with path.open() as file:
+        assert [r["epoch"] for r in csv.DictReader(file)] == ["1", "2", "3", "4"]
+
+
+@pytest.mark.parametrize("damage", [lambda b: b[:-20], lambda b: b.replace(b"\n2,", b"\n7,"), lambda b: b""])
+def test_csv_without_the_epochs_that_had_ended_is_refused(tmp_path, damage):
+    path = tmp_path / "metrics.csv"
+    write(metrics.CsvSink(path), [1, 2, 3])
+    path.write_bytes(damaged := damage(path.read_bytes()))
+    with pytest.raises(run_folder.RunFolderError, match=r"metrics.csv is damaged"):
+        metrics.CsvSink(path, epochs=3)
+    assert path.read_bytes() == damaged
+
+
+def test_jsonl_has_an_object_a_line_and_goes_on(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    write(metrics.JsonlSink(path), [1, 2, 3])
+    write(metrics.JsonlSink(path, epochs=2), [3, 4])
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    assert found == [row(epoch, q_mean=None) for epoch in (1, 2, 3, 4)]
+
+
+def events(folder):
+    """(step, name, value) of every scalar; a record is its length, a checksum, an Event and a checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    found = []
+    for path in sorted(folder.iterdir()):
+        content, at = path.read_bytes(), 0
+        while at < len(content):
+            (size,) = struct.unpack("<Q", content[at : at + 8])
+            event = Event.FromString(content[at + 12 : at + 12 + size])
+            found += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
+            at += 16 + size
+    return found
+
+
+def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
+    write(metrics.TensorBoardSink(tmp_path / "tb"), [1, 2])
+    found = events(tmp_path / "tb")
+    assert (200, "success_rate", pytest.approx(0.2)) in found
+    assert (100, "return_mean", -49.0) in found
+    assert {name for _, name, _ in found} == set(row(1)) - set(metrics.COUNTS)
+
+
+def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    run_folder.create(tmp_path / "run", run_folder.RunConfig(Config(), HParams(), 3, "native"), {})
+    sink = metrics.open_sinks(tmp_path / "run", ["wandb"])[1]
+    run = sink._run
+    sink.write(row(1))
+    sink.write(row(2))
+    assert run.summary["success_rate"] == 0.2
+    sink.close()
+    assert (run.config["seed"], run.config["gamma"], run.config["env"]) == (3, HParams().gamma, "push")
+    (kept,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
+    assert kept.name.endswith(run.id)
+    assert any(kept.glob("*.wandb"))
+    again = metrics.open_sinks(tmp_path / "run", ["wandb"])[1]
+    assert again._run.id == run.id
+    again.close()
+
+
+def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
+    with pytest.raises(ValueError, match=r"log must be one of jsonl, tensorboard, wandb; got 'tensorbord' \(did you mean"):
+        metrics.check(["jsonl", "tensorbord"])
+    monkeypatch.setitem(metrics.EXTRAS, "wandb", "no_such_package")
+    with pytest.raises(ValueError, match=r'log wandb needs no_such_package, .*pip install -e "\.\[wandb\]"'):
+        metrics.check(["wandb"])
+    metrics.check(["jsonl"])
+
+
+def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):
+    sinks = metrics.open_sinks(tmp_path, ["jsonl", "jsonl"])
+    assert [type(sink) for sink in sinks] == [metrics.CsvSink, metrics.JsonlSink]
+
+
+def test_what_was_relabelled_by_hand():
+    goal = jnp.zeros((4, 2))
+    hindsight = jnp.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
+    found = trainer._moved(goal, hindsight)
+    assert found == {"relabelled_share": 0.5, "relabel_distance": 3.0}
+    assert trainer._moved(goal, goal) == {"relabelled_share": 0.0, "relabel_distance": 0.0}
+
+
+def test_memory_in_use_is_known_and_plausible():
+    assert 10**7 < memory.used_bytes() < 10**12
+
+
+def test_every_metric_is_documented():
+    from test_trainer import ENV, SMALL
+
+    program = trainer.make_train(ENV, SMALL)
+    found = trainer.jax.eval_shape(lambda state: program.epoch(state)[1], trainer.state_template(program))
+    text = (run_folder.Path(__file__).parent.parent / "docs" / "logs.md").read_text()
+    for name in (*metrics.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
+        assert f"| `{name}` |" in text, name
