@@ -12,7 +12,7 @@ import importlib.util
 import math
 import sys
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ENGINES = ("auto", "native", "jax", "warp")
 SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
@@ -127,8 +127,12 @@ def check_count(field: str, value: int) -> None:
     Raises:
       ValueError: less than 1.
     """
-    if value < 1:
+    if not _is_count(value):
         raise ValueError(f"{field} must be an integer of at least 1; got {value}")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def preset(name: str, env: str) -> tuple[Config, HParams]:
@@ -238,11 +242,11 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
     wrong = False
     for field in (*positive, "replay_size", "eval_episodes"):
         value = getattr(c, field)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        if not _is_count(value):
             wrong = True
             yield f"{field} must be an integer of at least 1; got {value!r}"
     sizes = c.hidden_sizes
-    if not (isinstance(sizes, tuple) and sizes and all(isinstance(n, int) and n >= 1 for n in sizes)):
+    if not (isinstance(sizes, tuple) and sizes and all(map(_is_count, sizes))):
         yield f"hidden_sizes must be one or more integers of at least 1; got {sizes!r}"
     if wrong:
         return
@@ -296,8 +300,11 @@ _HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
 def _hparam_problems(hparams: HParams) -> Iterable[str]:
     for field, (least, least_too, greatest, greatest_too) in _HPARAM_RANGES.items():
         value = getattr(hparams, field)
-        if not isinstance(value, (int, float)):
+        if hasattr(value, "dtype"):
             continue  # an array: one value a seed, made by a program
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            yield f"{field} must be a number; got {value!r}"
+            continue
         above = value >= least if least_too else value > least
         below = value <= greatest if greatest_too else value < greatest
         if not (above and below):

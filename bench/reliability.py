@@ -1,0 +1,281 @@
+"""What survives? Kills, stops, a full disk, damage and a second program, on short runs of the real command.
+
+    python bench/reliability.py [--parts kills stops flips damage disk twice] [--kills 200] [--stops 20] [--flips 200]
+
+Every state that is restored is compared, by the SHA-256 of all its leaves, with that of a run that nothing happened to. A line
+a part; exits with 1 where something was restored that is not right to the bit, more than one interval between checkpoints was
+lost, or a refusal was not an error with a name. docs/reliability.md has the results.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+from timing import print_table
+
+from mjx_dher import Config, HParams, checkpoint, envs, run_folder, trainer
+
+ROOT = Path(__file__).parent.parent
+# A ring that takes a tenth of a second to save, so that kills meet saves.
+SHAPES = {
+    "num_envs": 2,
+    "cycles_per_epoch": 1,
+    "updates_per_cycle": 2,
+    "target_period": 1,
+    "batch_size": 16,
+    "hidden_sizes": (8, 8),
+    "replay_size": 50_000,
+    "eval_episodes": 2,
+}
+EPOCHS = 400
+INTERVAL = 2  # epochs between checkpoints
+PARTS = ("kills", "stops", "flips", "damage", "disk", "twice")
+
+
+class Failure(Exception):
+    """Something was not as it must be."""
+
+
+def expect(condition, what):
+    if not condition:
+        raise Failure(what)
+
+
+class Runs:
+    """Runs of one setting, and what their states must be."""
+
+    def __init__(self, env_name, folder):
+        env = envs.make(env_name)
+        self.folder = Path(folder)
+        total_steps = EPOCHS * SHAPES["num_envs"] * env.episode_length
+        self.config = Config(env=env_name, total_steps=total_steps, **SHAPES)
+        self.program = trainer.make_train(env, self.config)
+        compiled = trainer.compile_program(self.program, jax.random.key(0), HParams())
+        state = compiled.init(jax.random.key(0), HParams())
+        self.right = [digest(state)]  # after each epoch
+        for progress in trainer.run(env, self.config, compiled, trainer.Start(state)):
+            self.right.append(digest(progress.state))
+        self.template = trainer.state_template(self.program)
+
+    def start(self, out, limit=None):
+        """The command, training into `out` or resuming what is there; `limit`, kB that a file can have."""
+        if run_folder.checkpoints(out):
+            command = ["resume", out]
+        else:
+            shutil.rmtree(out, ignore_errors=True)
+            options = dataclasses.asdict(self.config)
+            command = ["--preset", "cpu", "--out", out, "--checkpoint-every", INTERVAL, "--final-episodes", "2"]
+            for name in ("env", "total_steps", *SHAPES):
+                value = options[name] if isinstance(options[name], tuple) else (options[name],)
+                command += ["--" + name.replace("_", "-"), *value]
+            numbers = HParams()._asdict()
+            command += [str(x) for name, value in numbers.items() for x in ("--" + name.replace("_", "-"), value)]
+        command = [sys.executable, "-u", "train.py", *map(str, command)]
+        if limit is not None:
+            command = ["bash", "-c", f'ulimit -f {limit}; exec "$@"', "bash", *command]
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def check(self, out):
+        """The epoch that is restored from `out`; 0 where there is no checkpoint."""
+        lines = (out / "metrics.csv").read_text().splitlines() if (out / "metrics.csv").exists() else []
+        done = max(0, len([line for line in lines if line]) - 1)
+        if not run_folder.checkpoints(out):
+            expect(done <= INTERVAL, f"{done} epochs without a checkpoint")
+            return 0
+        found = checkpoint.restore(out, self.template)
+        expect(not found.refused, f"a checkpoint is not whole: {found.refused}")
+        expect(digest(found.state) == self.right[found.epoch], f"the state of epoch {found.epoch} is another")
+        # The line of an epoch is written before its checkpoint, and may be cut by the kill.
+        expect(done - found.epoch <= INTERVAL, f"epochs {found.epoch} to {done} are lost")
+        return found.epoch
+
+
+def digest(state):
+    found = hashlib.sha256()
+    for array in checkpoint._to_arrays(state).values():
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def kills(runs, count, rng):
+    """SIGKILL at random moments, the run resumed each time."""
+    out = runs.folder / "kills"
+    inside, lost, ended = 0, [], 0
+    for _ in range(count):
+        process = runs.start(out)
+        before = {path.name for path in run_folder.checkpoints(out)}
+        deadline = time.monotonic() + 120
+        while process.poll() is None and time.monotonic() < deadline:  # until it works
+            if {path.name for path in run_folder.checkpoints(out)} - before:
+                break
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.6))
+        process.kill()
+        process.communicate()
+        if (out / run_folder.RESULT_FILE).exists():
+            ended += 1
+            shutil.rmtree(out)
+            continue
+        inside += any((out / run_folder.CHECKPOINTS).glob(".partial-*"))
+        lines = (out / "metrics.csv").read_text().splitlines()
+        lost.append(max(0, len(lines) - 1 - runs.check(out)))
+    return f"{count} SIGKILLs, {inside} of them inside a save; {ended} runs had ended", f"at most {max(lost)} epochs lost"
+
+
+def stops(runs, count, rng):
+    """SIGTERM and SIGINT at random moments."""
+    out, seconds = runs.folder / "stops", []
+    for number in range(count):
+        process = runs.start(out)
+        before = len(run_folder.checkpoints(out)) and runs.check(out)
+        while process.poll() is None and not (out / "metrics.csv").exists():
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 6))
+        sent = signal.SIGTERM if number % 2 else signal.SIGINT
+        process.send_signal(sent)
+        started = time.monotonic()
+        stdout, stderr = process.communicate()
+        seconds.append(time.monotonic() - started)
+        if process.returncode == 0:
+            shutil.rmtree(out)
+            continue
+        expect(process.returncode == 128 + sent, f"exit status {process.returncode}: {stdout}{stderr}")
+        expect(f"saved {run_folder.checkpoints(out)[0]}" in stdout, f"it does not say where: {stdout}")
+        lines = len((out / "metrics.csv").read_text().splitlines()) - 1
+        expect(runs.check(out) == lines >= before, "what was done is not what was saved")
+    return f"{count} SIGTERMs and SIGINTs", f"nothing lost; {max(seconds):.1f} s at most to save and end"
+
+
+def saved(runs, name):
+    """A folder with two checkpoints of a run that was stopped."""
+    out = runs.folder / name
+    process = runs.start(out)
+    while process.poll() is None and len(run_folder.checkpoints(out)) < 2:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    process.communicate()
+    return out
+
+
+def flips(runs, count, rng):
+    """One bit at a time, anywhere in the newest checkpoint, which is the only one."""
+    out = saved(runs, "flips")
+    newest, *older = run_folder.checkpoints(out)
+    for path in older:
+        shutil.rmtree(path)
+    files = [path for path in sorted(newest.rglob("*")) if path.is_file() and path.stat().st_size]
+    refused = harmless = 0
+    for _ in range(count):
+        path = rng.choice(files)
+        whole = path.read_bytes()
+        damaged = bytearray(whole)
+        damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            found = checkpoint.restore(out, runs.template)
+            expect(digest(found.state) == runs.right[found.epoch], f"restored silently wrong: {path}")
+            harmless += 1
+        except checkpoint.CheckpointError:
+            refused += 1
+        path.write_bytes(whole)
+    return f"{count} flipped bits in {len(files)} files", f"{refused} refused, {harmless} restored right, 0 wrong"
+
+
+def damage(runs, count, rng):
+    """Every file of a checkpoint cut short, emptied and removed; another schema; nothing left."""
+    out = saved(runs, "damage")
+    newest, older = run_folder.checkpoints(out)
+    expected = int(older.name[-6:])
+    tried = 0
+    for path in [path for path in sorted(newest.rglob("*")) if path.is_file()]:
+        whole = path.read_bytes()
+        for harm in (lambda p, b: p.write_bytes(b[: len(b) // 2]), lambda p, b: p.write_bytes(b""), lambda p, b: p.unlink()):
+            if len(whole) == 0 and path.exists():
+                continue  # cutting an empty file changes nothing
+            harm(path, whole)
+            found = checkpoint.restore(out, runs.template)
+            expect((found.epoch, len(found.refused)) == (expected, 1), f"{path}: epoch {found.epoch}, {found.refused}")
+            expect(digest(found.state) == runs.right[found.epoch], "the older one is another")
+            path.write_bytes(whole)
+            tried += 1
+    manifest = newest / checkpoint.MANIFEST
+    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 0'))
+    expect("schema" in checkpoint.restore(out, runs.template).refused[0], "an older schema is not named")
+    shutil.rmtree(older)
+    process = runs.start(out)
+    _, stderr = process.communicate()
+    expect(process.returncode == 2 and stderr.startswith(f"error: {out} has no checkpoint"), stderr)
+    return f"{tried} files cut, emptied or removed; another schema", "each refused by name, and the checkpoint before it used"
+
+
+def disk(runs, count, rng):
+    """Files cannot grow beyond so many kB, too few for a checkpoint, as on a full disk."""
+    out = saved(runs, "disk")
+    before = runs.check(out)
+    for limit in (16, 4, 1):
+        process = runs.start(out, limit)
+        _, stderr = process.communicate()
+        last = stderr.splitlines()[-1]  # orbax may have printed more before
+        named = last.startswith("error: cannot write the checkpoint") or (
+            "cannot be written to" in last and "goes on from" in last
+        )
+        expect(process.returncode == 2 and named, f"{limit}: {process.returncode} {stderr}")
+        expect(runs.check(out) >= before, "a checkpoint is gone")
+    return "files limited to 16, 4 and 1 kB", "a named error each; the checkpoints stay whole"
+
+
+def twice(runs, count, rng):
+    """A second program on the folder of the first."""
+    out = runs.folder / "twice"
+    first = runs.start(out)
+    while first.poll() is None and not run_folder.checkpoints(out):
+        time.sleep(0.01)
+    second = runs.start(out)
+    _, stderr = second.communicate()
+    expect(second.returncode == 2 and "is being trained by another program" in stderr, stderr)
+    first.kill()
+    first.communicate()
+    runs.check(out)
+    return "a second program on the folder", "refused by name; the first goes on"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--stops", type=int, default=20)
+    parser.add_argument("--flips", type=int, default=200)
+    parser.add_argument("--env", default="reach")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
+    rows, failed = [], False
+    with tempfile.TemporaryDirectory() as folder:
+        runs = Runs(args.env, folder)
+        for name in args.parts:
+            try:
+                rows.append((name, *parts[name](runs, getattr(args, name, 0), random.Random(args.seed)), "yes"))
+            except Failure as failure:
+                failed = True
+                print(failure, file=sys.stderr)
+                rows.append((name, "", str(failure)[:80], "NO"))
+            print(json.dumps(rows[-1]), flush=True)
+    print_table(("part", "what was done", "what came of it", "as it must be"), rows)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
