@@ -166,6 +166,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             print(f"error: {line}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:  # outside of training, which ends in order
+        print("stopped", file=sys.stderr)
+        return 128 + signal.SIGINT
 
 
 def train_command(argv: list[str], console: Console) -> int:
