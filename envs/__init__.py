@@ -1,12 +1,13 @@
-"""Goal-conditioned environments: `make` one by name, `register` your own, `list_envs`."""
+"""Goal-conditioned environments: `make` one by its name, or your own as "module:attribute"; `register`, `list_envs`."""
 
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.config import check_name
+from mjx_dher.config import check_name, load_own
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State
@@ -23,7 +24,7 @@ _REGISTRY: dict[str, Callable[..., Any] | str] = {
 
 
 def list_envs() -> tuple[str, ...]:
-    """The names that `make` takes."""
+    """The names that `make` takes, beside "module:attribute"."""
     return tuple(sorted(_REGISTRY))
 
 
@@ -32,7 +33,8 @@ def register(name: str, constructor: Callable[..., Any] | str) -> None:
 
     Args:
       name: how it will be called.
-      constructor: called with the keyword arguments of `make`, it returns a `GoalEnv`; or "module:attribute" naming one.
+      constructor: called with the keyword arguments of `make`, it returns a `GoalEnv`, or whatever fits `types.Env`; or
+        "module:attribute" naming one.
 
     Raises:
       ValueError: the name is taken, or `constructor` is neither of the two.
@@ -48,19 +50,40 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
     """The environment called `name`.
 
     Args:
-      name: one of `list_envs()`.
-      engine: "native" (MuJoCo C on the host's cores), "jax" (MJX) or "auto" (native on CPU, else jax).
+      name: one of `list_envs()`, or "module:attribute" of a class, or function, that makes one.
+      engine: "native" (MuJoCo C on the host's cores), "warp" (MuJoCo Warp on an NVIDIA GPU), "jax" (MJX) or "auto" (native on
+        a CPU, warp on an NVIDIA GPU, else jax). A constructor that takes no `engine` is called without it.
       **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`.
 
     Raises:
-      ValueError: no such environment or engine (the message names the nearest), or an argument out of range.
+      ValueError: no such environment, module, attribute or engine (the message names the nearest), an argument out of range,
+        an engine for what takes none, or something that is no environment.
     """
-    check_name("env", name, list_envs())
-    constructor = _REGISTRY[name]
+    check_name("env", name, list_envs(), own=True)
+    constructor = _REGISTRY.get(name, name)
     if isinstance(constructor, str):
-        module, attribute = constructor.split(":")
-        constructor = getattr(importlib.import_module(module), attribute)
-    return constructor(engine=engine, **overrides)
+        constructor = load_own("env", constructor)
+    if not callable(constructor):
+        raise ValueError(f"env {name!r} must be a class or function that makes an environment; it is {constructor!r}")
+    if _takes_engine(constructor):
+        overrides["engine"] = engine
+    elif engine != "auto":
+        raise ValueError(f"env {name!r} has no engine to choose; got {engine!r}")
+    env = constructor(**overrides)
+    missing = [member for member in _MEMBERS if not hasattr(env, member)]
+    if missing:
+        raise ValueError(
+            f"env {name!r} is no environment: it has no {', '.join(missing)} (mjx_dher.types.Env says what one has)"
+        )
+    return env
+
+
+_MEMBERS = ("action_size", "episode_length", "reset", "step", "compute_reward")  # of types.Env
+
+
+def _takes_engine(constructor: Callable[..., Any]) -> bool:
+    parameters = inspect.signature(constructor).parameters.values()
+    return any(parameter.name == "engine" or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 
 def __getattr__(name: str) -> Any:

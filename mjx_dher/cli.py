@@ -109,7 +109,7 @@ class RenderArgs:
     run: tyro.conf.Positional[Path | None] = None
     """The run folder; or else give --env."""
     env: str | None = None
-    """Without a run folder: the environment, played with uniformly random actions."""
+    """Without a run folder: the environment (a name, or module:attribute), played with uniformly random actions."""
     episodes: int = 4
     """Episodes to play, one after the other."""
     seed: int = 1
@@ -158,6 +158,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "plot": cli_sweep.plot_command,
     }
     name = argv.pop(0) if argv and argv[0] in commands else "train"
+    if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
+        sys.path.append("")
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             config.check_name("command", argv[0], commands)
@@ -198,7 +200,8 @@ def resume_command(argv: list[str], console: Console) -> int:
     if not (args.run / run_folder.CHECKPOINTS).is_dir():
         raise run_folder.RunFolderError(f"{args.run} has no checkpoint to go on from: it was stopped before it had saved any")
     keep_compiled_programs()
-    env = envs.make(run.config.env, engine=args.engine or run.engine)
+    ran = run.engine if run.engine in config.ENGINES else run.config.engine  # "none": the environment has none
+    env = envs.make(run.config.env, engine=args.engine or ran)
     return _Training(env, run, args.run, options, console)()
 
 
@@ -235,7 +238,7 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=TrainArgs(config=base, hparams=hparams))
     args = dataclasses.replace(args, preset=preset)
     checks = (
-        lambda: config.check_name("env", args.config.env, envs.list_envs()),
+        lambda: config.check_name("env", args.config.env, envs.list_envs(), own=True),
         lambda: config.validate(args.config, args.hparams),
         lambda: _check_options(**{name: getattr(args, name) for name in _OPTIONS}),
     )
@@ -398,7 +401,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
         played, policy = run_folder.read_config(args.run).config, load_policy(args.run)
     elif args.env is not None and args.run is None:
-        config.check_name("env", args.env, envs.list_envs())
+        config.check_name("env", args.env, envs.list_envs(), own=True)
         played, policy = Config(env=args.env), None
     else:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
@@ -464,6 +467,7 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
     import numpy as np
 
     from mjx_dher.evaluate import evaluate
+    from mjx_dher.trainer import check_env
 
     keep_compiled_programs()
     chunk = min(num_episodes, EVAL_CHUNK)
@@ -474,7 +478,7 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
 
     keys = jax.random.split(jax.random.key(seed), -(-num_episodes // chunk))
     outcomes = [jax.device_get(run(key)) for key in keys]
-    env.check()
+    check_env(env)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
 
 

@@ -67,9 +67,9 @@ class SweepArgs:
     sweep: _Axes
     """Numbers to try: --sweep.her-k 2 4 8."""
     env: tuple[str, ...] = ("push",)
-    """Environments."""
+    """Environments, by name or as module:attribute."""
     sampler: tuple[str, ...] = ("future", "closest", "epsilon_closest", "weighted")
-    """Samplers of hindsight goals."""
+    """Samplers of hindsight goals, by name or as module:attribute."""
     weight_kernel: tuple[str, ...] = ("linear",)
     """For weighted: linear, inverse, softmax."""
     metric: tuple[str, ...] = ("position",)
@@ -121,7 +121,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
         ("metric", config.metric_names()),
     ):
         for value in getattr(args, field) or ("",):
-            config.check_name(field, value, allowed)
+            config.check_name(field, value, allowed, own=field in ("env", "sampler"))
     config.check_name("preset", args.preset, ("auto", *config.PRESETS))
     for field in ("seeds", "final_episodes", *(("lanes",) if args.lanes is not None else ())):
         config.check_count(field, getattr(args, field))

@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import importlib.util
 import math
+import pkgutil
 import sys
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -30,9 +31,10 @@ class Config:
     """
 
     env: str = "push"
-    """Environment: a name from `envs.list_envs()`."""
+    """Environment: a name from `envs.list_envs()`, or one of your own as module:attribute."""
     sampler: str = "future"
-    """How hindsight goals are chosen: random, episode, future, final, closest, epsilon_closest or weighted."""
+    """How hindsight goals are chosen: random, episode, future, final, closest, epsilon_closest or weighted, or
+    module:attribute."""
     weight_kernel: str = "linear"
     """For the weighted sampler, how weights fall with distance: linear, inverse or softmax."""
     metric: str = "position"
@@ -206,22 +208,90 @@ def _paper(env: str) -> tuple[Config, HParams]:
     return config, HParams()
 
 
-def check_name(field: str, value: str, allowed: Iterable[str]) -> None:
-    """Raises ValueError, naming the nearest, unless `value` is one of `allowed`."""
+def check_name(field: str, value: str, allowed: Iterable[str], own: bool = False) -> None:
+    """Refuses what is not one of `allowed`.
+
+    With `own`, "module:attribute" is allowed, too, where a module of that name can be found. It is not imported.
+
+    Raises:
+      ValueError: says what is allowed, and names the nearest.
+    """
     allowed = tuple(allowed)
     if value in allowed:
         return
-    nearest = difflib.get_close_matches(str(value), allowed, n=2, cutoff=0.5)
-    hint = f" (did you mean {' or '.join(map(repr, nearest))}?)" if nearest else ""
-    raise ValueError(f"{field} must be one of {', '.join(allowed)}; got {value!r}{hint}")
+    if own and is_own(value):
+        _check_own(field, value)
+        return
+    rest = ", or module:attribute" if own else ""
+    raise ValueError(f"{field} must be one of {', '.join(allowed)}{rest}; got {value!r}{_hint(str(value), allowed)}")
 
 
-def validate(config: Config, hparams: HParams, episode_length: int = 50) -> None:
+def is_own(name: str) -> bool:
+    """Whether a name is "module:attribute", and not one that this library knows."""
+    return ":" in str(name)
+
+
+def load_own(field: str, value: str) -> Any:
+    """What "module:attribute" names. What the module itself raises when it is imported is raised as it is.
+
+    Raises:
+      ValueError: there is no such module, or no such attribute in it; the message names the nearest.
+    """
+    _check_own(field, value)
+    name, attribute = value.split(":")
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
+            raise  # the module is there, and lacks another
+        raise _no_module(field, value, error.name) from None
+    if not hasattr(module, attribute):
+        hint = _hint(attribute, [name for name in dir(module) if not name.startswith("_")])
+        raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{hint}")
+    return getattr(module, attribute)
+
+
+def _check_own(field: str, value: str) -> None:
+    name, _, attribute = value.partition(":")
+    if not all(part.isidentifier() for part in (*name.split("."), attribute)):
+        raise ValueError(f"{field} must be module:attribute, the module's name as `import` takes it; got {value!r}")
+    top = name.partition(".")[0]
+    if top not in sys.modules and importlib.util.find_spec(top) is None:
+        raise _no_module(field, value, top)
+
+
+def _no_module(field: str, value: str, missing: str) -> ValueError:
+    """`missing` is the first part of the module's name that cannot be found; what it would be in has been imported."""
+    parent = missing.rpartition(".")[0]
+    if not parent:
+        there = [module.name for module in pkgutil.iter_modules()]
+    elif hasattr(sys.modules[parent], "__path__"):
+        there = [f"{parent}.{module.name}" for module in pkgutil.iter_modules(sys.modules[parent].__path__)]
+    else:
+        there = [parent]
+    where = f"in {parent}" if parent else "in the current folder or on Python's path"
+    return ValueError(f"{field} {value!r}: there is no module {missing!r} {where}{_hint(missing, there, cutoff=0.75)}")
+
+
+def _hint(value: str, there: Iterable[str], cutoff: float = 0.5) -> str:
+    nearest = difflib.get_close_matches(value, there, n=2, cutoff=cutoff)
+    return f" (did you mean {' or '.join(map(repr, nearest))}?)" if nearest else ""
+
+
+def validate(config: Config, hparams: HParams, episode_length: int | None = None) -> None:
     """Refuses what cannot run.
+
+    Args:
+      config: shapes and choices.
+      hparams: numbers; arrays among them are not looked at.
+      episode_length: of the environment, where it is known. None: that of the tasks here, and of an environment of the user's
+        own nothing is assumed.
 
     Raises:
       ValueError: names every field at fault, its value and what is allowed.
     """
+    if episode_length is None:
+        episode_length = 1 if is_own(config.env) else 50
     problems = [*_config_problems(config, episode_length), *_hparam_problems(hparams)]
     if problems:
         raise ValueError("\n".join(problems))
@@ -235,7 +305,7 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
         ("engine", c.engine, ENGINES),
     ):
         try:
-            check_name(field, value, allowed)
+            check_name(field, value, allowed, own=field == "sampler")
         except ValueError as error:
             yield str(error)
     positive = ("num_envs", "cycles_per_epoch", "updates_per_cycle", "target_period", "batch_size", "total_steps")

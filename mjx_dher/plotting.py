@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import stats
+from mjx_dher import run_folder, stats
 from mjx_dher.comparison import Group, Row
 
 # Okabe and Ito's colours, which colour-blind readers tell apart, from dark to light; each with a line and a marker of its own.
@@ -116,7 +116,7 @@ def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold:
     }
     for name, figure in pictures.items():
         for ending in formats:
-            path = folder / f"{groups[0].env.replace(':', '-')}_{name}.{ending}"
+            path = folder / f"{run_folder.in_a_path(groups[0].env)}_{name}.{ending}"
             # Without a date and with fixed names within, so that the same sweep draws the same file.
             with plt.rc_context({"svg.hashsalt": "mjx-dher"}):
                 figure.savefig(path, dpi=130, metadata={"Date": None} if ending == "svg" else None)

@@ -15,7 +15,11 @@ from mjx_dher.types import Array, Batch, Episode, PRNGKey, RewardFn
 
 
 def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparams: HParams, key: PRNGKey) -> Array:
-    """[B, G] one achieved goal for each transition of `sample`, chosen by `sampler`."""
+    """[B, G] one achieved goal for each transition of `sample`, chosen by `sampler`.
+
+    Raises:
+      ValueError: its log weights are not one for each goal of an episode.
+    """
     pool_key, draw_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
     pool = sample.episode_goals
@@ -23,6 +27,8 @@ def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparam
         elsewhere = replay.sample_episode_goals(state, pool_key, batch_size)
         pool = jnp.where(sampler.whole_ring(hparams), elsewhere, pool) if callable(sampler.whole_ring) else elsewhere
     log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
+    if log_weights.shape != pool.shape[:2]:
+        raise ValueError(f"a sampler gives log weights [T+1] = [{pool.shape[1]}]; this one gives {list(log_weights.shape[1:])}")
     index = samplers.draw(draw_key, log_weights)
     return pool[jnp.arange(batch_size), index]
 

@@ -119,8 +119,14 @@ def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int)
     import jax
     import jax.numpy as jnp
 
-    if not hasattr(env, "model") or env.goal_size != 3:
-        raise ValueError(f"{env.name} cannot be rendered: it needs a MuJoCo model (attribute `model`) and goals of size 3")
+    start = jax.eval_shape(env.reset, jax.random.key(seed))
+    places = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
+    if not (hasattr(env, "model") and places):
+        name = getattr(env, "name", type(env).__name__)
+        raise ValueError(
+            f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`), states with `physics.qpos` and goals of"
+            " size 3"
+        )
 
     def step(state, key):
         following = jax.vmap(env.step)(state, act(state.obs, key))

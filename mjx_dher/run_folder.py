@@ -8,6 +8,7 @@ import datetime
 import json
 import os
 import platform
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,12 +56,17 @@ def choose(out: Path | None, config: Config, seed: int) -> Path:
     """
     if out is None:
         now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{config.env.replace(':', '-')}-{config.sampler}-s{seed}-{now}"
+        name = f"{in_a_path(config.env)}-{in_a_path(config.sampler)}-s{seed}-{now}"
         paths = (Path("runs") / (name + suffix) for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
         return next(path for path in paths if not path.exists())
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise RunFolderError(f"out: {out} is there already and is never overwritten; name a new or empty folder")
     return out
+
+
+def in_a_path(name: str) -> str:
+    """The name of an environment or a sampler as a part of a file's: "Tasks:Mine" is tasks-mine."""
+    return re.sub(r"[^a-z0-9_]+", "-", name.lower())
 
 
 def engine_name(env: Any) -> str:

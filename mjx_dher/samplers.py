@@ -12,6 +12,7 @@ itself.
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -151,7 +152,7 @@ _PLAIN: dict[str, Sampler] = {
 
 
 def list_samplers() -> tuple[str, ...]:
-    """The names that `make` takes."""
+    """The names that `make` takes, beside "module:attribute"."""
     return (*config_lib.SAMPLERS, *(name for name in _PLAIN if name not in config_lib.SAMPLERS))
 
 
@@ -181,14 +182,16 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
     """The sampler called `name`.
 
     Args:
-      name: one of `list_samplers()`. `random` chooses as `episode` does, but from a random episode of the ring.
+      name: one of `list_samplers()`, or "module:attribute" of a `Sampler` or a function as `Sampler.log_weights`. `random`
+        chooses as `episode` does, but from a random episode of the ring.
       kernel: for `weighted`, one of linear, inverse, softmax, or a function (relative distance, temperature) -> log weight.
       metric: for closest, epsilon_closest and weighted: "position", or a function (achieved [T+1, G], desired [G]) -> [T+1].
 
     Raises:
-      ValueError: no such sampler, kernel or metric; the message names the nearest.
+      ValueError: no such sampler, module, attribute, kernel or metric (the message names the nearest), or something that is no
+        sampler.
     """
-    config_lib.check_name("sampler", name, list_samplers())
+    config_lib.check_name("sampler", name, list_samplers(), own=True)
     if isinstance(kernel, str):
         config_lib.check_name("weight_kernel", kernel, KERNELS)
         kernel = KERNELS[kernel]
@@ -200,7 +203,23 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
         "epsilon_closest": functools.partial(epsilon_closest, metric=metric),
         "weighted": functools.partial(weighted, kernel=kernel, metric=metric),
     }
-    return Sampler(by_distance[name]) if name in by_distance else _PLAIN[name]
+    if name in by_distance:
+        return Sampler(by_distance[name])
+    return _own(name) if config_lib.is_own(name) else _PLAIN[name]
+
+
+def _own(name: str) -> Sampler:
+    found = config_lib.load_own("sampler", name)
+    if isinstance(found, Sampler):
+        return found
+    try:
+        inspect.signature(found).bind("achieved", "desired", "step", "hparams")
+    except TypeError:
+        raise ValueError(
+            f"sampler {name!r} must be a function (achieved [T+1, G], desired [G], step [], hparams) -> log weights [T+1], or a"
+            f" samplers.Sampler; it is {found!r}"
+        ) from None
+    return Sampler(found)
 
 
 def one_of(choices: Sequence[Sampler]) -> Sampler:

@@ -14,7 +14,6 @@ import hashlib
 import itertools
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -62,7 +61,8 @@ class Cell:
         """Of its folder: what it is, to be read, and a digest of all that it depends on."""
         settings = [run_folder.SCHEMA, dataclasses.asdict(self.config), self.hparams._asdict(), self.seed]
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:10]
-        return f"{re.sub(r'[^a-z0-9_]+', '-', self.config.env.lower())}-{self.config.sampler}-s{self.seed}-{digest}"
+        env, sampler = run_folder.in_a_path(self.config.env), run_folder.in_a_path(self.config.sampler)
+        return f"{env}-{sampler}-s{self.seed}-{digest}"
 
 
 def cells(configs: Iterable[Config], hparams: Iterable[Sequence[HParams]], seeds: Sequence[int]) -> list[Cell]:

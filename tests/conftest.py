@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "docs" / "examples"
 # What one test has compiled the next one need not; but nothing of a test stays in the user's cache folder.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache = tempfile.mkdtemp()
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
 atexit.register(shutil.rmtree, _cache, ignore_errors=True)
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES)]
 
 
 def load_recorded(task):

@@ -6,43 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher.types import Array, GoalObs
-
-
-@struct.dataclass
-class ProbeState:
-    obs: GoalObs
-    reward: Array
-    success: Array
-
-
-class PointMass:
-    """A point in the plane that moves by 0.1 times its action; the goal is a place. No physics engine.
-
-    The sparse reward is -1 until the point is within 0.1 of the goal, so a good policy needs a step for every 0.1 of distance.
-    """
-
-    name = "point_mass"
-    observation_size, goal_size, action_size = 2, 2, 2
-
-    def __init__(self, episode_length: int = 10):
-        self.episode_length = episode_length
-
-    def reset(self, key) -> ProbeState:
-        start, goal = jax.random.uniform(key, (2, 2), minval=-0.4, maxval=0.4)
-        return self._state(start, goal)
-
-    def step(self, state: ProbeState, action: Array) -> ProbeState:
-        position = state.obs["achieved_goal"] + 0.1 * jnp.clip(action, -1, 1)
-        return self._state(position, state.obs["desired_goal"])
-
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > 0.1).astype(jnp.float32)
-
-    def _state(self, position: Array, goal: Array) -> ProbeState:
-        reward = self.compute_reward(position, goal)
-        obs = GoalObs(observation=position, achieved_goal=position, desired_goal=goal)
-        return ProbeState(obs=obs, reward=reward, success=(reward == 0).astype(jnp.float32))
+from mjx_dher.types import Array
+from point_mass import PointMass, PointState
 
 
 class Clock(PointMass):
@@ -50,15 +15,15 @@ class Clock(PointMass):
 
     name = "clock"
 
-    def reset(self, key) -> ProbeState:
+    def reset(self, key) -> PointState:
         return self._state(jnp.zeros(2), jax.random.uniform(key, (2,)))
 
-    def step(self, state: ProbeState, action: Array) -> ProbeState:
+    def step(self, state: PointState, action: Array) -> PointState:
         return self._state(state.obs["achieved_goal"] + action, state.obs["desired_goal"])
 
 
 @struct.dataclass
-class ExplodingState(ProbeState):
+class ExplodingState(PointState):
     step: Array
     failed: Array
 

@@ -88,7 +88,15 @@ def test_an_existing_run_is_never_overwritten(finished, capsys):
 
 
 BAD = [
-    (["--env", "pusch"], ["env must be one of pick_and_place, push", "got 'pusch' (did you mean 'push'?)"]),
+    (
+        ["--env", "pusch"],
+        ["env must be one of pick_and_place, push", ", or module:attribute; got 'pusch' (did you mean 'push'"],
+    ),
+    (["--env", "not_there:Task"], ["env 'not_there:Task': there is no module 'not_there' in the current folder or on"]),
+    (["--env", "tasks/mine.py:Task"], ["env must be module:attribute, the module's name as `import` takes it; got"]),
+    (["--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
+    (["sweep", "--out", "x", "--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
+    (["render", "--env", "not_there:Task", "--out", "x.png"], ["env 'not_there:Task': there is no module 'not_there'"]),
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
     (["--engine", "natve"], ["engine must be one of auto, native, jax, warp; got 'natve' (did you mean 'native'?)"]),
     (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, paper; got 'papr' (did you mean 'paper'?)"]),

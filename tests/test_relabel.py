@@ -51,6 +51,14 @@ def test_goals_come_from_where_the_sampler_may_look(ring, name):
         assert np.any(index == step + 1)
 
 
+@pytest.mark.parametrize(("gives", "log_weights"), [("[]", lambda a, d, s, h: s * 0.0), ("[13, 2]", lambda a, d, s, h: a)])
+def test_a_sampler_s_log_weights_are_one_for_each_goal(ring, gives, log_weights):
+    sample = replay.sample(ring, jax.random.key(1), 5)
+    with pytest.raises(ValueError, match="a sampler gives log weights") as error:
+        hindsight_goals(ring, sample, samplers.Sampler(log_weights), HP, jax.random.key(0))
+    assert str(error.value) == f"a sampler gives log weights [T+1] = [13]; this one gives {gives}"
+
+
 @pytest.mark.parametrize("k", [0.0, 1.0, 4.0])
 def test_relabelled_share(ring, k):
     sample = replay.sample(ring, jax.random.key(3), 20_000)

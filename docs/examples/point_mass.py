@@ -1,0 +1,58 @@
+"""A task and a goal sampler of one's own, without a physics engine; docs/tutorial.md explains them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_dher.config import HParams
+from mjx_dher.types import Array, GoalObs, PRNGKey
+
+STEP = 0.1  # how far an action of 1 moves the point, along each axis
+REACH = 0.1  # how near to the goal counts as there
+
+
+@struct.dataclass
+class PointState:
+    """Everything that an episode in progress is made of."""
+
+    obs: GoalObs  # observation [2], achieved_goal [2], desired_goal [2]
+    reward: Array  # []
+    success: Array  # [] 1.0 where the goal is reached, else 0.0
+
+
+class PointMass:
+    """A point in the plane; an action moves it, and the goal is a place for it."""
+
+    name = "point_mass"
+    observation_size, goal_size, action_size = 2, 2, 2
+
+    def __init__(self, episode_length: int = 10):
+        self.episode_length = episode_length
+
+    def reset(self, key: PRNGKey) -> PointState:
+        """Start and goal are uniform in a square."""
+        start, goal = jax.random.uniform(key, (2, 2), minval=-0.4, maxval=0.4)
+        return self._state(start, goal)
+
+    def step(self, state: PointState, action: Array) -> PointState:
+        """The state after `action` [2]; values outside [-1, 1] are clipped."""
+        position = state.obs["achieved_goal"] + STEP * jnp.clip(action, -1, 1)
+        return self._state(position, state.obs["desired_goal"])
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """0 within reach, else -1: [..., 2], [..., 2] -> [...]."""
+        return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > REACH).astype(jnp.float32)
+
+    def _state(self, position: Array, goal: Array) -> PointState:
+        reward = self.compute_reward(position, goal)
+        obs = GoalObs(observation=position, achieved_goal=position, desired_goal=goal)
+        return PointState(obs=obs, reward=reward, success=(reward == 0).astype(jnp.float32))
+
+
+def soon(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """A goal sampler: future goals, each half as likely as the one before it. Log weights [T+1] of the goals [T+1, 2]."""
+    del desired, hparams
+    later = jnp.arange(achieved.shape[0]) - step
+    return jnp.where(later > 0, -jnp.log(2.0) * later, -jnp.inf)
