@@ -19,7 +19,7 @@ if not os.path.isdir(os.path.join(_checkout, "mjx_dher", "envs")) and os.path.is
     __path__.append(_checkout)
 
 if TYPE_CHECKING:
-    from mjx_dher import config, ddpg, envs, normalizer, relabel, replay, rollout, samplers, stats, trainer
+    from mjx_dher import config, ddpg, envs, normalizer, relabel, replay, rollout, samplers, stats, testing, trainer
     from mjx_dher.config import Config, HParams, preset
     from mjx_dher.policy import Policy, load_policy
     from mjx_dher.trainer import TrainState, make_train, train
@@ -41,6 +41,7 @@ __all__ = [
     "rollout",
     "samplers",
     "stats",
+    "testing",
     "train",
     "trainer",
 ]

@@ -1,0 +1,255 @@
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from mjx_dher import envs
+from mjx_dher.testing import EnvError, check_env
+from mjx_dher.types import Array, GoalObs
+from point_mass import PointMass, PointState
+from probes import Explodes
+
+
+@pytest.mark.parametrize("env", [PointMass(), PointMass(episode_length=1), Explodes(None)])
+def test_what_is_as_it_should_be_passes(env):
+    check_env(env)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", envs.list_envs())
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+def test_the_tasks_pass(env, reward_type):
+    check_env(envs.make(env, reward_type=reward_type))
+
+
+def test_what_an_environment_checks_itself_is_asked_last():
+    class Checked(PointMass):
+        def check(self):
+            raise ValueError("contacts were lost")
+
+    with pytest.raises(ValueError, match="contacts were lost"):
+        check_env(Checked())
+
+
+def broken(**members):
+    """PointMass with other members; functions of one instance are its methods."""
+    return type("Broken", (PointMass,), members)()
+
+
+def with_obs(name, change):
+    """PointMass whose obs[name] is changed."""
+
+    def state(self, position, goal):
+        right = PointMass._state(self, position, goal)
+        return right.replace(obs={**right.obs, name: change(right.obs[name])})
+
+    return broken(_state=state)
+
+
+def with_state(**changes):
+    """PointMass whose states have fields changed by functions of the state."""
+
+    def state(self, position, goal):
+        right = PointMass._state(self, position, goal)
+        return right.replace(**{name: change(right) for name, change in changes.items()})
+
+    return broken(_state=state)
+
+
+class Plain:
+    """A state that JAX does not know as a pytree."""
+
+    def __init__(self, state):
+        self.obs, self.reward, self.success = state.obs, state.reward, state.success
+
+
+@struct.dataclass
+class Counting(PointState):
+    count: Array
+
+
+@struct.dataclass
+class NoReward:
+    obs: GoalObs
+    success: Array
+
+
+def counting(first, later):
+    """Counts steps, from `first`; `later(count)` is the next count."""
+
+    def reset(self, key):
+        state = PointMass.reset(self, key)
+        return Counting(state.obs, state.reward, state.success, first)
+
+    def step(self, state, action):
+        following = PointMass.step(self, state, action)
+        return Counting(following.obs, following.reward, following.success, later(state.count))
+
+    return broken(reset=reset, step=step)
+
+
+def growing(self, state, action):
+    following = PointMass.step(self, state, action)
+    return Counting(following.obs, following.reward, following.success, jnp.zeros(()))
+
+
+def mutating(self, state, action):
+    following = PointMass.step(self, state, action)
+    state.obs["achieved_goal"] = following.obs["achieved_goal"]
+    return following
+
+
+def branching(self, state, action):
+    return PointMass.step(self, state, action if action[0] > 0 else -action)
+
+
+def drifting():
+    """Its steps depend on how many there have been, which no state says."""
+    calls = itertools.count()
+    return broken(step=lambda self, state, action: PointMass.step(self, state, action + 0.1 * next(calls)))
+
+
+def forgetful():
+    """Its starts depend on how many there have been."""
+    calls = itertools.count()
+    return broken(reset=lambda self, key: PointMass.reset(self, jax.random.fold_in(key, next(calls))))
+
+
+def traced_otherwise(self, state, action):
+    return PointMass.step(self, state, action / 2 if isinstance(action, jax.core.Tracer) else action)
+
+
+def mixing(self, state, action):
+    """A callback that is handed the whole batch, and mixes it."""
+
+    def centre(actions):
+        return np.asarray(actions) - (np.mean(actions, axis=0) if np.ndim(actions) > 1 else 0)
+
+    centred = jax.pure_callback(centre, jax.ShapeDtypeStruct(action.shape, action.dtype), action, vmap_method="broadcast_all")
+    return PointMass.step(self, state, centred)
+
+
+def refusing(self, state, action):
+    if not isinstance(action, jax.core.Tracer) and np.abs(action).max() > 1:
+        raise ValueError("action out of range")
+    return PointMass.step(self, state, action)
+
+
+def diverging(self, state, action):
+    """NaN from the third step on."""
+    following = PointMass.step(self, state, action)
+    obs = following.obs
+    far = jnp.abs(obs["achieved_goal"]).max() > 0.45
+    return following.replace(obs={**obs, "observation": jnp.where(far, jnp.nan, obs["observation"])})
+
+
+def new_goal(self, state, action):
+    following = PointMass.step(self, state, action)
+    return self._state(following.obs["achieved_goal"], following.obs["desired_goal"] + 0.01)
+
+
+def late_reward(self, state, action):
+    """The reward of the state that the step left."""
+    return PointMass.step(self, state, action).replace(reward=state.reward)
+
+
+def over_all(self, achieved_goal, desired_goal):
+    """Forgets that there may be leading axes."""
+    return -(jnp.linalg.norm(achieved_goal - desired_goal) > 0.1).astype(jnp.float32)
+
+
+def over_the_batch(self, achieved_goal, desired_goal):
+    distance = jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)
+    return -jnp.minimum(distance / jnp.maximum(1.0, jnp.max(distance)), 1.0) - 0.01 * (distance.size > 1)
+
+
+def inverted(self, achieved_goal, desired_goal):
+    return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) < 0.1).astype(jnp.float32)
+
+
+def shifted(self, achieved_goal, desired_goal):
+    return PointMass.compute_reward(self, achieved_goal, desired_goal) + 1.0
+
+
+def whole_numbers(self, achieved_goal, desired_goal):
+    return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > 0.1).astype(jnp.int32)
+
+
+BROKEN = {
+    "no actions": (broken(action_size=0), "action_size must be an integer of at least 1; it is 0"),
+    "no length": (broken(__init__=lambda self: None), "episode_length must be an integer of at least 1; it is None"),
+    "no reward function": (broken(compute_reward=None), "compute_reward must be a method; it is None"),
+    "reset fails": (broken(reset=lambda self, key: jnp.zeros(2) + jnp.zeros(3)), "reset raises TypeError: "),
+    "no pytree": (
+        broken(reset=lambda self, key: Plain(PointMass.reset(self, key))),
+        "reset must give a pytree of arrays, such as a flax.struct.dataclass; it is a Plain",
+    ),
+    "a name in the state": (counting("first", lambda count: count), r"its leaf \.count is a str"),
+    "no reward": (
+        broken(_state=lambda self, position, goal: NoReward(PointMass._state(self, position, goal).obs, jnp.zeros(()))),
+        "reset must give a state with obs, reward and success; it has no reward",
+    ),
+    "no achieved goal": (
+        with_state(obs=lambda state: {name: x for name, x in state.obs.items() if name != "achieved_goal"}),
+        "obs must have observation, achieved_goal, desired_goal; it has no achieved_goal",
+    ),
+    "matrix": (with_obs("observation", lambda x: x[None]), r"reset: observation must be one vector; it has shape \(1, 2\)"),
+    "two observations": (with_obs("observation", lambda x: {"position": x}), "observation must be one array; it is a dict"),
+    "whole numbers": (with_obs("observation", lambda x: x.astype(jnp.int32)), "observation must be float32; it is int32"),
+    "observation size": (broken(observation_size=3), "observation must have observation_size = 3 values; it has 2"),
+    "goal size": (broken(goal_size=3), "achieved_goal must have goal_size = 3 values; it has 2"),
+    "two kinds of goal": (
+        with_obs("desired_goal", lambda x: x[:1]),
+        "must be as long as achieved_goal, 2; it is 1",
+    ),
+    "a row of rewards": (with_state(reward=lambda s: s.reward[None]), r"reward must be a scalar, \[\]; it has shape \(1,\)"),
+    "success is bool": (with_state(success=lambda s: s.success > 0), "success must be float32; it is bool"),
+    "success of 2": (with_state(success=lambda s: s.success + 2), "success must be 0 or 1; it is 2"),
+    "NaN at once": (with_obs("observation", lambda x: x * jnp.nan), r"reset: observation must be finite; it is \[nan nan\]"),
+    "changes the state": (broken(step=mutating), "step must leave the state that it is given as it is"),
+    "branches": (broken(step=branching), "step, traced by jax.jit, raises TracerBoolConversionError"),
+    "grows": (broken(step=growing), r"states of one structure, for lax.scan; only one of them has \.count"),
+    "changes its type": (
+        counting(jnp.zeros((), jnp.int32), lambda count: count + 1.0),
+        r"the state's \.count is int32\[\] and becomes float32\[\]",
+    ),
+    "hidden start": (forgetful(), "reset, called twice with the same key, must give the same result"),
+    "hidden step": (drifting(), "step, called twice with the same state and action, must give the same result"),
+    "NaN later": (broken(step=diverging), "observation must be finite, or the state say `failed`; it is not after [1-9]"),
+    "always fails": (Explodes(None, edge=-1.0), "every episode of random actions said `failed`"),
+    "one start": (broken(reset=lambda self, key: PointMass.reset(self, jax.random.key(0))), "8 keys gave the same"),
+    "moving goal": (broken(step=new_goal), "desired_goal must stay the same for an episode; it changed at step 1"),
+    "other when traced": (
+        broken(step=traced_otherwise),
+        "step, alone and under jax.jit and jax.vmap, must give the same result",
+    ),
+    "mixes the batch": (
+        broken(step=mixing),
+        "step, alone and under jax.jit and jax.vmap, must give the same result; .* differs by",
+    ),
+    "refuses": (broken(step=refusing), r"step with an action of \+-3 raises ValueError: action out of range"),
+    "reward of all goals": (broken(compute_reward=over_all), r"of goals \[8, 2\] must be \[8\]; it is \[\]"),
+    "reward of whole numbers": (broken(compute_reward=whole_numbers), "must be float32; it is int32"),
+    "reward of the batch": (broken(compute_reward=over_the_batch), "must be that of each; it depends on the others"),
+    "late reward": (
+        broken(step=late_reward),
+        r"step must give compute_reward\(achieved_goal, desired_goal\) of the",
+    ),
+    "reward of 1": (broken(compute_reward=shifted), r"rewards must lie in \[-1, 0\], .* from 0 to 1"),
+    "inverted": (broken(compute_reward=inverted), "must be greatest for a goal that is achieved exactly"),
+    "always a success": (with_state(success=lambda s: jnp.ones(())), "success must be 0 where a sparse reward is -1"),
+    "never a success": (
+        with_state(success=lambda s: jnp.zeros(())),
+        "success must be 1 where the goal is reached",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_one_thing_wrong_is_named(name):
+    env, message = BROKEN[name]
+    with pytest.raises(EnvError, match=message):
+        check_env(env)
