@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import jax
-
 
 def available_bytes() -> int | None:
     """Bytes that the default device can still allocate, None where it does not tell.
 
     On a CPU: the free memory of the machine, or of the container if that is less (Linux only).
     """
+    import jax
+
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats()

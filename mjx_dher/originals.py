@@ -47,7 +47,7 @@ def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> N
     Raises:
       ValueError: pip failed, with what it said.
     """
-    if _is_ready(interpreter(environment), requirements):
+    if is_ready(interpreter(environment), requirements):
         return
     venv.create(environment, with_pip=True, clear=True)
     python = str(interpreter(environment))
@@ -70,7 +70,7 @@ def check(env_name: str, python: Path) -> str:
     """
     if env_name not in ORIGINALS:
         raise ValueError(f"{env_name} has no original to transfer to; the tasks that have: {', '.join(ORIGINALS)}")
-    if not _is_ready(python):
+    if not is_ready(python):
         raise ValueError(
             f"the original tasks need {' and '.join(REQUIREMENTS)} in an environment of their own, and {python} does not have"
             " them: --set-up makes one there (a download of 200 MB), or name the Python of yours with --python"
@@ -131,7 +131,8 @@ def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
     return outcome
 
 
-def _is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
+def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
+    """Whether `python` is there and has the original tasks, in the versions that they need."""
     names = [requirement.split("==")[0] for requirement in requirements]
     code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
     try:

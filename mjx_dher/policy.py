@@ -13,6 +13,7 @@ import numpy as np
 from mjx_dher import run_folder
 from mjx_dher.run_folder import POLICY_FILE, RunFolderError, read_config
 
+_VECTORS = ("observation_mean", "observation_std", "goal_mean", "goal_std")
 _SCALARS = ("norm_clip", "obs_clip")
 
 
@@ -72,13 +73,31 @@ class Policy:
                 x = xp.maximum(x, 0)
         return xp.tanh(x)
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All that the policy is made of, by name, float32: layerI_kernel [in, out] and layerI_bias [out], and the fields."""
+        arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
+        arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
+        return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
+
     def save(self, path: Path) -> None:
         """Writes the policy to `path`; what was there stays whole until the new file is."""
-        arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
-        for field in ("observation_mean", "observation_std", "goal_mean", "goal_std", *_SCALARS):
-            arrays[field] = np.asarray(getattr(self, field), np.float32)
+        arrays: dict[str, Any] = self.arrays()
         with run_folder.whole(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
+
+
+def from_arrays(arrays: Mapping[str, Any]) -> Policy:
+    """The policy that `Policy.arrays` gave.
+
+    Raises:
+      KeyError: one of them is missing.
+    """
+    num_layers = sum(name.endswith("_kernel") for name in arrays)
+    return Policy(
+        layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
+        **{field: arrays[field] for field in _VECTORS},
+        **{field: float(arrays[field]) for field in _SCALARS},
+    )
 
 
 def from_learner(learner: Any, hparams: Any) -> Policy:
@@ -115,16 +134,6 @@ def load_policy(run_dir: str | Path) -> Policy:
         raise RunFolderError(f"{path} is missing: the run was stopped before its first epoch ended")
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        num_layers = sum(name.endswith("_kernel") for name in arrays)
-        return Policy(
-            layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
-            observation_mean=arrays["observation_mean"],
-            observation_std=arrays["observation_std"],
-            goal_mean=arrays["goal_mean"],
-            goal_std=arrays["goal_std"],
-            norm_clip=float(arrays["norm_clip"]),
-            obs_clip=float(arrays["obs_clip"]),
-        )
+            return from_arrays({name: file[name] for name in file.files})
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise RunFolderError(f"{path} is damaged or not a policy of this program ({error})") from error

@@ -17,10 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher import run_folder
+
 FPS = 25  # an action lasts 40 ms: pictures in real time
 HOLD = 10  # frames that the end of an episode stays, so that the eye can compare object and goal
 STILLS = 5  # pictures side by side in a .png
 SIZES = range(64, 2049, 2)  # even, as H.264 takes nothing else
+GL = ("egl", "osmesa", "glfw")  # ways to draw on Linux, as MUJOCO_GL names them, in the order in which they are tried
+GL_SECONDS = 60.0  # that trying one may take
 GOAL_RADIUS = 0.03  # m, so that it shows through an object that has reached it
 GOAL_RGBA = (1.0, 0.1, 0.1, 0.6)
 
@@ -42,14 +46,10 @@ def check(out: Path, width: int, height: int, overwrite: bool) -> None:
       ValueError: names each argument at fault and what is allowed.
     """
     problems = []
-    if out.suffix.lower() not in FORMATS:
-        problems.append(f"out must end in {', '.join(FORMATS)}; got {str(out)!r}")
-    elif out.is_dir():
-        problems.append(f"out: {out} is a folder")
-    elif out.exists() and not overwrite:
-        problems.append(f"out: {out} is there already; name another file or give --overwrite")
-    elif not out.parent.is_dir():
-        problems.append(f"out: there is no folder {out.parent}")
+    try:
+        run_folder.check_file(out, FORMATS, overwrite)
+    except ValueError as error:
+        problems.append(str(error))
     for field, value in (("width", width), ("height", height)):
         if value not in SIZES:
             problems.append(f"{field} must be an even integer from {SIZES[0]} to {SIZES[-1]}; got {value}")
@@ -74,8 +74,7 @@ def ffmpeg() -> str:
 def choose_gl() -> str:
     """Makes MuJoCo draw with what works here without a screen, by setting MUJOCO_GL; returns its name.
 
-    A MUJOCO_GL that the user has set is taken, if it works. Each is tried in a process of its own, because MuJoCo decides once,
-    at its import, and a failed attempt may crash.
+    A MUJOCO_GL that the user has set is taken, if it works.
 
     Raises:
       ValueError: none works, or MuJoCo was imported before anything was chosen.
@@ -85,20 +84,33 @@ def choose_gl() -> str:
         raise ValueError("MuJoCo has been imported already: set MUJOCO_GL (egl or osmesa) before the program starts")
     if not asked and sys.platform != "linux":
         return "system"  # macOS and Windows have one way to draw, and it needs no screen
-    probe = "import mujoco as m\nwith m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 16, 16) as r: r.render()"
     tried = []
-    for name in [asked] if asked else ["egl", "osmesa", "glfw"]:
-        done = subprocess.run(
-            [sys.executable, "-c", probe], env={**os.environ, "MUJOCO_GL": name}, capture_output=True, text=True, check=False
-        )
-        if done.returncode == 0:
+    for name in [asked] if asked else GL:
+        why_not = try_gl(name)
+        if why_not is None:
             os.environ["MUJOCO_GL"] = name
             return name
-        tried.append(f"{name} ({(done.stderr.strip().splitlines() or ['crashed'])[-1]})")
+        tried.append(f"{name} ({why_not})")
     raise ValueError(
         f"MuJoCo cannot draw here; tried MUJOCO_GL={', '.join(tried)}. Install EGL or OSMesa"
         " (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri, or libosmesa6)"
     )
+
+
+def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
+    """Why MuJoCo cannot draw here with MUJOCO_GL=`name`, in one line; None where it can.
+
+    Tried in a process of its own, because MuJoCo decides once, at its import, and a failed attempt may crash.
+    """
+    probe = "import mujoco as m\nwith m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 16, 16) as r: r.render()"
+    environment = {**os.environ, "MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # nothing is worth keeping
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", probe], env=environment, capture_output=True, text=True, check=False, timeout=seconds
+        )
+    except subprocess.TimeoutExpired:
+        return f"did not end within {seconds:g} s"
+    return None if done.returncode == 0 else (done.stderr.strip().splitlines() or ["crashed"])[-1]
 
 
 def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

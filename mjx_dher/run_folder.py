@@ -9,7 +9,7 @@ import json
 import os
 import platform
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,23 @@ def in_a_path(name: str) -> str:
     return re.sub(r"[^a-z0-9_]+", "-", name.lower())
 
 
+def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
+    """Refuses a file that cannot or must not be written, before anything slow has happened.
+
+    Raises:
+      RunFolderError: it ends in none of `endings`, is a folder, is there already (without `overwrite`), or its folder is not.
+    """
+    endings = tuple(endings)
+    if out.suffix.lower() not in endings:
+        raise RunFolderError(f"out must end in {', '.join(endings)}; got {str(out)!r}")
+    if out.is_dir():
+        raise RunFolderError(f"out: {out} is a folder")
+    if out.exists() and not overwrite:
+        raise RunFolderError(f"out: {out} is there already; name another file or give --overwrite")
+    if not out.parent.is_dir():
+        raise RunFolderError(f"out: there is no folder {out.parent}")
+
+
 def engine_name(env: Any) -> str:
     """Of the physics that an environment runs on; none for one without an engine."""
     return getattr(getattr(env, "engine", None), "name", "none")
@@ -116,10 +133,16 @@ def lock(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """A path to write to that takes the place of `path` when it is complete; until then, what was there stays."""
+    """A path to write to that takes the place of `path` when it is complete; until then, what was there stays.
+
+    After an error it stays for good, and nothing is left of the new.
+    """
     partial = path.with_name(path.name + ".partial")
-    yield partial
-    partial.replace(path)
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _versions() -> dict[str, str]:

@@ -194,6 +194,10 @@ def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
         render.choose_gl()
 
 
+def test_a_way_to_draw_that_hangs_is_given_up():
+    assert render.try_gl("egl", seconds=0.01) == "did not end within 0.01 s"
+
+
 def test_mujoco_must_not_have_chosen_already(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setitem(sys.modules, "mujoco", object())
