@@ -1,6 +1,6 @@
 """The command line: `train` (the default command), `resume`, `eval`, `render` and `transfer`.
 
-`sweep` and `plot` are in `cli_sweep`.
+`sweep` and `plot` are in `cli_sweep`, `export` in `cli_export`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import cli_sweep, config, envs, metrics, run_folder
+from mjx_dher import cli_export, cli_sweep, config, envs, metrics, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -39,8 +39,8 @@ class TrainArgs:
     """Train a policy with DDPG and Hindsight Experience Replay.
 
     Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates one again, `render RUN` draws it,
-    `transfer RUN` plays it in the original Fetch task, `sweep` trains and compares many runs, `plot DIR` draws a sweep (see
-    `eval --help` and so on).
+    `transfer RUN` plays it in the original Fetch task, `export RUN` writes its policy for other programs, `sweep` trains and
+    compares many runs, `plot DIR` draws a sweep (see `eval --help` and so on).
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -154,6 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "eval": eval_command,
         "render": render_command,
         "transfer": transfer_command,
+        "export": cli_export.export_command,
         "sweep": cli_sweep.sweep_command,
         "plot": cli_sweep.plot_command,
     }

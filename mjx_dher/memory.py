@@ -23,6 +23,8 @@ def available_bytes() -> int | None:
 
 def used_bytes() -> int | None:
     """Bytes that the default device holds for JAX; on a CPU, that this program holds (Linux only). None where unknown."""
+    import jax
+
     device = jax.devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats()

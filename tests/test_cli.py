@@ -112,7 +112,13 @@ BAD = [
     (["--gamma", "1.0"], ["gamma must lie in [0, 1); got 1.0"]),
     (["--final-episodes", "0"], ["final_episodes must be an integer of at least 1; got 0"]),
     (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must be", "gamma must lie"]),
-    (["evall", "runs/x"], ["command must be one of train, resume, eval", "got 'evall' (did you mean 'eval'?)"]),
+    (
+        ["evall", "runs/x"],
+        [
+            "command must be one of train, resume, eval, render, transfer, export, sweep, plot;",
+            "got 'evall' (did you mean 'eval'?)",
+        ],
+    ),
     (["eval", "runs/not-there"], ["runs/not-there is not a run folder: no such folder"]),
     (["eval", "docs"], ["docs is not a run folder: it has no config.json"]),
     (["eval", "docs", "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
