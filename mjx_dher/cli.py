@@ -1,6 +1,6 @@
 """The command line: `train` (the default command), `resume`, `eval`, `render` and `transfer`.
 
-`sweep` and `plot` are in `cli_sweep`, `export` in `cli_export`.
+`sweep` and `plot` are in `cli_sweep`, `export` in `cli_export`, `doctor` in `cli_doctor`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import cli_export, cli_sweep, config, envs, metrics, run_folder
+from mjx_dher import cli_doctor, cli_export, cli_sweep, config, envs, metrics, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
 
@@ -40,7 +40,7 @@ class TrainArgs:
 
     Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates one again, `render RUN` draws it,
     `transfer RUN` plays it in the original Fetch task, `export RUN` writes its policy for other programs, `sweep` trains and
-    compares many runs, `plot DIR` draws a sweep (see `eval --help` and so on).
+    compares many runs, `plot DIR` draws a sweep, `doctor` says what works on this machine (see `eval --help` and so on).
     """
 
     config: Annotated[Config, tyro.conf.arg(name="")]
@@ -157,6 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "export": cli_export.export_command,
         "sweep": cli_sweep.sweep_command,
         "plot": cli_sweep.plot_command,
+        "doctor": cli_doctor.doctor_command,
     }
     name = argv.pop(0) if argv and argv[0] in commands else "train"
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing

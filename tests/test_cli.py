@@ -115,7 +115,7 @@ BAD = [
     (
         ["evall", "runs/x"],
         [
-            "command must be one of train, resume, eval, render, transfer, export, sweep, plot;",
+            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, doctor;",
             "got 'evall' (did you mean 'eval'?)",
         ],
     ),
