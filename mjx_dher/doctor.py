@@ -49,6 +49,9 @@ PACKAGES = {
     "imageio-ffmpeg": "video",
     "onnx": "export",
     "safetensors": "export",
+    "tensorboardX": "tensorboard",
+    "tensorboard": "tensorboard",
+    "wandb": "wandb",
 }
 
 Report = dict[str, dict[str, Any]]
