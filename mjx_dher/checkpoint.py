@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_dher import memory
 from mjx_dher.run_folder import CHECKPOINTS, RunFolderError, checkpoints
 
 SCHEMA = 1
@@ -61,6 +62,9 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
         for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
             shutil.rmtree(left)
         leaves = _to_arrays(state)
+        needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(parent).free
+        if needed > free:
+            raise OSError(f"it can take {memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free")
         _write_arrays(partial / _STATE, list(leaves.values()))
         content = {
             "schema": SCHEMA,
@@ -203,7 +207,7 @@ def _from_arrays(arrays: list[np.ndarray], template: Any) -> Any:
 def _checkpointer() -> Any:
     import orbax.checkpoint
 
-    logging.getLogger("absl").setLevel(logging.ERROR)  # orbax tells how long each step took
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax tells how long each step took
     return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler())
 
 

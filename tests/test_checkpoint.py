@@ -200,6 +200,14 @@ def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeyp
     assert restore(copy, program).epoch == 3
 
 
+def test_a_disk_with_too_little_left_is_refused_before_anything_is_written(program, copy, monkeypatch):
+    state = restore(copy, program).state
+    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**6, 10**6 - 1000, 1000))
+    with pytest.raises(CheckpointError, match=r"epoch-000004 \(it can take .* kB, and 1.0 kB of the disk are free\); the last"):
+        checkpoint.save(copy, state, 4, 1.0, keep=1)
+    assert restore(copy, program).epoch == 3
+
+
 # The command line, on the real thing.
 
 TINY = """
