@@ -264,7 +264,7 @@ def fetch_observation(
             finger_pos,
             matrix_to_euler(rotation),
             (object_vel - grip_vel) * DT,
-            jnp.sum(rotation * object_qvel[3:], axis=-1) * DT,
+            jnp.sum(rotation * object_qvel[None, 3:], axis=-1) * DT,
             grip_vel * DT,
             finger_vel * DT,
         ]

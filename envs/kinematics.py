@@ -50,7 +50,7 @@ class Chain:
         """Position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and their rates [J], rad/s."""
         pos, quat, anchors, axes = self._walk(angles)
         site = pos + rotate(quat, jnp.asarray(self._site, jnp.float32))
-        return site, jnp.sum(rates[:, None] * jnp.cross(axes, site - anchors), axis=0)
+        return site, jnp.sum(rates[:, None] * jnp.cross(axes, site[None] - anchors), axis=0)
 
     def _walk(self, angles: Array) -> tuple[Array, Array, Array, Array]:
         """Position [3] and orientation [4] of the body; places and axes [J, 3] of the joints; all in the world's frame."""

@@ -26,4 +26,5 @@ def summary(outcome: Outcome) -> dict[str, Array]:
 
 def return_mean(outcome: Outcome) -> Array:
     """[] mean return of the valid episodes; 0 where there is none."""
-    return jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)) / jnp.maximum(jnp.sum(outcome.valid), 1)
+    count = jnp.sum(outcome.valid, dtype=outcome.ret.dtype)
+    return jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)) / jnp.maximum(count, 1.0)

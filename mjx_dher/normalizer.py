@@ -32,7 +32,7 @@ def update(state: NormalizerState, values: Array, clip: Array | float, valid: Ar
     values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
     number = jnp.sum(seen).astype(jnp.float32)
     batch_mean = jnp.sum(jnp.where(seen, values, 0.0), axis=0) / jnp.maximum(number, 1.0)
-    batch_var = jnp.sum(jnp.where(seen, jnp.square(values - batch_mean), 0.0), axis=0) / jnp.maximum(number, 1.0)
+    batch_var = jnp.sum(jnp.where(seen, jnp.square(values - batch_mean[None]), 0.0), axis=0) / jnp.maximum(number, 1.0)
     count = state.count + number
     share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean
@@ -48,5 +48,5 @@ def normalize(
 ) -> Array:
     """`values` [..., D] clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`."""
     values = jnp.clip(values, -input_clip, input_clip)
-    std = jnp.maximum(jnp.sqrt(state.var), eps)
-    return jnp.clip((values - state.mean) / std, -clip, clip)
+    mean, std = (jnp.expand_dims(x, range(values.ndim - 1)) for x in (state.mean, jnp.maximum(jnp.sqrt(state.var), eps)))
+    return jnp.clip((values - mean) / std, -clip, clip)

@@ -42,9 +42,9 @@ class Sampler:
 
 
 def position(achieved: Array, desired: Array) -> Array:
-    """The metric `position`: Euclidean distance of [T+1, G] to [G]."""
+    """The metric `position`: Euclidean distances [T+1] of `achieved` [T+1, G] to `desired` [G]."""
     # Coordinate by coordinate: XLA on a CPU takes three times as long for a sum over an axis of 3.
-    squares = jnp.square(achieved - desired)
+    squares = jnp.square(achieved - desired[None])
     return jnp.sqrt(sum(squares[..., i] for i in range(squares.shape[-1])))
 
 
@@ -120,24 +120,24 @@ def weighted(
     """
     mask = future_mask(achieved.shape[0], step)
     distance = jnp.where(mask, metric(achieved, desired), 0.0)
-    mean = jnp.sum(distance) / jnp.sum(mask)
+    mean = jnp.sum(distance) / jnp.sum(mask, dtype=distance.dtype)
     # Where every candidate lies on the goal, all are equally near.
     relative = jnp.where(mask & (mean > 0), distance / jnp.where(mean > 0, mean, 1.0), 1.0)
     return jnp.where(mask, kernel(relative, hparams.temperature), -jnp.inf)
 
 
 def linear(relative: Array, temperature: Array | float) -> Array:
-    """log max(1 - (r - 1) / temperature, 0)."""
+    """log max(1 - (r - 1) / temperature, 0), of relative distances r [T+1]."""
     return jnp.log(jnp.maximum(1.0 - (relative - 1.0) / temperature, 0.0))
 
 
 def inverse(relative: Array, temperature: Array | float) -> Array:
-    """log r^(-1/temperature); a candidate on the goal counts as one at a thousandth of the mean distance."""
+    """log r^(-1/temperature), of relative distances r [T+1]; one on the goal counts as at a thousandth of the mean distance."""
     return -jnp.log(jnp.maximum(relative, 1e-3)) / temperature
 
 
 def softmax(relative: Array, temperature: Array | float) -> Array:
-    """-(r - 1) / temperature."""
+    """-(r - 1) / temperature, of relative distances r [T+1]."""
     return -(relative - 1.0) / temperature
 
 

@@ -1,0 +1,75 @@
+"""Nothing is promoted unasked: arrays of another rank or dtype meet only where the code says so.
+
+JAX decides that while it traces, so tracing is enough, and quick.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+from test_trainer import SMALL
+
+from mjx_dher import config, ddpg, envs, make_train, replay, samplers, sweep, trainer
+from point_mass import PointMass
+from probes import Explodes
+
+
+@pytest.fixture(autouse=True)
+def strict(monkeypatch):
+    """Optax's own arithmetic is exempt: Adam raises a float to the power of its count."""
+    update = ddpg._ADAM.update
+
+    def as_ever(*args):
+        with jax.numpy_dtype_promotion("standard"):
+            return update(*args)
+
+    monkeypatch.setattr(ddpg, "_ADAM", ddpg._ADAM._replace(update=as_ever))
+    with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
+        yield
+
+
+def test_it_would_be_noticed():
+    with pytest.raises(ValueError, match="rank_promotion"):
+        jnp.zeros((2, 3)) + jnp.zeros(3)
+    with pytest.raises(ValueError, match="no available implicit dtype promotion"):
+        jnp.zeros(3) + jnp.zeros(3, jnp.int32)
+
+
+def trace(env, sampler, **changes):
+    program = make_train(env, dataclasses.replace(SMALL, **changes), sampler)
+    return jax.eval_shape(program.epoch, trainer.state_template(program))
+
+
+@pytest.mark.parametrize("name", [name for name in config.SAMPLERS if name != "weighted"])
+def test_an_epoch_with_each_sampler(name):
+    trace(PointMass(), samplers.make(name))
+
+
+@pytest.mark.parametrize("kernel", config.WEIGHT_KERNELS)
+def test_an_epoch_with_each_kernel(kernel):
+    trace(PointMass(), samplers.make("weighted", kernel))
+
+
+def test_an_epoch_in_which_physics_may_blow_up():
+    trace(Explodes(None), None)
+
+
+def test_an_epoch_of_a_sweep_s_lanes():
+    program = make_train(PointMass(), SMALL, samplers.one_of([samplers.make(name) for name in ("random", "weighted", "final")]))
+    lanes = sweep.Lane(*(jnp.zeros(3) for _ in sweep.Lane._fields))
+    states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)
+    jax.eval_shape(jax.vmap(program.epoch), states)
+
+
+def test_replay_drawn_from_without_rows():
+    program = make_train(PointMass(), SMALL)
+    ring = trainer.state_template(program).replay
+    jax.eval_shape(lambda ring, key: replay.sample(ring, key, 5), ring, jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", envs.list_envs())
+def test_the_tasks(name):
+    env = envs.make(name, engine="native")
+    states = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 2))
+    jax.eval_shape(jax.vmap(env.step), states, jax.ShapeDtypeStruct((2, env.action_size), jnp.float32))

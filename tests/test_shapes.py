@@ -1,0 +1,170 @@
+"""The shapes and dtypes that the docstrings state, by jaxtyping, with a size of its own for each letter.
+
+Functions are traced, not run. Letters are those of `mjx_dher.types`; T1 is T+1.
+"""
+# ruff: noqa: F722, F821
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+from beartype import beartype
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key, TypeCheckError, jaxtyped
+
+from mjx_dher import HParams, config, ddpg, relabel, replay, samplers
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.types import Batch, Episode
+
+E, N, B, T, D, G, A = 11, 3, 5, 7, 13, 2, 4
+HP = HParams()
+NETWORKS = ddpg.Networks(Actor(A, (8,)), Critic((8,)))
+
+
+def shape(*sizes, dtype=jnp.float32):
+    return jax.ShapeDtypeStruct(sizes, dtype)
+
+
+KEY = jax.eval_shape(lambda: jax.random.key(0))
+EPISODES = Episode(shape(N, T + 1, D), shape(N, T + 1, G), shape(N, G), shape(N, T, A))
+RING = jax.eval_shape(lambda: replay.init(jax.tree.map(lambda x: shape(*x.shape[1:]), EPISODES), E))
+SAMPLE = jax.eval_shape(lambda ring, key: replay.sample(ring, key, B), RING, KEY)
+BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B))
+typed = jaxtyped(typechecker=beartype)
+fields = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.fields(tree))  # noqa: E731
+
+NewEpisodes = tuple[Float[Array, "N T1 D"], Float[Array, "N T1 G"], Float[Array, "N G"], Float[Array, "N T A"]]
+Stored = tuple[Float[Array, "E T1 D"], Float[Array, "E T1 G"], Float[Array, "E G"], Float[Array, "E T A"]]
+Marks = tuple[Bool[Array, "E"], Int[Array, ""], Int[Array, ""]]
+Ring = tuple[Stored, Marks]
+Ends = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B A"]]
+Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], Int[Array, "B"]]
+Drawn = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B G"], Float[Array, "B A"], Float[Array, "B"]]
+Rows = tuple[Int[Array, "B"], Int[Array, "E"], Bool[Array, ""]]
+Noise = tuple[Float[Array, "T N A"], Bool[Array, "T N"], Float[Array, "T N A"]]
+
+
+def from_ring(state):
+    return fields(state.episodes), (state.eventful, state.cursor, state.size)
+
+
+def to_ring(ring):
+    return replay.ReplayState(Episode(*ring[0]), *ring[1])
+
+
+def from_sample(sample):
+    return fields(sample)[:3], *fields(sample)[3:]
+
+
+def to_sample(sample):
+    return replay.Sample(*sample[0], *sample[1:])
+
+
+# A name stands for one size in all arguments and the result; an argument `like` is there to say which.
+
+
+@typed
+def added(ring: Ring, new: NewEpisodes) -> Ring:
+    return from_ring(replay.add(to_ring(ring), Episode(*new), jnp.zeros(N, bool), jnp.ones(N, bool)))
+
+
+def test_replay():
+    @typed
+    def sampled(ring: Ring, key: Key[Array, ""], rows: Int[Array, "B"]) -> Sample:
+        return from_sample(replay.sample(to_ring(ring), key, B, rows))
+
+    @typed
+    def rows(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Rows:
+        state = to_ring(ring)
+        counts = replay.count_eventful(state)
+        return replay.draw_rows(state, key, B, 0.5, counts), counts, replay.can_sample(state)
+
+    @typed
+    def goals(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Float[Array, "B T1 G"]:
+        return replay.sample_episode_goals(to_ring(ring), key, B)
+
+    jax.eval_shape(added, from_ring(RING), fields(EPISODES))
+    for function in (sampled, rows, goals):
+        jax.eval_shape(function, from_ring(RING), KEY, shape(B, dtype=jnp.int32))
+
+
+@pytest.mark.parametrize("name", config.SAMPLERS)
+def test_samplers(name):
+    @typed
+    def log_weights(achieved: Float[Array, "T1 G"], desired: Float[Array, "G"], step: Int[Array, ""]) -> Float[Array, "T1"]:
+        return samplers.make(name).log_weights(achieved, desired, step, HP)
+
+    jax.eval_shape(log_weights, shape(T + 1, G), shape(G), shape(dtype=jnp.int32))
+
+
+def test_drawing():
+    @typed
+    def draw(key: Key[Array, ""], weights: Float[Array, "B T1"]) -> tuple[Int[Array, "B"], Float[Array, "B T1"]]:
+        return samplers.draw(key, weights), samplers.probabilities(weights)
+
+    jax.eval_shape(draw, KEY, shape(B, T + 1))
+
+
+def reward(achieved, desired):
+    return -jnp.linalg.norm(achieved - desired, axis=-1)
+
+
+@pytest.mark.parametrize("name", ["random", "weighted"])
+def test_relabel(name):
+    @typed
+    def relabelled(ring: Ring, sample: Sample, key: Key[Array, ""]) -> tuple[Drawn, Float[Array, "B G"]]:
+        args = to_ring(ring), to_sample(sample), samplers.make(name)
+        return fields(relabel.relabel(*args, reward, HP, key)), relabel.hindsight_goals(*args, HP, key)
+
+    @typed
+    def eventful(*episodes: Float[Array, "N ..."]) -> Bool[Array, "N"]:
+        return relabel.is_eventful(Episode(*episodes), reward)
+
+    jax.eval_shape(relabelled, from_ring(RING), from_sample(SAMPLE), KEY)
+    jax.eval_shape(eventful, *fields(EPISODES))
+
+
+def test_ddpg():
+    @typed
+    def acted(observation: Float[Array, "*N D"], goal: Float[Array, "*N G"], like: Float[Array, "A"]) -> Float[Array, "*N A"]:
+        state = ddpg.init(jax.random.key(0), NETWORKS, D, G, A)
+        return ddpg.act(NETWORKS, state, {"observation": observation, "desired_goal": goal, "achieved_goal": goal}, HP)
+
+    @typed
+    def noise(key: Key[Array, ""], like: Float[Array, "T N A"]) -> Noise:
+        return tuple(ddpg.exploration_noise(key, T, N, A, HP))
+
+    @typed
+    def explored(action: Float[Array, "N A"], random: Bool[Array, "N"]) -> Float[Array, "N A"]:
+        return ddpg.explore(ddpg.Noise(action, random, action), action)
+
+    @typed
+    def updated(batch: Drawn) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, "B"]]:
+        state = ddpg.init(jax.random.key(0), NETWORKS, D, G, A)
+        following, losses = ddpg.update(NETWORKS, state, Batch(*batch), HP)
+        # What learning changes keeps its shapes and dtypes.
+        before, after = (jax.tree.map(lambda x: (x.shape, x.dtype), x) for x in (state, ddpg.update_target(following, HP)))
+        assert before == after
+        return *losses, ddpg.target_value(NETWORKS, state.target, Batch(*batch), HP)
+
+    for lead in ((), (N,), (T, N)):
+        jax.eval_shape(acted, shape(*lead, D), shape(*lead, G), shape(A))
+    jax.eval_shape(noise, KEY, shape(T, N, A))
+    jax.eval_shape(explored, shape(N, A), shape(N, dtype=bool))
+    jax.eval_shape(updated, fields(BATCH))
+
+
+def test_it_would_be_noticed():
+    """Goals where observations belong, actions of another number of episodes, and a result of another size."""
+    observation, goal, desired, action = fields(EPISODES)
+    for wrong in ((goal, observation, desired, action), (observation, goal, desired, shape(N + 1, T, A))):
+        with pytest.raises(TypeCheckError):
+            jax.eval_shape(added, from_ring(RING), wrong)
+
+    @typed
+    def cut(rows: Int[Array, "B"]) -> tuple[Int[Array, "B"], Int[Array, "B"]]:
+        return rows, rows[1:]
+
+    with pytest.raises(TypeCheckError):
+        jax.eval_shape(cut, shape(B, dtype=jnp.int32))
