@@ -1,0 +1,81 @@
+"""What docs/examples and docs/tutorial.md show."""
+
+import re
+
+import many_copies
+import many_seeds
+import numpy as np
+import own_learner
+import pytest
+from conftest import EXAMPLES, ROOT
+
+from mjx_dher import cli, testing
+from point_mass import PointMass
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
+
+
+def test_each_is_short():
+    lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py")}
+    assert set(lengths) == {"point_mass.py", "own_learner.py", "many_copies.py", "many_seeds.py"}
+    assert max(lengths.values()) < 60
+
+
+def test_a_regression_learns_from_replay_and_weighted_relabelling(capsys):
+    own_learner.main(["--rounds", "6", "--updates", "40"])
+    success = [float(line.split()[-1]) for line in capsys.readouterr().out.splitlines()]
+    assert len(success) == 6
+    assert success[0] < 0.3
+    assert success[-1] > 0.8
+
+
+def test_many_copies_are_stepped(capsys):
+    many_copies.main(["--env", "point_mass:PointMass", "--num-envs", "4", "--steps", "3"])
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.startswith("12 steps in ")
+    assert second.startswith("observations (4, 2), mean reward -")
+
+
+def test_many_seeds_are_trained_at_once_and_summed_up(capsys):
+    many_seeds.main(["--seeds", "4", "--epochs", "6"])
+    lines = capsys.readouterr().out.splitlines()
+    found = [
+        re.fullmatch(r"epoch (\d), (\d+) steps: success ([\d.]+) \(([\d.]+) to ([\d.]+)\)", line).groups() for line in lines
+    ]
+    assert [row[:2] for row in found] == [(str(n), str(200 * n)) for n in range(1, 7)]
+    success = np.array([row[2:] for row in found], float)
+    assert np.all((success[:, 1] <= success[:, 0]) & (success[:, 0] <= success[:, 2]))
+    assert success[-1, 0] > success[0, 0] + 0.4
+
+
+def test_the_tutorial_shows_the_example_as_it_is():
+    code = (EXAMPLES / "point_mass.py").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", TUTORIAL, re.S)
+    shown = [block for block in blocks if "class " in block or "def " in block]
+    assert len(shown) >= 3
+    for block in shown:
+        assert block in code
+
+
+def test_the_tutorial_s_check_passes():
+    (check,) = [block for block in re.findall(r"```python\n(.*?)```", TUTORIAL, re.S) if "check_env" in block]
+    namespace = {}
+    exec(compile(check, "tutorial.md", "exec"), namespace)
+    assert namespace["check_env"] is testing.check_env
+    assert namespace["PointMass"] is PointMass
+
+
+def tutorial_command():
+    (command,) = re.findall(r"^PYTHONPATH=docs/examples python train\.py (.*?[^\\])$", TUTORIAL, re.M | re.S)
+    return command.replace("\\\n", "").split()
+
+
+def test_the_tutorial_s_command_is_one():
+    args = cli.parse_train_args(tutorial_command())
+    assert (args.config.env, args.config.sampler) == ("point_mass:PointMass", "point_mass:soon")
+
+
+@pytest.mark.slow
+def test_the_tutorial_s_command_trains(tmp_path, capsys):
+    assert cli.main([*tutorial_command(), "--out", str(tmp_path / "run")]) == 0
+    assert float(re.search(r"^success ([\d.]+)", capsys.readouterr().out, re.M)[1]) >= 0.95
