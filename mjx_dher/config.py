@@ -342,7 +342,7 @@ def sampler_names() -> tuple[str, ...]:
 
 
 def metric_names() -> tuple[str, ...]:
-    """Likewise the metrics."""
+    """The metrics known so far; see `sampler_names`."""
     module = sys.modules.get("mjx_dher.samplers")
     return tuple(module.METRICS) if module else METRICS
 

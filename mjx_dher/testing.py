@@ -1,8 +1,10 @@
 """A check for authors of environments: all that this library relies on, tried out on one.
 
-from mjx_dher.testing import check_env
+In a test:
 
-check_env(MyTask())
+    from mjx_dher.testing import check_env
+
+    check_env(MyTask())
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class Train(NamedTuple):
 def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Train:
     """The training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
 
-    Hindsight goals are chosen by `sampler`, or else by the one that `config` names.
+    Hindsight goals are chosen by `sampler`, or else by the one that `config` names. `config.env` is not read.
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
     and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the

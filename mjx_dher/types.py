@@ -72,6 +72,9 @@ class EnvState(Protocol):
 class Env(Protocol):
     """An unbatched, pure, goal-conditioned environment of fixed horizon; `jax.vmap` is the batch.
 
+    `step` takes an action [A]. `compute_reward` takes goals [..., G] and gives rewards [...]; the learner's targets are clipped
+    to [-1/(1-gamma), 0], so they should lie between -1 and 0. `testing.check_env` tries an environment out.
+
     It may have `check()`, which the trainer calls on the host after each epoch, and which raises ValueError where the steps
     were not what they should be and their results do not show it.
     """
