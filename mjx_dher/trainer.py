@@ -170,10 +170,10 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
 def _moved(goal: Array, hindsight: Array) -> Metrics:
     """The share of goals [B, G] that were replaced, and how far away, in the mean, those are that took their place."""
     distance = jnp.linalg.norm(hindsight - goal, axis=-1)
-    replaced = distance > 0
+    replaced = (distance > 0).astype(jnp.float32)
     return {
         "relabelled_share": jnp.mean(replaced),
-        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1),
+        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1.0),
     }
 
 
