@@ -44,7 +44,7 @@ PACKAGES = {
     "numpy": None,
     "jax-cuda12-plugin": "cuda",
     "warp-lang": "cuda",
-    "gymnasium": None,
+    "gymnasium": "gym",
     "matplotlib": "plot",
     "imageio-ffmpeg": "video",
     "onnx": "export",

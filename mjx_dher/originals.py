@@ -121,7 +121,8 @@ def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
     for seed in range(first_seed, first_seed + episodes):
         obs, _ = env.reset(seed=seed)
         distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
-        ended, info, ret = False, {}, 0.0
+        ended, ret = False, 0.0
+        info: dict[str, Any] = {}
         while not ended:
             obs, reward, _, ended, info = env.step(policy(obs))
             ret += float(reward)

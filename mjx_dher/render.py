@@ -11,7 +11,7 @@ import itertools
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +113,20 @@ def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
     return None if done.returncode == 0 else (done.stderr.strip().splitlines() or ["crashed"])[-1]
 
 
+def check_drawable(env: Any) -> None:
+    """Raises ValueError unless `env` has what `play` and `draw` need."""
+    import jax
+
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    places = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
+    if not (hasattr(env, "model") and places):
+        name = getattr(env, "name", type(env).__name__)
+        raise ValueError(
+            f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`), states with `physics.qpos` and goals of"
+            " size 3"
+        )
+
+
 def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whole episodes side by side, as what is needed to draw them.
 
@@ -131,14 +145,7 @@ def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int)
     import jax
     import jax.numpy as jnp
 
-    start = jax.eval_shape(env.reset, jax.random.key(seed))
-    places = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
-    if not (hasattr(env, "model") and places):
-        name = getattr(env, "name", type(env).__name__)
-        raise ValueError(
-            f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`), states with `physics.qpos` and goals of"
-            " size 3"
-        )
+    check_drawable(env)
 
     def step(state, key):
         following = jax.vmap(env.step)(state, act(state.obs, key))
@@ -178,7 +185,7 @@ def stills(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: 
     return np.concatenate(list(draw(model, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
-def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
+def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Generator[np.ndarray]:
     """A picture [height, width, 3] uint8 of each configuration, with the goal as a red ball.
 
     Args:

@@ -1,0 +1,313 @@
+import importlib
+import re
+import subprocess
+import sys
+import warnings
+from collections import Counter
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import ROOT
+from gymnasium.utils import seeding
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+
+import mjx_dher.gym
+import mjx_dher.render
+from mjx_dher import envs
+from mjx_dher.envs.base import GoalEnv
+from probes import Explodes
+
+REACH = "mjx_dher/FetchReach-v0"
+SB3_INSTALL = "pip install stable-baselines3"
+
+traced = Counter()
+
+
+class Probe(Explodes, GoalEnv):
+    """No physics: a point, of which the episodes that start at x > 0.2 fail at their third step. Counts what is traced."""
+
+    name = "probe"
+
+    def __init__(self, engine):
+        super().__init__(None)
+
+    def reset(self, key):
+        traced["reset"] += 1
+        return super().reset(key)
+
+    def step(self, state, action):
+        traced["step"] += 1
+        return super().step(state, action)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(envs, "_REGISTRY", envs._REGISTRY | {"probe": Probe})
+        yield
+
+
+def assert_same(a, b, atol=0.0):
+    """What environments return, nested as it is: the same keys, dtypes and values."""
+    assert type(a) is type(b)
+    if isinstance(a, tuple):
+        assert_same(dict(enumerate(a)), dict(enumerate(b)), atol)
+    elif isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key], atol)
+    else:
+        assert np.asarray(a).dtype == np.asarray(b).dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize(("id", "name"), mjx_dher.gym.IDS.items())
+def test_every_task_is_registered_with_its_spaces(id, name):
+    env, pure = gymnasium.make(f"mjx_dher.gym:{id}"), envs.make(name)
+    assert env.spec.max_episode_steps == pure.episode_length == 50
+    sizes = {"observation": 10 if name == "reach" else 25, "achieved_goal": 3, "desired_goal": 3}
+    assert {key: (space.shape, space.dtype) for key, space in env.observation_space.items()} == {
+        key: ((size,), np.float32) for key, size in sizes.items()
+    }
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
+    assert env.metadata["render_fps"] == 25
+
+
+def test_an_episode_is_that_of_the_pure_environment():
+    env, pure = gymnasium.make(REACH, engine="native"), envs.make("reach", engine="native")
+    step = jax.jit(pure.step)
+    state = jax.jit(pure.reset)(jax.random.key(int(seeding.np_random(7)[0].integers(2**31))))
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 4)).astype(np.float32)
+    obs, info = env.reset(seed=7)
+    assert_same(obs, jax.tree.map(np.asarray, dict(state.obs)))
+    assert info == {"is_success": float(state.success), "failed": False}
+    start = obs["achieved_goal"]
+    for number, action in enumerate(actions, start=1):
+        state = step(state, action)
+        obs, reward, terminated, truncated, info = env.step(action)
+        assert_same(obs, jax.tree.map(np.asarray, dict(state.obs)))
+        assert (reward, terminated, truncated) == (float(state.reward), False, number == 50)
+        assert info == {"is_success": float(state.success), "failed": False}
+        assert reward == env.unwrapped.compute_reward(obs["achieved_goal"], obs["desired_goal"], info)
+    assert np.abs(obs["achieved_goal"] - start).max() > 0.01
+
+
+def test_a_seed_decides_all_episodes_that_follow():
+    env = mjx_dher.gym.GymEnv("probe")
+    first, second = env.reset(seed=3)[0], env.reset()[0]
+    assert_same(env.reset(seed=3)[0], first)
+    assert_same(env.reset()[0], second)
+    starts = [tuple(obs["achieved_goal"]) for obs in (first, second, env.reset(seed=4)[0])]
+    assert len(set(starts)) == 3
+
+
+def test_many_at_once_are_as_many_single_ones():
+    """Against gymnasium's own vectorisation: two restarts, in the middle of which comes another seed."""
+    settings = {"num_envs": 3, "engine": "native"}
+    ours = gymnasium.make_vec(REACH, vectorization_mode="vector_entry_point", max_episode_steps=4, **settings)
+    theirs = gymnasium.make_vec(REACH, vectorization_mode="sync", max_episode_steps=4, **settings)
+    assert isinstance(ours, mjx_dher.gym.GymVectorEnv)
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+    rng, truncations = np.random.default_rng(1), []
+    for seed, steps in ((5, 12), ([1, None, 2], 6)):
+        assert_same(ours.reset(seed=seed), theirs.reset(seed=seed), atol=1e-5)
+        for _ in range(steps):
+            actions = rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+            here, there = ours.step(actions), theirs.step(actions)
+            assert_same(here, there, atol=1e-5)
+            assert here[0] in ours.observation_space
+            truncations.append(here[3].all())
+    # Four steps, and one that resets.
+    assert truncations == [number % 5 == 4 for number in range(1, 13)] + [number % 5 == 4 for number in range(1, 7)]
+    assert [random.bit_generator.state for random in ours.np_random] == [
+        random.bit_generator.state for random in theirs.np_random
+    ]
+    assert ours.np_random_seed == theirs.np_random_seed
+
+
+@pytest.mark.parametrize("make", [mjx_dher.gym.GymEnv, mjx_dher.gym.GymVectorEnv])
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+def test_rewards_are_those_of_the_environment_on_any_leading_axes(make, reward_type):
+    env, pure = make("reach", reward_type=reward_type), envs.make("reach", reward_type=reward_type)
+    achieved = np.random.default_rng(0).uniform(-0.05, 0.05, (5, 2, 3))
+    rewards = env.compute_reward(achieved, np.zeros(3), [{}] * 10)
+    assert (rewards.shape, rewards.dtype) == ((5, 2), np.float32)
+    exact = {"rtol": 0, "atol": 0 if reward_type == "sparse" else 1e-8}
+    np.testing.assert_allclose(rewards, pure.compute_reward(jnp.asarray(achieved), jnp.zeros(3)), **exact)
+    for index in np.ndindex(5, 2):
+        alone = env.compute_reward(achieved[index], np.zeros(3), {})
+        assert np.ndim(alone) == 0
+        np.testing.assert_allclose(alone, rewards[index], **exact)
+    distances = np.linalg.norm(achieved, axis=-1)
+    assert 0 < (distances > 0.05).mean() < 1
+    np.testing.assert_allclose(rewards, -1.0 * (distances > 0.05) if reward_type == "sparse" else -distances, atol=1e-7)
+    assert env.compute_reward(np.zeros((0, 3)), np.zeros((0, 3)), []).shape == (0,)
+    for ends in (env.compute_terminated, env.compute_truncated):
+        assert not ends(achieved[0, 0], np.zeros(3), {})
+        np.testing.assert_array_equal(ends(achieved, np.zeros(3), [{}] * 10), np.zeros((5, 2), bool))
+
+
+def test_what_was_compiled_serves_all_instances():
+    def play():
+        for env, actions in (
+            (mjx_dher.gym.GymEnv("probe"), np.zeros(2)),
+            (mjx_dher.gym.GymVectorEnv("probe", num_envs=3), np.zeros((3, 2))),
+            (mjx_dher.gym.GymEnv("probe", engine="auto"), np.zeros(2)),
+        ):
+            env.reset()
+            for _ in range(3):
+                env.step(actions)
+
+    play()
+    before = traced.copy()
+    play()
+    assert traced == before
+    assert traced["step"] <= 2  # single, and many
+
+
+def test_physics_that_blew_up_is_reported_until_the_episode_ends():
+    env = mjx_dher.gym.GymVectorEnv("probe", num_envs=16)
+    obs, infos = env.reset(seed=0)
+    breaks = obs["observation"][:, 0] > Explodes.EDGE
+    assert 0 < breaks.sum() < 16
+    failed = [infos["failed"]] + [env.step(np.zeros((16, 2)))[-1]["failed"] for _ in range(11)]
+    expected = [breaks & (number >= 3) for number in range(11)] + [np.zeros(16, bool)]
+    np.testing.assert_array_equal(failed, expected)
+    single = mjx_dher.gym.GymEnv("probe")
+    single.reset(seed=int(np.flatnonzero(breaks)[0]))
+    assert [single.step(np.zeros(2))[-1]["failed"] for _ in range(4)] == [False, False, True, True]
+
+
+def test_what_is_returned_belongs_to_the_caller():
+    env = mjx_dher.gym.GymVectorEnv("probe", num_envs=2)
+    obs, _ = env.reset(seed=0)
+    kept = {key: value.copy() for key, value in obs.items()}
+    for value in obs.values():
+        value += 1
+    following = env.step(np.zeros((2, 2)))[0]
+    np.testing.assert_array_equal(following["achieved_goal"], kept["achieved_goal"])
+
+
+REFUSED = [
+    (lambda: gymnasium.make(REACH, engine="natve"), "engine must be one of auto, native, jax, warp; got 'natve'"),
+    (lambda: gymnasium.make(REACH, colour=1), "option of engine native must be one of num_threads; got 'colour'"),
+    (lambda: gymnasium.make(REACH, reward_type="sprase"), "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
+    (lambda: gymnasium.make(REACH, episode_length=20), "episode_length is called max_episode_steps in gymnasium.make"),
+    (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), "render_mode must be one of rgb_array; got 'ansi'"),
+    (lambda: mjx_dher.render.check_drawable(Probe("auto")), "probe cannot be rendered: it needs a MuJoCo model"),
+    (lambda: mjx_dher.gym.GymEnv("pusch"), r"env must be one of .*did you mean 'push'"),
+    (lambda: gymnasium.make_vec(REACH, num_envs=0), "num_envs must be an integer of at least 1; got 0"),
+    (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), "max_episode_steps must be an integer of at least 1; got 0"),
+    (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), "many environments at once are not drawn"),
+    (lambda: single().step(np.zeros(3)), r"action must have shape \(2,\); got \(3,\)"),
+    (lambda: single().step(np.array([0, np.nan])), r"action must be finite; got \[ 0. nan\]"),
+    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got 'goal'"),
+    (lambda: single().render(), 'must be made with render_mode="rgb_array"'),
+    (lambda: single().compute_reward(np.zeros(2), np.zeros(3), {}), r"goals must end in an axis of 2; got .*\(3,\)"),
+    (lambda: many().step(np.zeros(2)), r"action must have shape \(2, 2\); got \(2,\)"),
+    (lambda: many().step(np.full((2, 2), np.inf)), "action must be finite"),
+    (lambda: many().reset(seed=[1]), "seed must be one number or one for each of 2 environments; got 1"),
+    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got 'reset_mask'"),
+]
+
+
+def single():
+    env = mjx_dher.gym.GymEnv("probe")
+    env.reset(seed=0)
+    return env
+
+
+def many():
+    env = mjx_dher.gym.GymVectorEnv("probe", num_envs=2)
+    env.reset(seed=0)
+    return env
+
+
+@pytest.mark.parametrize(("act", "message"), REFUSED)
+def test_what_cannot_be_is_refused(act, message):
+    with pytest.raises(ValueError, match=message):
+        act()
+
+
+@pytest.mark.parametrize("env", [("GymEnv", (2,)), ("GymVectorEnv", (1, 2))])
+def test_a_step_needs_a_reset(env):
+    name, shape = env
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset must be called before step"):
+        getattr(mjx_dher.gym, name)("probe").step(np.zeros(shape))
+
+
+def test_the_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "mjx_dher.gym")
+    with pytest.raises(ImportError, match=r'pip install "mjx-dher\[gym\]"'):
+        importlib.import_module("mjx_dher.gym")
+
+
+# In a process of its own: MuJoCo chooses how to draw when it is imported, which other tests have done.
+SCRIPT = """
+import sys
+import gymnasium, mjx_dher.gym
+assert not {"jax", "mujoco"} & set(sys.modules)
+import numpy as np
+try:
+    env = gymnasium.make("mjx_dher/FetchReach-v0", render_mode="rgb_array")
+except ValueError as error:
+    print(error)
+    sys.exit(77)
+pictures = []
+for seed in (0, 1):
+    env.reset(seed=seed)
+    pictures += [env.render(), env.render()]
+assert all(picture.shape == (480, 480, 3) and picture.dtype == np.uint8 for picture in pictures)
+assert np.array_equal(pictures[0], pictures[1]) and np.array_equal(pictures[2], pictures[3])
+assert not np.array_equal(pictures[0], pictures[2])  # another goal
+for _ in range(3):
+    env.step(np.array([0, 0, -1, 0]))
+assert not np.array_equal(env.render(), pictures[3])  # the arm has moved
+env.close()
+"""
+
+
+def test_pictures_follow_the_state():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode == 77:
+        pytest.skip(f"nothing on this machine can draw: {done.stdout.strip()}")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+TASKS = [pytest.param(id, marks=() if id == REACH else pytest.mark.slow) for id in mjx_dher.gym.IDS]
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_gymnasiums_checker_has_nothing_to_say(id):
+    """But that observations have no bounds, which those of the original have not either."""
+    env = gymnasium.make(id, engine="native")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped, skip_render_check=True)
+    assert all("infinity. This is probably too" in str(warning.message) for warning in said), [str(w.message) for w in said]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reward_type", ["sparse", "dense"])
+@pytest.mark.parametrize("id", mjx_dher.gym.IDS)
+def test_stable_baselines3s_checker_has_nothing_to_say(id, reward_type):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=SB3_INSTALL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gymnasium.make(id, engine="native", reward_type=reward_type).unwrapped)
+
+
+@pytest.mark.slow
+def test_stable_baselines3_learns_to_reach(capsys):
+    """The example of docs/gymnasium.md; it prints its success over 100 episodes."""
+    pytest.importorskip("stable_baselines3", reason=SB3_INSTALL)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "gymnasium.md").read_text(), re.S)
+    (example,) = [block for block in blocks if "stable_baselines3" in block]
+    exec(compile(example, "gymnasium.md", "exec"), {})
+    assert float(capsys.readouterr().out.split()[-1]) >= 0.9
