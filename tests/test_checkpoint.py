@@ -208,11 +208,11 @@ def test_a_disk_with_too_little_left_is_refused_before_anything_is_written(progr
     assert restore(copy, program).epoch == 3
 
 
-# The command line, on the real thing.
+# The command line.
 
 TINY = """
-    --env reach --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --replay-size 1000
-    --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4 --checkpoint-every 3
+    --env docs.examples.point_mass:PointMass --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1
+    --batch-size 16 --replay-size 1000 --hidden-sizes 8 8 --eval-episodes 2 --final-episodes 4 --checkpoint-every 20
 """.split()  # noqa: SIM905
 TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
 
@@ -237,11 +237,11 @@ def wait_for(condition, process):
 
 def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     """SIGKILL after a checkpoint, then SIGTERM, then to the end: metrics and policy are those of a run in one go."""
-    steps = ["--total-steps", "8000"]
+    steps = ["--total-steps", "16000"]
     whole, out = tmp_path / "whole", tmp_path / "run"
     alone = start(*TINY, *steps, "--out", whole)
     first = start(*TINY, *steps, "--out", out)
-    wait_for(lambda: (out / "checkpoints" / "epoch-000006").exists(), first)
+    wait_for(lambda: run_folder.checkpoints(out), first)
     busy = subprocess.run([sys.executable, "train.py", "resume", out], cwd=ROOT, capture_output=True, text=True, check=False)
     first.kill()
     first.communicate()
@@ -261,7 +261,7 @@ def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     assert (third.returncode, stderr) == (0, "")
     assert f"going on from {newest}" in stdout
     alone.communicate(timeout=200)
-    assert len(table(whole)) == 81
+    assert len(table(whole)) == 801
     assert table(out) == table(whole)
     for name, array in np.load(whole / "policy.npz").items():
         np.testing.assert_array_equal(np.load(out / "policy.npz")[name], array)
