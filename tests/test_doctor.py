@@ -150,7 +150,7 @@ def test_it_can_be_read():
         "versions",
         "  jax         0.10.2",
         "  matplotlib  not installed (extra plot)",
-        "  gymnasium   not installed",
+        "  gymnasium   not installed (extra gym)",
         "machine",
         "  cores       2",
         "  devices     gpu NVIDIA H200 (memory 113.0 GB), cpu cpu (memory unknown)",
