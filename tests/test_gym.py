@@ -19,6 +19,7 @@ import mjx_dher.gym
 import mjx_dher.render
 from mjx_dher import envs
 from mjx_dher.envs.base import GoalEnv
+from mjx_dher.envs.engines import resolve_engine
 from probes import Explodes
 
 REACH = "mjx_dher/FetchReach-v0"
@@ -157,7 +158,7 @@ def test_what_was_compiled_serves_all_instances():
         for env, actions in (
             (mjx_dher.gym.GymEnv("probe"), np.zeros(2)),
             (mjx_dher.gym.GymVectorEnv("probe", num_envs=3), np.zeros((3, 2))),
-            (mjx_dher.gym.GymEnv("probe", engine="auto"), np.zeros(2)),
+            (mjx_dher.gym.GymEnv("probe", engine=resolve_engine("auto")), np.zeros(2)),
         ):
             env.reset()
             for _ in range(3):
