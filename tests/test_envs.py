@@ -11,6 +11,7 @@ from mjx_dher import envs
 from mjx_dher.envs import fetch
 from mjx_dher.envs.engines import Physics
 from mjx_dher.envs.engines.base import with_stand_ins
+from probes import PointMass
 
 ENGINES = ("native", "jax")
 RECORDED = ("push", "pick_and_place", "slide")
@@ -380,9 +381,18 @@ def test_bad_names_and_overrides_are_refused(args, kwargs, message):
 
 def test_register(monkeypatch):
     monkeypatch.setattr(envs, "_REGISTRY", dict(envs._REGISTRY))
-    envs.register("mine", lambda engine, size=1: (engine, size))
+
+    class Mine(PointMass):
+        def __init__(self, engine, size=1):
+            super().__init__()
+            self.made_with = engine, size
+
+    envs.register("mine", Mine)
     envs.register("also_mine", "probes:PointMass")
-    assert envs.make("mine", size=3) == ("auto", 3)
+    assert envs.make("mine", size=3).made_with == ("auto", 3)
+    envs.register("nothing", lambda engine: (engine,))
+    with pytest.raises(ValueError, match="env 'nothing' is no environment: it has no action_size"):
+        envs.make("nothing")
     assert {"mine", "also_mine"} <= set(envs.list_envs())
     for name, constructor, message in (
         ("push", dict, "environment 'push' is already registered"),
