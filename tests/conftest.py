@@ -14,10 +14,12 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
-# What one test has compiled the next one need not; but nothing of a test stays in the user's cache folder.
-os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache = tempfile.mkdtemp()
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
-atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+# What one test has compiled the next one need not, in whichever of the processes that run side by side (see pyproject.toml);
+# but nothing of a test stays in the user's cache folder.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache = tempfile.mkdtemp()
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES)]
 
 
