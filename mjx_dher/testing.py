@@ -63,6 +63,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = 1e-3) -> None:
     _check_state(env, first, "reset")
     second = _check_step(env, first, actions[0, 0])
     _check_scan(env, keys[0])
+    _check_reward_shapes(env, len(first.obs["achieved_goal"]))
     _check_same("reset, called twice with the same key", _attempt("reset", env.reset, keys[0]), first, tolerance)
     again = _attempt("step", env.step, first, actions[0, 0])
     _check_same("step, called twice with the same state and action", again, second, tolerance)
@@ -183,6 +184,17 @@ def _check_scan(env: Env, key: jax.Array) -> None:
             raise EnvError(f"step must keep shapes and dtypes, for lax.scan; the state's {name} is {old} and becomes {new}")
 
 
+def _check_reward_shapes(env: Env, goal_size: int) -> None:
+    for leading in ((), (3,), (2, 3)):
+        goals = jax.ShapeDtypeStruct((*leading, goal_size), jnp.float32)
+        what = f"compute_reward of goals {list(goals.shape)}"
+        found = _attempt(what, jax.eval_shape, env.compute_reward, goals, goals)
+        if found.shape != leading:
+            raise EnvError(f"{what} must be {list(leading)}; it is {list(found.shape)}")
+        if found.dtype != jnp.float32:
+            raise EnvError(f"compute_reward must be float32; it is {found.dtype}")
+
+
 def _check_same(what: str, found: Any, expected: Any, tolerance: float) -> None:
     got, wanted = _seen(found), _seen(expected)
     for name, value in wanted.items():
@@ -237,14 +249,6 @@ def _check_against_play(env: Env, keys: jax.Array, actions: jax.Array, states: A
 
 def _check_reward(env: Env, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:
     achieved, desired = played["achieved_goal"], played["desired_goal"]
-    for index in ((0, 0), (0,), ()):
-        goals = achieved[index], desired[index]
-        found = _attempt(f"compute_reward of goals {list(goals[0].shape)}", jax.eval_shape, env.compute_reward, *goals)
-        shape, expected = list(found.shape), list(goals[0].shape[:-1])
-        if shape != expected:
-            raise EnvError(f"compute_reward of goals {list(goals[0].shape)} must be {expected}; it is {shape}")
-        if found.dtype != jnp.float32:
-            raise EnvError(f"compute_reward must be float32; it is {found.dtype}")
     reward = jax.jit(env.compute_reward)
     batched = np.asarray(reward(achieved, desired))
     single = np.asarray(jax.jit(jax.vmap(jax.vmap(env.compute_reward)))(achieved, desired))

@@ -36,6 +36,7 @@ def test_many_copies_are_stepped(capsys):
     assert second.startswith("observations (4, 2), mean reward -")
 
 
+@pytest.mark.slow
 def test_many_seeds_are_trained_at_once_and_summed_up(capsys):
     many_seeds.main(["--seeds", "4", "--epochs", "6"])
     lines = capsys.readouterr().out.splitlines()

@@ -2,14 +2,10 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import EXAMPLES, ROOT
 
 import mjx_dher
 from mjx_dher import cli, cli_sweep, config, envs, samplers
@@ -38,36 +34,35 @@ TWO = 2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A folder with a module of the user's, and in it a run that was stopped: (folder, what the command printed)."""
+    """A folder with a module of the user's, and in it a run that was stopped."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "my_tasks.py").write_text(MY_TASKS)
-    command = [sys.executable, str(ROOT / "train.py"), *OWN, "--total-steps", "60", "--out", "run"]
-    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES), "STOP_AFTER_AN_EPOCH": "1"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 130, done.stdout + done.stderr
-    return folder, done.stdout
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("STOP_AFTER_AN_EPOCH", "1")
+        assert cli.main([*OWN, "--total-steps", "60", "--out", "run"]) == 130
+    return folder
 
 
 def test_a_run_in_the_current_folder_s_module_is_resumed_and_evaluated(folder, monkeypatch, capsys):
-    there, printed = folder
-    assert printed.startswith("my_tasks:MyTask, sampler my_tasks:soon, seed 0; physics none")
-    monkeypatch.chdir(there)
+    monkeypatch.chdir(folder)
     assert cli.main(["resume", "run"]) == 0
+    assert "my_tasks:MyTask, sampler my_tasks:soon, seed 0; physics none" in capsys.readouterr().out
     assert cli.main(["eval", "run", "--episodes", "3"]) == 0
     assert "my_tasks:MyTask: 3 episodes" in capsys.readouterr().out
-    settings = json.loads((there / "run" / "config.json").read_text())["config"]
+    settings = json.loads((folder / "run" / "config.json").read_text())["config"]
     assert (settings["env"], settings["sampler"]) == ("my_tasks:MyTask", "my_tasks:soon")
-    with (there / "run" / "metrics.csv").open() as file:
+    with (folder / "run" / "metrics.csv").open() as file:
         assert [row["env_steps"] for row in csv.DictReader(file)] == ["20", "40", "60"]
 
 
 def test_its_policy_needs_no_module(folder):
-    policy = mjx_dher.load_policy(folder[0] / "run")
+    policy = mjx_dher.load_policy(folder / "run")
     assert policy({"observation": np.zeros((5, 2)), "desired_goal": np.zeros((5, 2))}).shape == (5, 2)
 
 
 def test_a_sweep_takes_them(folder, monkeypatch):
-    monkeypatch.chdir(folder[0])
+    monkeypatch.chdir(folder)
     _, (cell,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
     assert (cell.config.env, cell.config.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
     assert cell.name.startswith("my_tasks-mytask-my_tasks-soon-s0-")
@@ -75,10 +70,10 @@ def test_a_sweep_takes_them(folder, monkeypatch):
 
 @pytest.mark.slow
 def test_a_sweep_trains_them(folder, monkeypatch, capsys):
-    monkeypatch.chdir(folder[0])
+    monkeypatch.chdir(folder)
     assert cli.main(["sweep", *OWN, "--total-steps", "20", "--seeds", "1", "--lanes", "1", "--out", "sweep"]) == 0
     assert "my_tasks:soon" in capsys.readouterr().out
-    assert len(list((folder[0] / "sweep" / "cells").iterdir())) == 1
+    assert len(list((folder / "sweep" / "cells").iterdir())) == 1
 
 
 def test_what_has_no_model_is_not_rendered():
@@ -126,7 +121,7 @@ def test_make_imports_it():
     ],
 )
 def test_what_cannot_be_used_is_refused(folder, monkeypatch, make, name, message):
-    monkeypatch.syspath_prepend(str(folder[0]))
+    monkeypatch.syspath_prepend(str(folder))
     with pytest.raises((ValueError, TypeError), match=message):
         make(name)
 

@@ -13,7 +13,15 @@ from point_mass import PointMass, PointState
 from probes import Explodes
 
 
-@pytest.mark.parametrize("env", [PointMass(), PointMass(episode_length=1), Explodes(None)])
+class Quick(PointMass):
+    """PointMass whose starts are compiled in no time: many are, below."""
+
+    def reset(self, key):
+        start, goal = 0.4 * jnp.sin(jnp.outer(jnp.array([1.0, 2.0]), jax.random.key_data(key).astype(jnp.float32)))
+        return self._state(start, goal)
+
+
+@pytest.mark.parametrize("env", [PointMass(episode_length=1), Explodes(None)])
 def test_what_is_as_it_should_be_passes(env):
     check_env(env)
 
@@ -26,7 +34,7 @@ def test_the_tasks_pass(env, reward_type):
 
 
 def test_what_an_environment_checks_itself_is_asked_last():
-    class Checked(PointMass):
+    class Checked(Quick):
         def check(self):
             raise ValueError("contacts were lost")
 
@@ -35,12 +43,12 @@ def test_what_an_environment_checks_itself_is_asked_last():
 
 
 def broken(**members):
-    """PointMass with other members; functions of one instance are its methods."""
-    return type("Broken", (PointMass,), members)()
+    """Quick with other members; functions are its methods."""
+    return type("Broken", (Quick,), members)()
 
 
 def with_obs(name, change):
-    """PointMass whose obs[name] is changed."""
+    """Quick whose obs[name] is changed."""
 
     def state(self, position, goal):
         right = PointMass._state(self, position, goal)
@@ -50,7 +58,7 @@ def with_obs(name, change):
 
 
 def with_state(**changes):
-    """PointMass whose states have fields changed by functions of the state."""
+    """Quick whose states have fields changed by functions of the state."""
 
     def state(self, position, goal):
         right = PointMass._state(self, position, goal)
@@ -81,7 +89,7 @@ def counting(first, later):
     """Counts steps, from `first`; `later(count)` is the next count."""
 
     def reset(self, key):
-        state = PointMass.reset(self, key)
+        state = Quick.reset(self, key)
         return Counting(state.obs, state.reward, state.success, first)
 
     def step(self, state, action):
@@ -115,7 +123,7 @@ def drifting():
 def forgetful():
     """Its starts depend on how many there have been."""
     calls = itertools.count()
-    return broken(reset=lambda self, key: PointMass.reset(self, jax.random.fold_in(key, next(calls))))
+    return broken(reset=lambda self, key: Quick.reset(self, jax.random.fold_in(key, next(calls))))
 
 
 def traced_otherwise(self, state, action):
@@ -184,7 +192,7 @@ BROKEN = {
     "no reward function": (broken(compute_reward=None), "compute_reward must be a method; it is None"),
     "reset fails": (broken(reset=lambda self, key: jnp.zeros(2) + jnp.zeros(3)), "reset raises TypeError: "),
     "no pytree": (
-        broken(reset=lambda self, key: Plain(PointMass.reset(self, key))),
+        broken(reset=lambda self, key: Plain(Quick.reset(self, key))),
         "reset must give a pytree of arrays, such as a flax.struct.dataclass; it is a Plain",
     ),
     "a name in the state": (counting("first", lambda count: count), r"its leaf \.count is a str"),
@@ -220,7 +228,7 @@ BROKEN = {
     "hidden step": (drifting(), "step, called twice with the same state and action, must give the same result"),
     "NaN later": (broken(step=diverging), "observation must be finite, or the state say `failed`; it is not after [1-9]"),
     "always fails": (Explodes(None, edge=-1.0), "every episode of random actions said `failed`"),
-    "one start": (broken(reset=lambda self, key: PointMass.reset(self, jax.random.key(0))), "8 keys gave the same"),
+    "one start": (broken(reset=lambda self, key: Quick.reset(self, jax.random.key(0))), "8 keys gave the same"),
     "moving goal": (broken(step=new_goal), "desired_goal must stay the same for an episode; it changed at step 1"),
     "other when traced": (
         broken(step=traced_otherwise),
@@ -231,7 +239,7 @@ BROKEN = {
         "step, alone and under jax.jit and jax.vmap, must give the same result; .* differs by",
     ),
     "refuses": (broken(step=refusing), r"step with an action of \+-3 raises ValueError: action out of range"),
-    "reward of all goals": (broken(compute_reward=over_all), r"of goals \[8, 2\] must be \[8\]; it is \[\]"),
+    "reward of all goals": (broken(compute_reward=over_all), r"of goals \[3, 2\] must be \[3\]; it is \[\]"),
     "reward of whole numbers": (broken(compute_reward=whole_numbers), "must be float32; it is int32"),
     "reward of the batch": (broken(compute_reward=over_the_batch), "must be that of each; it depends on the others"),
     "late reward": (
