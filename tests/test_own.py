@@ -48,8 +48,8 @@ def test_a_run_in_the_current_folder_s_module_is_resumed_and_evaluated(folder, m
     monkeypatch.chdir(folder)
     assert cli.main(["resume", "run"]) == 0
     assert "my_tasks:MyTask, sampler my_tasks:soon, seed 0; physics none" in capsys.readouterr().out
-    assert cli.main(["eval", "run", "--episodes", "3"]) == 0
-    assert "my_tasks:MyTask: 3 episodes" in capsys.readouterr().out
+    assert cli.main(["eval", "run", "--episodes", "4"]) == 0
+    assert "my_tasks:MyTask: 4 episodes" in capsys.readouterr().out
     settings = json.loads((folder / "run" / "config.json").read_text())["config"]
     assert (settings["env"], settings["sampler"]) == ("my_tasks:MyTask", "my_tasks:soon")
     with (folder / "run" / "metrics.csv").open() as file:
@@ -59,6 +59,11 @@ def test_a_run_in_the_current_folder_s_module_is_resumed_and_evaluated(folder, m
 def test_its_policy_needs_no_module(folder):
     policy = mjx_dher.load_policy(folder / "run")
     assert policy({"observation": np.zeros((5, 2)), "desired_goal": np.zeros((5, 2))}).shape == (5, 2)
+
+
+def test_a_policy_is_played_where_there_is_no_check(folder):
+    outcome = cli.play(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
+    assert outcome.success.shape == (4,)
 
 
 def test_a_sweep_takes_them(folder, monkeypatch):
