@@ -8,6 +8,7 @@ ended and named after its settings and a digest of them; so a sweep that was cut
 from __future__ import annotations
 
 import collections
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -25,6 +26,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig, RunFolderError
 
 if TYPE_CHECKING:
+    from mjx_dher.metrics import Sink
     from mjx_dher.trainer import Progress
 
 CELLS = "cells"
@@ -148,7 +150,7 @@ def _run_group(
 ) -> None:
     import jax
 
-    from mjx_dher import memory, samplers, trainer
+    from mjx_dher import memory, metrics, policy, samplers, trainer
 
     static = group[0].config
     config_lib.validate(static, group[0].hparams, env.episode_length)
@@ -165,7 +167,7 @@ def _run_group(
         on_program(f"{static.env}: compiling for {together}, of {len(group)} ...")
         started = time.perf_counter()
         compiled = trainer.compile_program(program, *_stack(group, choices, size))
-        trainer.check_env(env)
+        trainer.check_steps(env)
         needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
         on_program(f"{static.env}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
         if available is None or compiled.nbytes <= available or size == 1:
@@ -175,20 +177,24 @@ def _run_group(
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
-        curves: list[tuple[dict[str, float], dict[str, Any]]] = []  # what is the same for all lanes, and arrays over them
-        for progress in trainer.run(env, static, compiled, trainer.Start(compiled.init(keys, hparams))):
-            counts = {name: getattr(progress, name) for name in ("epoch", "env_steps", "updates", "wall_seconds")}
-            curves.append((counts, progress.metrics))
-            on_epoch(chunk, progress)
+        with contextlib.ExitStack() as stack:
+            sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size)) for cell in chunk]
+            for progress in trainer.run(env, static, compiled, trainer.Start(compiled.init(keys, hparams))):
+                counts = {name: getattr(progress, name) for name in metrics.COUNTS}
+                for lane, sink in enumerate(sinks):
+                    sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
+                on_epoch(chunk, progress)
         final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
         final = jax.device_get(evaluate(progress.state, final_keys))
-        trainer.check_env(env)
+        trainer.check_steps(env)
         learners = jax.device_get(progress.state.learner)
         for lane, cell in enumerate(chunk):
             learner = jax.tree.map(lambda x, lane=lane: x[lane], learners)
-            curve = [{**counts, **{name: float(values[lane]) for name, values in found.items()}} for counts, found in curves]
+            policy.from_learner(learner, cell.hparams).save(_path(folder, cell) / run_folder.POLICY_FILE)
+            last = {"epochs": counts["epoch"], "env_steps": counts["env_steps"], "wall_seconds": counts["wall_seconds"]}
             result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": final_episodes}
-            _write(folder, cell, run_folder.engine_name(env), size, curve, result, learner)
+            # Last of all: the cell is done when this is there.
+            run_folder.write_json(_path(folder, cell) / run_folder.RESULT_FILE, {**last, "lanes": size, **result})
 
 
 def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size: int) -> tuple[Any, Any]:
@@ -206,21 +212,13 @@ def _path(folder: Path, cell: Cell) -> Path:
     return folder / CELLS / cell.name
 
 
-def _write(
-    folder: Path, cell: Cell, engine: str, lanes: int, curve: list[dict[str, Any]], result: dict[str, Any], learner: Any
-) -> None:
-    from mjx_dher import metrics, policy
+def _begin(folder: Path, cell: Cell, engine: str, lanes: int) -> contextlib.closing[Sink]:
+    """Makes the cell's folder, and the sink for its curve, which is there to be read while it grows."""
+    from mjx_dher import metrics
 
     path = _path(folder, cell)
     run_folder.create(path, RunConfig(cell.config, cell.hparams, cell.seed, engine), {"lanes": lanes})
-    policy.from_learner(learner, cell.hparams).save(path / run_folder.POLICY_FILE)
-    sink = metrics.CsvSink(path / run_folder.METRICS_FILE)
-    for row in curve:
-        sink.write(row)
-    sink.close()
-    last = {"epochs": curve[-1]["epoch"], "env_steps": curve[-1]["env_steps"], "wall_seconds": curve[-1]["wall_seconds"]}
-    # Last of all: the cell is done when this is there.
-    run_folder.write_json(path / run_folder.RESULT_FILE, {**last, "lanes": lanes, **result})
+    return contextlib.closing(metrics.CsvSink(path / run_folder.METRICS_FILE))
 
 
 def read(folder: Path) -> list[dict[str, Any]]:

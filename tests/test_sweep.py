@@ -115,6 +115,8 @@ def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had
     with pytest.raises(KeyboardInterrupt):
         run(cut, cells, lanes=2, on_epoch=stop_in_the_second_chunk)
     assert [sweep.is_done(cut, cell) for cell in cells] == [True] * 2 + [False] * 4
+    curves = [cut / "cells" / cell.name / "metrics.csv" for cell in cells]
+    assert [path.exists() and len(path.read_text().splitlines()) for path in curves] == [2, 2, 2, 2, False, False]
     assert len(table(cut)) == 2
     run(cut, [cell for cell in cells if not sweep.is_done(cut, cell)], lanes=2)
     run(whole, cells, lanes=2)
