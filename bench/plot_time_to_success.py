@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -35,7 +36,7 @@ def main() -> None:
     args = parser.parse_args()
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True)
     for axis, column, scale, label in zip(axes, (0, 1), (1, 1e3), ("seconds of training", "thousand environment steps")):
-        for source, (color, dashes) in zip(args.sources, LOOKS):
+        for source, (color, dashes) in zip(args.sources, itertools.cycle(LOOKS)):
             name = f"{source.stem} {args.label}".strip()
             for points in read(source).values():
                 line = ([p[column] / scale for p in points], [p[2] for p in points])

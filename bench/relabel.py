@@ -39,8 +39,8 @@ def transitions_a_second(draw, num_drawn):
     return ROUNDS * num_drawn / median_seconds(lambda: run(keys))
 
 
-def flashbax(ring, shape):
-    """A function key -> transitions [*shape] from an item buffer that holds those of `ring`."""
+def flashbax(ring, num_drawn):
+    """A function key -> transitions [num_drawn] from an item buffer that holds those of `ring`."""
     import flashbax as fbx
 
     episodes = ring.episodes
@@ -53,7 +53,6 @@ def flashbax(ring, shape):
         next_observation=flat(episodes.observation[:, 1:]),
         desired_goal=desired,
     )
-    num_drawn = shape[0] * shape[1]
     buffer = fbx.make_item_buffer(max_length=len(desired), min_length=1, sample_batch_size=num_drawn, add_batches=True)
     state = buffer.add(buffer.init(jax.tree.map(lambda x: x[0], items)), items)
     return lambda key: buffer.sample(state, key).experience
@@ -74,7 +73,7 @@ def main() -> None:
         draw = lambda key, sampler=sampler: draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)  # noqa: E731
         rates[name] = transitions_a_second(draw, num_drawn)
     if args.flashbax:
-        rates["flashbax, not relabelled"] = transitions_a_second(flashbax(ring, shape), num_drawn)
+        rates["flashbax, not relabelled"] = transitions_a_second(flashbax(ring, num_drawn), num_drawn)
     rows = [
         (name, f"{rate:,.0f}", f"{1e6 * args.batch_size / rate:.1f}", f"{rates['future'] / rate:.2f}")
         for name, rate in rates.items()

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import memory
-from mjx_dher.run_folder import CHECKPOINTS, RunFolderError, checkpoints
+from mjx_dher.run_folder import CHECKPOINTS, RunFolderError, checkpoints, checkpoints_to_resume, read_versioned
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
@@ -99,17 +99,17 @@ def restore(folder: Path, template: Any) -> Restored:
       template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
 
     Raises:
-      CheckpointError: there is none; says why each that is there cannot be used.
+      RunFolderError: there is none.
+      CheckpointError: says why each that is there cannot be used.
     """
     refused: list[str] = []
-    for path in checkpoints(folder):
+    for path in checkpoints_to_resume(folder):
         try:
             manifest, state = _load(path, template)
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, tuple(refused))
-        except CheckpointError as error:
+        except RunFolderError as error:
             refused.append(str(error))
-    why = "\n".join(refused) or "it was stopped before it had saved any (see --checkpoint-every)"
-    raise CheckpointError(f"{folder} has no checkpoint to go on from: {why}")
+    raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused))
 
 
 def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
@@ -137,14 +137,9 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads((path / MANIFEST).read_text())
+        content = read_versioned(path / MANIFEST, SCHEMA)
     except FileNotFoundError:
         raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is damaged: {MANIFEST} cannot be read ({error})") from error
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        found = content.get("schema") if isinstance(content, dict) else None
-        raise CheckpointError(f"{path} is not of this program's checkpoint schema {SCHEMA} (found {found!r})")
     if content.pop("sha256", None) != _digest_of(content):
         raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
     return content

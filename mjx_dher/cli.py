@@ -191,16 +191,15 @@ def resume_command(argv: list[str], console: Console) -> int:
     """`resume RUN`: goes on with a run that was stopped."""
     args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
     _check_engine(args.engine)
-    run = run_folder.read_config(args.run)
     started = run_folder.read_content(args.run)
+    run = run_folder.to_config(args.run, started)
     defaults = {field.name: field.default for field in dataclasses.fields(TrainArgs)}
     options = {name: getattr(args, name) for name in _OPTIONS}
     options = {name: started.get(name, defaults[name]) if value is None else value for name, value in options.items()}
     _check_options(**options)
     if (args.run / run_folder.RESULT_FILE).exists():
         raise run_folder.RunFolderError(f"{args.run} has ended; there is nothing to go on with")
-    if not (args.run / run_folder.CHECKPOINTS).is_dir():
-        raise run_folder.RunFolderError(f"{args.run} has no checkpoint to go on from: it was stopped before it had saved any")
+    run_folder.checkpoints_to_resume(args.run)
     keep_compiled_programs()
     ran = run.engine if run.engine in config.ENGINES else run.config.engine  # "none": the environment has none
     env = envs.make(run.config.env, engine=args.engine or ran)
@@ -469,7 +468,7 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
     import numpy as np
 
     from mjx_dher.evaluate import evaluate
-    from mjx_dher.trainer import check_env
+    from mjx_dher.trainer import check_steps
 
     keep_compiled_programs()
     chunk = min(num_episodes, EVAL_CHUNK)
@@ -480,7 +479,7 @@ def play(env: GoalEnv, policy: Policy, num_episodes: int, seed: int) -> Outcome:
 
     keys = jax.random.split(jax.random.key(seed), -(-num_episodes // chunk))
     outcomes = [jax.device_get(run(key)) for key in keys]
-    check_env(env)
+    check_steps(env)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
 
 

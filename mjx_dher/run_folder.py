@@ -157,9 +157,50 @@ def checkpoints(path: Path) -> list[Path]:
     return sorted((path / CHECKPOINTS).glob("epoch-*"), reverse=True)
 
 
+def checkpoints_to_resume(path: Path) -> list[Path]:
+    """As `checkpoints`, where there must be one.
+
+    Raises:
+      RunFolderError: there is none.
+    """
+    if found := checkpoints(path):
+        return found
+    raise RunFolderError(
+        f"{path} has no checkpoint to go on from: it was stopped before it had saved any (see --checkpoint-every)"
+    )
+
+
+def read_versioned(file: Path, schema: int) -> dict[str, Any]:
+    """An object of JSON that names its schema.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      RunFolderError: it cannot be read, or is of another schema.
+    """
+    try:
+        content = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        raise RunFolderError(f"{file} cannot be read ({error})") from error
+    found = content.get("schema") if isinstance(content, dict) else None
+    if found != schema:
+        raise RunFolderError(f"{file} is not of this program's schema {schema} (found {found!r})")
+    return content
+
+
 def read_content(path: Path) -> dict[str, Any]:
-    """All of config.json; `read_config` checks it."""
-    return json.loads((path / CONFIG_FILE).read_text())
+    """All of the config.json of the run in `path`.
+
+    Raises:
+      RunFolderError: no run folder, or one of another schema; the message says which.
+    """
+    if not path.is_dir():
+        raise RunFolderError(f"{path} is not a run folder: no such folder")
+    try:
+        return read_versioned(path / CONFIG_FILE, SCHEMA)
+    except FileNotFoundError:
+        raise RunFolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
 
 
 def read_config(path: Path) -> RunConfig:
@@ -168,18 +209,15 @@ def read_config(path: Path) -> RunConfig:
     Raises:
       RunFolderError: no run folder, or one of another schema; the message says which.
     """
-    file = path / CONFIG_FILE
-    if not path.is_dir():
-        raise RunFolderError(f"{path} is not a run folder: no such folder")
-    try:
-        content = json.loads(file.read_text())
-    except FileNotFoundError:
-        raise RunFolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
-    except (OSError, ValueError) as error:
-        raise RunFolderError(f"{file} cannot be read ({error})") from error
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        found = content.get("schema") if isinstance(content, dict) else None
-        raise RunFolderError(f"{file} is not of this program's schema {SCHEMA} (found {found!r})")
+    return to_config(path, read_content(path))
+
+
+def to_config(path: Path, content: dict[str, Any]) -> RunConfig:
+    """What `read_content` gave of the run in `path`, as `read_config` gives it.
+
+    Raises:
+      RunFolderError: something is missing in it, or of another kind.
+    """
     try:
         config = dict(content["config"])
         config["hidden_sizes"] = tuple(config["hidden_sizes"])
@@ -190,4 +228,4 @@ def read_config(path: Path) -> RunConfig:
             engine=str(content["engine"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise RunFolderError(f"{file} does not describe a run ({error})") from error
+        raise RunFolderError(f"{path / CONFIG_FILE} does not describe a run ({error})") from error

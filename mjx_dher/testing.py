@@ -76,7 +76,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = 1e-3) -> None:
     _check_state(env, _attempt(beyond, env.step, first, 3.0 * jnp.sign(actions[0, 0])), beyond)
     _check_reward(env, played, valid, tolerance)
     _check_success(played, valid)
-    trainer.check_env(env)
+    trainer.check_steps(env)
 
 
 def _attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:

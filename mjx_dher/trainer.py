@@ -286,7 +286,7 @@ def train(
     started = time.perf_counter()
     key = jax.random.key(seed)
     compiled = compile_program(program, key, hparams)
-    check_env(env)
+    check_steps(env)
     on_compile(time.perf_counter() - started)
     for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
         # To the digits that float32 has: 95 of 100 are 0.95, which float(float32) is not.
@@ -336,7 +336,7 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)
             state, metrics = running.result()
-            check_env(env)
+            check_steps(env)
             now = time.perf_counter()
             yield Progress(
                 epoch=number,
@@ -355,8 +355,8 @@ def _arrays(hparams: HParams) -> HParams:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
 
 
-def check_env(env: Env) -> None:
-    """Calls `env.check()`, where the environment has one."""
+def check_steps(env: Env) -> None:
+    """Calls `env.check()`, where the environment has one: whether its steps so far were whole."""
     if (check := getattr(env, "check", None)) is not None:
         check()
 
