@@ -219,8 +219,7 @@ def _check_options(final_episodes: int, checkpoint_every: int, keep: int, log: S
     metrics.check(log)
     config.check_count("final_episodes", final_episodes)
     config.check_count("keep", keep)
-    if checkpoint_every < 0:
-        raise ValueError(f"checkpoint_every must be a number of epochs, or 0; got {checkpoint_every}")
+    config.check_every("checkpoint_every", checkpoint_every)
 
 
 def parse_train_args(argv: list[str]) -> TrainArgs:

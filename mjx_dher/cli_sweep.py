@@ -58,7 +58,7 @@ class SweepArgs:
     """Train every combination of environments, samplers, numbers and seeds, and compare them.
 
     Runs that differ in sampler, numbers or seed are trained side by side in one compiled program. Each finished run is a run
-    folder in cells/: the same command again trains what is missing, and a larger one what is new.
+    folder in cells/: the same command again goes on where a sweep was stopped, and a larger one trains what is new.
     """
 
     out: Path
@@ -84,6 +84,8 @@ class SweepArgs:
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
     final_episodes: int = 500
     """Episodes of the evaluation that ends each run."""
+    checkpoint_every: int = 10
+    """Epochs between checkpoints of the runs side by side, from which the same command goes on; 0: only when it is stopped."""
     threshold: float = 0.9
     """Success rate for the time that it takes to get there."""
     baseline: str = "future"
@@ -125,6 +127,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
     config.check_name("preset", args.preset, ("auto", *config.PRESETS))
     for field in ("seeds", "final_episodes", *(("lanes",) if args.lanes is not None else ())):
         config.check_count(field, getattr(args, field))
+    config.check_every("checkpoint_every", args.checkpoint_every)
     if args.first_seed < 0:
         raise ValueError(f"first_seed must be an integer of at least 0; got {args.first_seed}")
     _check_threshold(args.threshold)
@@ -161,16 +164,19 @@ def sweep_command(argv: list[str], console: Console) -> int:
     if todo:
         keep_compiled_programs()
         screen = _Screen(console, todo)
-        previous_handler = signal.signal(signal.SIGINT, screen.on_interrupt)
+        handlers = {number: signal.signal(number, screen.on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             make_env = lambda static: envs.make(static.env, engine=static.engine)  # noqa: E731
-            sweep.run(args.out, todo, make_env, args.lanes, args.final_episodes, console.print, screen.show)
+            options = (args.lanes, args.final_episodes, args.checkpoint_every)
+            say = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
+            sweep.run(args.out, todo, make_env, *options, say, screen.show)
         except KeyboardInterrupt:
             left = sum(not sweep.is_done(args.out, cell) for cell in cells)
-            console.print(f"stopped; {len(cells) - left} runs are done, and the same command trains the other {left}")
-            return 130
+            console.print(f"stopped; {len(cells) - left} runs are done, and the same command goes on with the other {left}")
+            return 128 + (screen.stop_asked or signal.SIGINT)
         finally:
-            signal.signal(signal.SIGINT, previous_handler)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
             screen.close()
     found = sweep.read(args.out)
     sweep.write_tables(args.out, found)
@@ -226,10 +232,13 @@ class _Screen:
     def __init__(self, console: Console, todo: Sequence[Cell]):
         self._console = console
         self._total = sum(cell.config.total_steps for cell in todo)
-        self._done = 0.0
+        self._done = 0.0  # environment steps, of all runs
+        self._done_before = 0.0  # the present ones
+        self._present: Sequence[Cell] = ()
+        self._trained = 0.0  # since this start of the sweep, in `_seconds`
         self._seconds = 0.0
         self._printed = time.monotonic()
-        self._stop_asked = False
+        self.stop_asked: int | None = None  # the signal
         self._bar: Bar | None = None
         if console.is_terminal:
             self._bar = Bar(BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
@@ -237,24 +246,28 @@ class _Screen:
             self._bar.start()
 
     def on_interrupt(self, signum: int, frame: Any) -> None:
-        """Ctrl-C: the epoch under way cannot be cut short, so the first one waits for its end."""
-        if self._stop_asked:
+        """Ctrl-C or SIGTERM: the epoch under way cannot be cut short, so the first one waits for its end."""
+        if self.stop_asked is not None:
             self._console.show_cursor(True)
             sys.stdout.flush()
-            os._exit(130)  # what has ended is on the disk already
-        self._stop_asked = True
-        self._console.print("stopping when this epoch has ended; Ctrl-C again stops at once. Finished runs are kept either way")
+            os._exit(128 + signum)  # what has ended is on the disk already
+        self.stop_asked = signum
+        self._console.print("stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved")
 
     def show(self, cells: Sequence[Cell], progress: Any) -> None:
         """After each epoch of those side by side; raises KeyboardInterrupt where a stop was asked for."""
         from mjx_dher.metrics import clock
 
-        if self._stop_asked:
+        if self.stop_asked is not None:
             raise KeyboardInterrupt
         total = cells[0].config.total_steps
-        self._done += len(cells) * total / progress.num_epochs
+        if cells is not self._present:
+            self._present, self._done_before = cells, self._done
+        an_epoch = len(cells) * total / progress.num_epochs
+        self._done = self._done_before + an_epoch * progress.epoch
+        self._trained += an_epoch
         self._seconds += progress.epoch_seconds
-        left = self._seconds * (self._total - self._done) / self._done
+        left = self._seconds * (self._total - self._done) / self._trained
         success = [float(rate) for rate in progress.metrics["success_rate"]][: len(cells)]
         by_sampler: dict[str, list[float]] = {}
         for cell, rate in zip(cells, success):

@@ -133,6 +133,16 @@ def check_count(field: str, value: int) -> None:
         raise ValueError(f"{field} must be an integer of at least 1; got {value}")
 
 
+def check_every(field: str, value: int) -> None:
+    """Refuses what is no interval of epochs.
+
+    Raises:
+      ValueError: less than 0.
+    """
+    if value < 0:
+        raise ValueError(f"{field} must be a number of epochs, or 0; got {value}")
+
+
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 

@@ -1,8 +1,9 @@
 """Many runs: every environment, sampler, number and seed of a grid, side by side in as few compiled programs as there can be.
 
 Runs that differ in seed, sampler, weight kernel or HParams are *lanes* of one vmapped program; environments are programs of
-their own. A lane follows the same draws as that run alone. A run is a *cell* of the grid: a run folder, written when it has
-ended and named after its settings and a digest of them; so a sweep that was cut short, or made larger, trains what is missing.
+their own. A lane follows the same draws as that run alone. A run is a *cell* of the grid: a run folder, named after its
+settings and a digest of them, with a result once it has ended; so a sweep that was cut short, or made larger, trains what is
+missing. Those side by side when it was cut short go on from their checkpoint, which they share.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import hashlib
 import itertools
 import json
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -27,9 +29,10 @@ from mjx_dher.run_folder import RunConfig, RunFolderError
 
 if TYPE_CHECKING:
     from mjx_dher.metrics import Sink
-    from mjx_dher.trainer import Progress
+    from mjx_dher.trainer import Progress, Start, TrainState
 
 CELLS = "cells"
+UNFINISHED = "unfinished"
 RESULTS = "results.csv"
 FINALS = "finals.csv"
 
@@ -108,10 +111,11 @@ def run(
     make_env: Callable[[Config], Any],
     lanes: int | None = None,
     final_episodes: int = 500,
+    checkpoint_every: int = 0,
     on_program: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[Cell], Progress], None] = lambda cells, progress: None,
 ) -> None:
-    """Trains the cells, and writes each one's folder when its lanes have ended.
+    """Trains the cells. Each one's curve is in its folder after every epoch, its result when its lanes have ended.
 
     Args:
       folder: of the sweep; it is made where it is not there.
@@ -119,8 +123,9 @@ def run(
       make_env: makes the environment of a Config.
       lanes: side by side at most; by default one on a CPU, whose cores one run fills, and elsewhere what its memory holds.
       final_episodes: of the evaluation that ends each run.
-      on_program: called with a line about each program, before it is compiled and after.
-      on_epoch: called after every epoch of those side by side.
+      checkpoint_every: epochs between checkpoints of those side by side; 0: only when the sweep is stopped.
+      on_program: called with a line about each program, before it is compiled and after, and about checkpoints.
+      on_epoch: called after every epoch of those side by side. It stops the sweep by raising KeyboardInterrupt.
 
     Raises:
       ValueError: a setting that cannot run, or a ring that does not fit into memory even alone.
@@ -131,7 +136,8 @@ def run(
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     for static, group in itertools.groupby(todo, key=lambda cell: _shared(cell.config)):
-        _run_group(folder, make_env(static), list(group), lanes, final_episodes, on_program, on_epoch)
+        _run_group(folder, make_env(static), list(group), lanes, final_episodes, checkpoint_every, on_program, on_epoch)
+    shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
 
 
 def _shared(static: Config) -> Config:
@@ -145,6 +151,7 @@ def _run_group(
     group: list[Cell],
     lanes: int | None,
     final_episodes: int,
+    checkpoint_every: int,
     on_program: Callable[[str], None],
     on_epoch: Callable[[Sequence[Cell], Progress], None],
 ) -> None:
@@ -177,13 +184,22 @@ def _run_group(
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
+        unfinished = _Unfinished(folder, chunk, size, on_program)
         with contextlib.ExitStack() as stack:
-            sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size)) for cell in chunk]
-            for progress in trainer.run(env, static, compiled, trainer.Start(compiled.init(keys, hparams))):
+            begin = unfinished.restore(compiled.init(keys, hparams))
+            engine = run_folder.engine_name(env)
+            sinks = [stack.enter_context(_begin(folder, cell, engine, size, begin.epoch)) for cell in chunk]
+            for progress in trainer.run(env, static, compiled, begin):
                 counts = {name: getattr(progress, name) for name in metrics.COUNTS}
                 for lane, sink in enumerate(sinks):
                     sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
-                on_epoch(chunk, progress)
+                try:
+                    on_epoch(chunk, progress)
+                except KeyboardInterrupt:
+                    unfinished.save(progress)
+                    raise
+                if checkpoint_every and progress.epoch % checkpoint_every == 0:
+                    unfinished.save(progress)
         final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
         final = jax.device_get(evaluate(progress.state, final_keys))
         trainer.check_steps(env)
@@ -195,6 +211,55 @@ def _run_group(
             result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": final_episodes}
             # Last of all: the cell is done when this is there.
             run_folder.write_json(_path(folder, cell) / run_folder.RESULT_FILE, {**last, "lanes": size, **result})
+        unfinished.forget()
+
+
+class _Unfinished:
+    """The checkpoint of cells that are trained side by side, in a folder named after them.
+
+    Args:
+      folder: of the sweep.
+      chunk: the cells.
+      size: lanes, of which the last ones may repeat the last cell.
+      say: called with a line about what was found or could not be done.
+    """
+
+    def __init__(self, folder: Path, chunk: Sequence[Cell], size: int, say: Callable[[str], None]):
+        digest = hashlib.sha256(json.dumps([size, *(cell.name for cell in chunk)]).encode()).hexdigest()[:10]
+        self.folder, self.say = folder / UNFINISHED / digest, say
+
+    def restore(self, state: TrainState) -> Start:
+        """Where these cells go on from: `state`, a fresh one, if there is no checkpoint that can be used."""
+        import jax
+
+        from mjx_dher import checkpoint, trainer
+
+        if not run_folder.checkpoints(self.folder):
+            return trainer.Start(state)
+        try:
+            found = checkpoint.restore(self.folder, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state))
+        except RunFolderError as error:
+            self.say(f"{error}; training these runs from their start")
+            return trainer.Start(state)
+        self.say(f"going on after epoch {found.epoch}")
+        # A lane's number for its sampler depends on which others there still are.
+        return trainer.Start(dataclasses.replace(found.state, hparams=state.hparams), found.epoch, found.wall_seconds)
+
+    def save(self, progress: Progress) -> None:
+        """A checkpoint in place of the one before. One that cannot be written is said to be so, and costs nothing else."""
+        from mjx_dher import checkpoint
+
+        if progress.epoch == progress.num_epochs:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            checkpoint.save(self.folder, progress.state, progress.epoch, progress.wall_seconds, keep=1)
+        except (OSError, checkpoint.CheckpointError) as error:
+            self.say(str(error))
+
+    def forget(self) -> None:
+        """The cells have ended."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size: int) -> tuple[Any, Any]:
@@ -212,13 +277,13 @@ def _path(folder: Path, cell: Cell) -> Path:
     return folder / CELLS / cell.name
 
 
-def _begin(folder: Path, cell: Cell, engine: str, lanes: int) -> contextlib.closing[Sink]:
-    """Makes the cell's folder, and the sink for its curve, which is there to be read while it grows."""
+def _begin(folder: Path, cell: Cell, engine: str, lanes: int, epochs: int) -> contextlib.closing[Sink]:
+    """Makes the cell's folder, and the sink for its curve, of which `epochs` are there already."""
     from mjx_dher import metrics
 
     path = _path(folder, cell)
     run_folder.create(path, RunConfig(cell.config, cell.hparams, cell.seed, engine), {"lanes": lanes})
-    return contextlib.closing(metrics.CsvSink(path / run_folder.METRICS_FILE))
+    return contextlib.closing(metrics.CsvSink(path / run_folder.METRICS_FILE, epochs))
 
 
 def read(folder: Path) -> list[dict[str, Any]]:

@@ -2,7 +2,9 @@ import csv
 import dataclasses
 import json
 import re
+import shutil
 import signal
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +126,97 @@ def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had
     assert table(cut, sweep.FINALS) == table(whole, sweep.FINALS)
 
 
+LONGER = dataclasses.replace(CONFIG, total_steps=5 * CONFIG.total_steps)
+
+
+def cut_short(folder, cells, epoch, **options):
+    """Trains until KeyboardInterrupt after `epoch`."""
+
+    def interrupt(chunk, progress):
+        if progress.epoch == epoch:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, cells, on_epoch=interrupt, **options)
+
+
+def test_what_ran_side_by_side_goes_on_from_its_checkpoint_to_the_same_tables(tmp_path):
+    cells, cut, whole, seen, said = grid(static=LONGER), tmp_path / "cut", tmp_path / "whole", [], []
+    cut_short(cut, cells, 3, lanes=4)
+    assert len(list((cut / "unfinished").glob("*/checkpoints/epoch-000003"))) == 1
+    run(cut, cells, lanes=4, on_epoch=lambda chunk, progress: seen.append(progress.epoch), on_program=said.append)
+    assert seen == [4, 5]
+    assert "going on after epoch 3" in said
+    assert not (cut / "unfinished").exists()
+    run(whole, cells, lanes=4)
+    assert table(cut) == table(whole)
+    assert table(cut, sweep.FINALS) == table(whole, sweep.FINALS)
+    seconds = [float(row["wall_seconds"]) for row in csv.DictReader((cut / "results.csv").open())][:5]
+    assert seconds == sorted(set(seconds))
+
+
+def test_a_checkpoint_is_made_every_so_many_epochs_and_one_is_kept(tmp_path):
+    found = []
+
+    def look(chunk, progress):
+        found.append([path.name for path in tmp_path.glob("unfinished/*/checkpoints/*")])
+
+    run(tmp_path, grid(("future",), (0,), static=LONGER), checkpoint_every=2, on_epoch=look)
+    assert found == [[], [], ["epoch-000002"], ["epoch-000002"], ["epoch-000004"]]
+    found.clear()
+    run(tmp_path, grid(("future",), (1,), static=LONGER), on_epoch=look)
+    assert found == [[]] * 5
+
+
+def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
+    """Alone, `closest` is the first of the samplers, and was the second when it was cut short."""
+    future, closest = grid(("future", "closest"), (0,), static=LONGER)
+    run(tmp_path / "first", [future], lanes=1)
+    cells = [future, closest]
+    ended = []
+
+    def interrupt(chunk, progress):
+        ended.append(progress.epoch)
+        if len(ended) == 5 + 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "cut", cells, lanes=1, on_epoch=interrupt)
+    assert [sweep.is_done(tmp_path / "cut", cell) for cell in cells] == [True, False]
+    run(tmp_path / "cut", [closest], lanes=1, on_epoch=lambda chunk, progress: ended.append(progress.epoch))
+    assert ended[-2:] == [4, 5]
+    run(tmp_path / "whole", [closest], lanes=1)
+    ours, alone = table(tmp_path / "cut"), table(tmp_path / "whole")
+    ours = [row for row in ours if row["sampler"] == "closest"]
+    for a, b in zip(ours, alone, strict=True):
+        assert {name: float(a[name]) for name in NUMBERS} == pytest.approx({name: float(b[name]) for name in NUMBERS}, rel=1e-2)
+
+
+NUMBERS = ("actor_norm", "critic_norm", "q_mean", "relabel_distance")
+
+
+@pytest.mark.parametrize("harm", ["damaged", "other lanes"])
+def test_without_a_checkpoint_that_fits_runs_begin_anew(tmp_path, harm):
+    cells, seen, said = grid(static=LONGER), [], []
+    cut_short(tmp_path, cells, 2, lanes=4)
+    if harm == "damaged":
+        (manifest,) = tmp_path.glob("unfinished/*/checkpoints/*/manifest.json")
+        manifest.write_text(manifest.read_text().replace('"epoch": 2', '"epoch": 1'))
+    on_epoch = lambda chunk, progress: seen.append(progress.epoch)  # noqa: E731
+    run(tmp_path, cells, lanes=4 if harm == "damaged" else 2, on_epoch=on_epoch, on_program=said.append)
+    assert seen == [1, 2, 3, 4, 5] * (1 if harm == "damaged" else 2)
+    assert any("manifest.json is not as it was written" in line for line in said) == (harm == "damaged")
+    assert [len(cell["curve"]["epoch"]) for cell in sweep.read(tmp_path)] == [5] * 4
+
+
+def test_a_checkpoint_that_cannot_be_written_does_not_end_the_sweep(tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
+    said = []
+    run(tmp_path, grid(("future",), (0,), static=LONGER), checkpoint_every=2, on_program=said.append)
+    assert sum("1.0 kB of the disk are free" in line for line in said) == 2
+    assert len(sweep.read(tmp_path)) == 1
+
+
 def test_the_tables_hold_every_epoch_and_every_setting(tmp_path):
     static = dataclasses.replace(CONFIG, total_steps=480)
     run(tmp_path, grid(("weighted",), (5,), (HParams(her_k=2.0), HParams(her_k=8.0)), static), lanes=2)
@@ -223,25 +316,32 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     assert min(written.values()) > 5000
 
 
-def test_ctrl_c_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys, number):
     """In the first epoch of the second of two programs."""
     show, seen = cli_sweep._Screen.show, []
 
     def interrupt(screen, cells, progress):
         seen.append(progress.epoch)
         if len(seen) == 5:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         show(screen, cells, progress)
 
     monkeypatch.setattr(cli_sweep._Screen, "show", interrupt)
-    handler = signal.getsignal(signal.SIGINT)
-    assert cli.main([*COMMAND, "--lanes", "2", "--out", str(tmp_path)]) == 130
+    handler = signal.getsignal(number)
+    command = [*COMMAND, "--lanes", "2", "--out", str(tmp_path)]
+    assert cli.main(command) == 128 + number
     said = capsys.readouterr().out
     assert "stopping when this epoch has ended" in said
-    assert "stopped; 2 runs are done, and the same command trains the other 2" in said
+    assert "stopped; 2 runs are done, and the same command goes on with the other 2" in said
     assert seen == [1, 2, 3, 4, 1]
-    assert signal.getsignal(signal.SIGINT) == handler
+    assert signal.getsignal(number) == handler
     assert len(table(tmp_path, sweep.FINALS)) == 2
+    assert cli.main(command) == 0
+    assert seen[5:] == [2, 3, 4]
+    said = capsys.readouterr().out
+    assert "going on after epoch 1" in said
+    assert "100%  point_mass, 2 runs: epoch 4/4" in said
 
 
 @pytest.mark.parametrize(
@@ -255,6 +355,7 @@ def test_ctrl_c_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, 
         (["--preset", "tpu"], "preset must be one of"),
         (["--seeds", "0"], "seeds must be an integer of at least 1; got 0"),
         (["--first-seed", "-1"], "first_seed must be an integer of at least 0; got -1"),
+        (["--checkpoint-every", "-1"], "checkpoint_every must be a number of epochs, or 0; got -1"),
         (["--lanes", "0"], "lanes must be an integer of at least 1; got 0"),
         (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
         (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 1\); got 1.5"),
