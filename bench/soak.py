@@ -3,10 +3,10 @@
     python bench/soak.py [--env push] [--minutes 60] [--out soak.csv] [-- OPTIONS OF train.py]
 
 Trains, with checkpoints and a log of JSON lines, until the time is up, and is then stopped as by SIGTERM. After each epoch it
-notes the memory held (resident), the processor time used and how often XLA has compiled. The epochs after the first tenth of
-the time, in which the replay ring fills, are cut into ten blocks; a line is fitted to the blocks' medians. Exits with 1 if
-anything compiled after the first epoch, if the 95 % interval of memory's slope lies above zero, or if steps per second change
-by 5 % or more along the line.
+notes the memory held (resident), how often XLA has compiled, and how fast the machine is (MuJoCo alone, for a moment). The
+epochs after the first tenth of the time, in which the replay ring fills, are cut into ten blocks; a line is fitted to the
+blocks' medians. Exits with 1 if anything compiled after the first epoch, if the 95 % interval of memory's slope lies above
+zero, or if steps per second, in terms of the machine's speed, change by 5 % or more along the line.
 """
 
 from __future__ import annotations
@@ -17,54 +17,64 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import scipy.stats
 from timing import print_table
 
-from mjx_dher import cli, memory
-from mjx_dher.run_folder import METRICS_FILE
+from mjx_dher import cli, envs, memory, metrics
 
 BLOCKS = 10
+REFERENCE_STEPS = 50_000
 COMPILATION = "/jax/core/compile/backend_compile_duration"
 
 
-class Watch(threading.Thread):
-    """Notes what each epoch leaves, as soon as its line is in metrics.csv, and stops the run when its time is up."""
+class Watch:
+    """A sink that notes what each epoch leaves, and stops the run when its time is up.
 
-    def __init__(self, run, seconds):
-        super().__init__(daemon=True)
-        self.file, self.seconds, self.rows, self.compilations = run / METRICS_FILE, seconds, [], []
-        self.ended = threading.Event()
+    Between epochs, while training waits, it also steps MuJoCo alone for a moment, to know how fast the machine is just then.
+    """
+
+    def __init__(self, env, seconds):
+        self.model, self.seconds, self.rows, self.compilations = envs.make(env, engine="native").model, seconds, [], 0
         jax.monitoring.register_event_duration_secs_listener(self._on_event)
+        self.since = None  # the first epoch's end
 
     def _on_event(self, name, seconds, **_):
-        if name == COMPILATION:
-            self.compilations.append(time.perf_counter())
+        self.compilations += name == COMPILATION
 
-    def run(self):
-        asked = False
-        while not self.ended.wait(0.05):
-            lines = self.file.read_text().splitlines()[1:] if self.file.exists() else []
-            if len(lines) > len(self.rows):
-                columns = lines[-1].split(",")
-                self.rows.append(
-                    {
-                        "epoch": int(columns[0]),
-                        "env_steps": int(columns[1]),
-                        "seconds": time.perf_counter(),
-                        "cpu_seconds": time.process_time(),
-                        "memory": memory.used_bytes(),
-                        "compilations": len(self.compilations),
-                    }
-                )
-            if self.rows and not asked and time.perf_counter() - self.rows[0]["seconds"] > self.seconds:
-                asked = True
-                os.kill(os.getpid(), signal.SIGTERM)
+    def write(self, row):
+        now = time.perf_counter()
+        if self.since is None:
+            self.since = self.begin = now
+        elif now - self.since > self.seconds:
+            os.kill(os.getpid(), signal.SIGTERM)
+        self.rows.append(
+            {
+                "epoch": row["epoch"],
+                "env_steps": row["env_steps"],
+                "seconds": now - self.since,
+                "epoch_seconds": now - self.begin,
+                "reference_seconds": self._reference(),
+                "memory": memory.used_bytes(),
+                "compilations": self.compilations,
+            }
+        )
+        self.begin = time.perf_counter()
+
+    def _reference(self):
+        data = mujoco.MjData(self.model)
+        started = time.perf_counter()
+        for _ in range(REFERENCE_STEPS):
+            mujoco.mj_step(self.model, data)
+        return time.perf_counter() - started
+
+    def close(self):
+        pass
 
 
 def line(minutes, values):
@@ -82,14 +92,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     parser.add_argument("options", nargs="*", help="of train.py, after --")
     args = parser.parse_args()
+    watch, open_sinks = Watch(args.env, args.minutes * 60), metrics.open_sinks
+    metrics.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
     with tempfile.TemporaryDirectory() as parent:
-        run = Path(parent) / "run"
-        watch = Watch(run, args.minutes * 60)
-        watch.start()
         command = ["--env", args.env, "--total-steps", "1000000000", "--checkpoint-every", "20", "--log", "jsonl"]
-        status = cli.main([*command, "--out", str(run), *args.options])
-        watch.ended.set()
-        watch.join()
+        status = cli.main([*command, "--out", str(Path(parent) / "run"), *args.options])
     if status != 128 + signal.SIGTERM:
         print(f"the run ended by itself, with status {status}", file=sys.stderr)
         return 1
@@ -103,25 +110,29 @@ def main() -> int:
 
 def report(rows) -> int:
     column = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
-    minutes = (column["seconds"] - column["seconds"][0]) / 60
-    steps = np.diff(column["env_steps"])
-    used = minutes[1:] > minutes[-1] / 10
-    speed = (steps / np.diff(column["seconds"]))[used]
-    speed_of_cpu = (steps / np.diff(column["cpu_seconds"]))[used]
-    held = column["memory"][1:][used] / 1e6
-    along = minutes[1:][used]
+    minutes = column["seconds"] / 60
+    used = minutes > minutes[-1] / 10
+    along, held = minutes[used], column["memory"][used] / 1e6
+    speed = (np.diff(column["env_steps"], prepend=0) / column["epoch_seconds"].clip(1e-9))[used]
+    machine_speed = (REFERENCE_STEPS / column["reference_seconds"])[used]
     span = along[-1] - along[0]
     again = int(column["compilations"][-1] - column["compilations"][0])
+    measured = {
+        "memory, MB": held,
+        "env steps/s": speed,
+        "the machine: mj_step/s, alone": machine_speed,
+        "env steps a thousand of these": 1000 * speed / machine_speed,
+    }
     table, wrong = [], [] if again == 0 else [f"{again} programs were compiled after the first epoch"]
-    for name, values in (("memory, MB", held), ("steps/s", speed), ("steps/s of processor time", speed_of_cpu)):
+    for name, values in measured.items():
         median = np.median(values)
         slope, low, high = (span * x for x in line(along, values))
         shares = " to ".join(f"{x / median:+.2%}" for x in (low, high))
         table.append((name, f"{median:,.1f}", f"{values.min():,.1f}", f"{values.max():,.1f}", f"{slope:+,.1f}", shares))
         if name == "memory, MB" and low > 0:
             wrong.append(f"memory grows by {slope:.1f} MB in {span:.0f} minutes ({low:.1f} to {high:.1f})")
-        if name == "steps/s" and abs(slope) >= 0.05 * median:
-            wrong.append(f"speed changes by {slope / median:+.1%}")
+        if name == "env steps a thousand of these" and abs(slope) >= 0.05 * median:
+            wrong.append(f"speed changes by {slope / median:+.1%}, beside the machine's own")
     print_table(("of the epochs", "median", "least", "most", f"change in {span:.0f} min", "95 % interval"), table)
     print(f"\n{len(rows)} epochs, {column['env_steps'][-1]:,.0f} env steps in {minutes[-1]:.1f} min;", end=" ")
     print(f"compiled before the first epoch's end: {int(column['compilations'][0])}, after it: {again}")

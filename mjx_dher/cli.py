@@ -179,7 +179,7 @@ def train_command(argv: list[str], console: Console) -> int:
     """`train`: trains a policy and writes a run folder."""
     args = parse_train_args(argv)
     folder = run_folder.choose(args.out, args.config, args.seed)
-    keep_compiled_programs()
+    prepare()
     env = envs.make(args.config.env, engine=args.config.engine)
     run = RunConfig(config=args.config, hparams=args.hparams, seed=args.seed, engine=run_folder.engine_name(env))
     options = {name: getattr(args, name) for name in _OPTIONS}
@@ -200,7 +200,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     if (args.run / run_folder.RESULT_FILE).exists():
         raise run_folder.RunFolderError(f"{args.run} has ended; there is nothing to go on with")
     run_folder.checkpoints_to_resume(args.run)
-    keep_compiled_programs()
+    prepare()
     ran = run.engine if run.engine in config.ENGINES else run.config.engine  # "none": the environment has none
     env = envs.make(run.config.env, engine=args.engine or ran)
     return _Training(env, run, args.run, options, console)()
@@ -360,6 +360,9 @@ class _Training:
         if seconds is None:
             self.console.print("compiling the training loop (physics, replay, learner, evaluation) ...")
         else:
+            from mjx_dher import memory
+
+            memory.release()
             self.console.print(f"compiled in {seconds:.1f} s")
 
     def _on_signal(self, signum: int, frame: Any) -> None:
@@ -513,6 +516,14 @@ def keep_compiled_programs() -> None:
 
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(run_folder.user_cache() / "xla"))
+
+
+def prepare() -> None:
+    """What a program that trains for hours needs: compiled programs are kept, and memory is not."""
+    from mjx_dher import memory
+
+    keep_compiled_programs()
+    memory.keep_heap_small()
 
 
 def _row(progress: Progress) -> dict[str, Any]:

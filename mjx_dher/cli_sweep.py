@@ -19,7 +19,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from mjx_dher import comparison, config, envs, sweep
+from mjx_dher import comparison, config, envs, run_folder, sweep
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunFolderError
 from mjx_dher.sweep import Cell
@@ -82,6 +82,8 @@ class SweepArgs:
     """cpu, gpu, paper, or auto, the one for this machine."""
     lanes: int | None = None
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
+    share: str = "1/1"
+    """2/4: the second of four shares of the runs. For several programs at once on one folder, each with a GPU of its own."""
     final_episodes: int = 500
     """Episodes of the evaluation that ends each run."""
     checkpoint_every: int = 10
@@ -131,6 +133,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
     if args.first_seed < 0:
         raise ValueError(f"first_seed must be an integer of at least 0; got {args.first_seed}")
     _check_threshold(args.threshold)
+    share = _share(args.share)
     if args.out.exists() and not args.out.is_dir():
         raise RunFolderError(f"out: {args.out} is there already and is no folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / sweep.CELLS).is_dir():
@@ -150,19 +153,30 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
             statics.append(static)
             numbers.append(points)
     seeds = range(args.first_seed, args.first_seed + args.seeds)
-    return args, sweep.cells(statics, numbers, seeds)
+    cells = sweep.cells(statics, numbers, seeds)
+    if not (own := sweep.share(cells, *share)):
+        raise ValueError(f"share {args.share} is empty: there are {len(cells)} runs in all")
+    return args, own
+
+
+def _share(text: str) -> tuple[int, int]:
+    number, _, of = text.partition("/")
+    if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+        raise ValueError(f"share must be N/M, 1 to M, such as 2/4; got {text!r}")
+    return int(number), int(of)
 
 
 def sweep_command(argv: list[str], console: Console) -> int:
     """`sweep`: trains a grid of runs."""
-    from mjx_dher.cli import keep_compiled_programs
+    from mjx_dher.cli import prepare
 
     args, cells = parse_sweep_args(argv)
     todo = [cell for cell in cells if not sweep.is_done(args.out, cell)]
     done = f"; {len(cells) - len(todo)} of them are done already" if len(todo) < len(cells) else ""
-    console.print(f"{len(cells)} runs{done}; writing to {args.out}", soft_wrap=True)
+    of = "" if args.share == "1/1" else f", share {args.share} of the sweep"
+    console.print(f"{len(cells)} runs{of}{done}; writing to {args.out}", soft_wrap=True)
     if todo:
-        keep_compiled_programs()
+        prepare()
         screen = _Screen(console, todo)
         handlers = {number: signal.signal(number, screen.on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -178,9 +192,10 @@ def sweep_command(argv: list[str], console: Console) -> int:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             screen.close()
-    found = sweep.read(args.out)
-    sweep.write_tables(args.out, found)
-    _compare(args.out, comparison.groups(found), args.baseline, args.threshold, console)
+    with run_folder.lock(args.out / sweep.CELLS, "lock", wait=True):  # another share's program may be writing them
+        found = sweep.read(args.out)
+        sweep.write_tables(args.out, found)
+        _compare(args.out, comparison.groups(found), args.baseline, args.threshold, console)
     console.print(f"wrote {sweep.RESULTS}, {sweep.FINALS} and {comparison.COMPARISON} in {args.out}", soft_wrap=True)
     return 0
 

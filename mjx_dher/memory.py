@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from pathlib import Path
+
+_M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
 
 
 def available_bytes() -> int | None:
@@ -31,6 +34,30 @@ def used_bytes() -> int | None:
         return stats["bytes_in_use"] if stats else None
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return None
+
+
+def keep_heap_small() -> None:
+    """Has the C library take blocks of a megabyte and more from the system, and give them back when they are freed.
+
+    As it comes, glibc keeps freed blocks of up to 32 MB for later ones. Buffers of checkpoints then leave holes that the
+    next ones do not fit into, and a long run grows by some MB with each. Elsewhere than on Linux with glibc: nothing.
+    """
+    if (library := _glibc()) is not None:
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
+
+
+def release() -> None:
+    """Gives the system back what the C library has kept of freed memory (glibc only): after compiling, hundreds of MB."""
+    if (library := _glibc()) is not None:
+        library.malloc_trim(0)
+
+
+def _glibc() -> ctypes.CDLL | None:
+    try:
+        library = ctypes.CDLL("libc.so.6")
+        return library if hasattr(library, "mallopt") and hasattr(library, "malloc_trim") else None
     except OSError:
         return None
 

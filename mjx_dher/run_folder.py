@@ -116,16 +116,21 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
-def lock(path: Path) -> Iterator[None]:
-    """Keeps other programs off the run in `path`. The system lets go of the lock when this one ends, however it ends.
+def lock(path: Path, name: str = CONFIG_FILE, wait: bool = False) -> Iterator[None]:
+    """Keeps other programs off the folder `path`. The system lets go of the lock when this one ends, however it ends.
+
+    Args:
+      path: the folder, of a run as a rule.
+      name: a file in it that no one puts another in the place of; it is made where it is not there.
+      wait: until the other one is done.
 
     Raises:
       RunFolderError: another program is at work there.
     """
-    with (path / CONFIG_FILE).open("r+") as file:
+    with (path / name).open("a") as file:
         if fcntl is not None:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
             except OSError:
                 raise RunFolderError(f"{path} is being trained by another program") from None
         yield

@@ -20,7 +20,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_dher import config as config_lib
 from mjx_dher import run_folder
@@ -29,10 +29,13 @@ from mjx_dher.run_folder import RunConfig, RunFolderError
 
 if TYPE_CHECKING:
     from mjx_dher.metrics import Sink
-    from mjx_dher.trainer import Progress, Start, TrainState
+    from mjx_dher.trainer import Compiled, Metrics, Progress, Start, Train, TrainState
+    from mjx_dher.types import PRNGKey
 
 CELLS = "cells"
 UNFINISHED = "unfinished"
+_NAMES = "cells.json"
+_LOCK = "lock"
 RESULTS = "results.csv"
 FINALS = "finals.csv"
 
@@ -100,6 +103,15 @@ def reads(sampler: str, name: str) -> bool:
     return sampler not in config_lib.SAMPLERS or sampler in _READ_BY.get(name, (sampler,))
 
 
+def share(found: Sequence[Cell], number: int, of: int) -> list[Cell]:
+    """Of `of` shares that differ by a cell at most in each environment, the one with this number, from 1.
+
+    Neighbours stay together, so a share has all settings of some seeds, which are compared, and trains them side by side.
+    """
+    grouped = (list(group) for _, group in itertools.groupby(found, key=lambda cell: cell.config.env))
+    return [cell for group in grouped for cell in group[len(group) * (number - 1) // of : len(group) * number // of]]
+
+
 def is_done(folder: Path, cell: Cell) -> bool:
     """Whether the cell has been trained."""
     return (_path(folder, cell) / run_folder.RESULT_FILE).exists()
@@ -136,8 +148,20 @@ def run(
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     for static, group in itertools.groupby(todo, key=lambda cell: _shared(cell.config)):
-        _run_group(folder, make_env(static), list(group), lanes, final_episodes, checkpoint_every, on_program, on_epoch)
-    shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        settings = _Settings(folder, lanes, final_episodes, checkpoint_every, on_program, on_epoch)
+        _run_group(make_env(static), list(group), settings)
+    _clear(folder)
+
+
+class _Settings(NamedTuple):
+    """What `run` was called with, for all of its programs."""
+
+    folder: Path
+    lanes: int | None
+    final_episodes: int
+    checkpoint_every: int
+    on_program: Callable[[str], None]
+    on_epoch: Callable[[Sequence[Cell], Progress], None]
 
 
 def _shared(static: Config) -> Config:
@@ -145,73 +169,103 @@ def _shared(static: Config) -> Config:
     return dataclasses.replace(static, sampler="future", weight_kernel="linear", metric="position")
 
 
-def _run_group(
-    folder: Path,
-    env: Any,
-    group: list[Cell],
-    lanes: int | None,
-    final_episodes: int,
-    checkpoint_every: int,
-    on_program: Callable[[str], None],
-    on_epoch: Callable[[Sequence[Cell], Progress], None],
-) -> None:
+def _run_group(env: Any, group: list[Cell], settings: _Settings) -> None:
+    """Trains cells that can share a program, as many side by side as can be."""
     import jax
 
-    from mjx_dher import memory, metrics, policy, samplers, trainer
+    from mjx_dher import samplers, trainer
 
     static = group[0].config
     config_lib.validate(static, group[0].hparams, env.episode_length)
     choices = list(dict.fromkeys(cell.choice for cell in group))
     program = trainer.make_train(env, static, samplers.one_of([samplers.make(*choice) for choice in choices]))
     trainer.check_memory(program.replay_bytes, static)
-    size = min(len(group), lanes or len(group))
+    compiled, size = _compile(env, program, group, choices, settings)
+
+    @jax.jit
+    @jax.vmap
+    def evaluate(state: TrainState, key: PRNGKey) -> Metrics:
+        return trainer.evaluate_state(env, program.networks, state, key, settings.final_episodes)
+
+    for start in range(0, len(group), size):
+        chunk = group[start : start + size]
+        keys, hparams = _stack(chunk, choices, size)
+        progress = _train(env, chunk, compiled, compiled.init(keys, hparams), settings)
+        final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
+        final = jax.device_get(evaluate(progress.state, final_keys))
+        trainer.check_steps(env)
+        _end(chunk, progress, final, settings)
+
+
+def _compile(
+    env: Any, program: Train, group: list[Cell], choices: list[tuple[str, str, str]], settings: _Settings
+) -> tuple[Compiled, int]:
+    """The program for as many lanes as there may be and memory holds, and how many they are."""
+    from mjx_dher import memory, trainer
+
+    name = group[0].config.env
+    size = min(len(group), settings.lanes or len(group))
     available = memory.available_bytes()
     if available is not None:  # the rings alone must fit before the compiler is asked
         size = max(1, min(size, int(available / program.replay_bytes)))
     while True:
         size = math.ceil(len(group) / math.ceil(len(group) / size))  # chunks of equal size
         together = f"{size} runs side by side" if size > 1 else "one run at a time"
-        on_program(f"{static.env}: compiling for {together}, of {len(group)} ...")
+        settings.on_program(f"{name}: compiling for {together}, of {len(group)} ...")
         started = time.perf_counter()
         compiled = trainer.compile_program(program, *_stack(group, choices, size))
         trainer.check_steps(env)
         needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
-        on_program(f"{static.env}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
+        settings.on_program(f"{name}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
+        memory.release()
         if available is None or compiled.nbytes <= available or size == 1:
-            break
+            return compiled, size
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
-    evaluate = jax.jit(jax.vmap(lambda state, key: trainer.evaluate_state(env, program.networks, state, key, final_episodes)))
-    for start in range(0, len(group), size):
-        chunk = group[start : start + size]
-        keys, hparams = _stack(chunk, choices, size)
-        unfinished = _Unfinished(folder, chunk, size, on_program)
-        with contextlib.ExitStack() as stack:
-            begin = unfinished.restore(compiled.init(keys, hparams))
-            engine = run_folder.engine_name(env)
-            sinks = [stack.enter_context(_begin(folder, cell, engine, size, begin.epoch)) for cell in chunk]
-            for progress in trainer.run(env, static, compiled, begin):
-                counts = {name: getattr(progress, name) for name in metrics.COUNTS}
-                for lane, sink in enumerate(sinks):
-                    sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
-                try:
-                    on_epoch(chunk, progress)
-                except KeyboardInterrupt:
-                    unfinished.save(progress)
-                    raise
-                if checkpoint_every and progress.epoch % checkpoint_every == 0:
-                    unfinished.save(progress)
-        final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
-        final = jax.device_get(evaluate(progress.state, final_keys))
-        trainer.check_steps(env)
-        learners = jax.device_get(progress.state.learner)
-        for lane, cell in enumerate(chunk):
-            learner = jax.tree.map(lambda x, lane=lane: x[lane], learners)
-            policy.from_learner(learner, cell.hparams).save(_path(folder, cell) / run_folder.POLICY_FILE)
-            last = {"epochs": counts["epoch"], "env_steps": counts["env_steps"], "wall_seconds": counts["wall_seconds"]}
-            result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": final_episodes}
-            # Last of all: the cell is done when this is there.
-            run_folder.write_json(_path(folder, cell) / run_folder.RESULT_FILE, {**last, "lanes": size, **result})
-        unfinished.forget()
+
+
+def _train(env: Any, chunk: Sequence[Cell], compiled: Compiled, state: TrainState, settings: _Settings) -> Progress:
+    """Trains cells side by side, from `state` or the checkpoint that they were left with, to their end."""
+    from mjx_dher import metrics, trainer
+
+    folder, size = settings.folder, state.env_steps.shape[0]
+    unfinished = _Unfinished(folder, chunk, size, settings.on_program)
+    with contextlib.ExitStack() as stack:
+        for cell in chunk:
+            _path(folder, cell).mkdir(exist_ok=True)
+            stack.enter_context(run_folder.lock(_path(folder, cell), _LOCK))
+        begin = unfinished.restore(state)
+        sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size, begin.epoch)) for cell in chunk]
+        for progress in trainer.run(env, chunk[0].config, compiled, begin):
+            counts = {name: getattr(progress, name) for name in metrics.COUNTS}
+            for lane, sink in enumerate(sinks):
+                sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
+            try:
+                settings.on_epoch(chunk, progress)
+            except KeyboardInterrupt:
+                unfinished.save(progress)
+                raise
+            if settings.checkpoint_every and progress.epoch % settings.checkpoint_every == 0:
+                unfinished.save(progress)
+    return progress
+
+
+def _end(chunk: Sequence[Cell], progress: Progress, final: dict[str, Any], settings: _Settings) -> None:
+    """Writes what cells that have ended leave: policies and the last evaluations."""
+    import jax
+
+    from mjx_dher import policy
+
+    learners = jax.device_get(progress.state.learner)
+    lanes = len(learners.num_updates)
+    last = {"epochs": progress.epoch, "env_steps": progress.env_steps, "wall_seconds": progress.wall_seconds, "lanes": lanes}
+    for lane, cell in enumerate(chunk):
+        path, learner = _path(settings.folder, cell), jax.tree.map(lambda x, lane=lane: x[lane], learners)
+        policy.from_learner(learner, cell.hparams).save(path / run_folder.POLICY_FILE)
+        result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": settings.final_episodes}
+        # Last of all: the cell is done when this is there.
+        run_folder.write_json(path / run_folder.RESULT_FILE, {**last, **result})
+        (path / _LOCK).unlink(missing_ok=True)
+    _clear(settings.folder)
 
 
 class _Unfinished:
@@ -225,8 +279,9 @@ class _Unfinished:
     """
 
     def __init__(self, folder: Path, chunk: Sequence[Cell], size: int, say: Callable[[str], None]):
-        digest = hashlib.sha256(json.dumps([size, *(cell.name for cell in chunk)]).encode()).hexdigest()[:10]
-        self.folder, self.say = folder / UNFINISHED / digest, say
+        self.names, self.say = [cell.name for cell in chunk], say
+        digest = hashlib.sha256(json.dumps([size, *self.names]).encode()).hexdigest()[:10]
+        self.folder = folder / UNFINISHED / digest
 
     def restore(self, state: TrainState) -> Start:
         """Where these cells go on from: `state`, a fresh one, if there is no checkpoint that can be used."""
@@ -253,13 +308,20 @@ class _Unfinished:
             return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            run_folder.write_json(self.folder / _NAMES, {"cells": self.names})
             checkpoint.save(self.folder, progress.state, progress.epoch, progress.wall_seconds, keep=1)
         except (OSError, checkpoint.CheckpointError) as error:
             self.say(str(error))
 
-    def forget(self) -> None:
-        """The cells have ended."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+
+def _clear(folder: Path) -> None:
+    """Removes the checkpoints of cells that have all ended. Those of others stay: another program may be at work on them."""
+    done = {path.parent.name for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}")}
+    for path in (folder / UNFINISHED).glob(f"*/{_NAMES}"):
+        if done.issuperset(json.loads(path.read_text())["cells"]):
+            shutil.rmtree(path.parent, ignore_errors=True)
+    with contextlib.suppress(OSError):  # not empty, or not there
+        (folder / UNFINISHED).rmdir()
 
 
 def _stack(group: Sequence[Cell], choices: Sequence[tuple[str, str, str]], size: int) -> tuple[Any, Any]:

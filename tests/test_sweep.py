@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import HParams, cli, cli_sweep, config, envs, memory, policy, sweep, trainer
+from mjx_dher import HParams, cli, cli_sweep, config, envs, memory, policy, run_folder, sweep, trainer
 from mjx_dher.run_folder import RunFolderError
 from mjx_dher.sweep import Cell
 from probes import PointMass
 
 CONFIG = dataclasses.replace(SMALL, num_envs=8, updates_per_cycle=8, hidden_sizes=(16,))  # an epoch of 240 steps
+LONGER = dataclasses.replace(CONFIG, total_steps=5 * CONFIG.total_steps)
 
 
 DEFAULT = HParams()
@@ -65,6 +66,55 @@ def test_environments_stay_together():
     statics = [dataclasses.replace(CONFIG, env=env) for env in ("reach", "push")]
     found = sweep.cells(statics, [[HParams()]] * 2, [0, 1, 2])
     assert [c.config.env for c in found] == ["reach"] * 3 + ["push"] * 3
+
+
+@pytest.mark.parametrize("of", [1, 2, 3, 7])
+def test_shares_have_all_runs_between_them_and_whole_seeds_where_they_can(of):
+    tasks = [dataclasses.replace(CONFIG, env=env) for env in ("push", "slide")]
+    cells = [cell for task in tasks for cell in grid(seeds=(0, 1, 2, 3), static=task)]
+    shares = [sweep.share(cells, number, of) for number in range(1, of + 1)]
+    assert sorted(cell.name for share in shares for cell in share) == sorted(cell.name for cell in cells)
+    for task in tasks:
+        sizes = [sum(cell.config.env == task.env for cell in share) for share in shares]
+        assert max(sizes) - min(sizes) <= 1
+    if of == 2:
+        assert [[(c.config.env, c.config.sampler, c.seed) for c in share] for share in shares] == [
+            [(env, sampler, seed) for env in ("push", "slide") for seed in seeds for sampler in ("future", "weighted")]
+            for seeds in ((0, 1), (2, 3))
+        ]
+
+
+def test_two_programs_share_a_sweep_and_the_last_one_s_tables_have_it_all(tmp_path, point_mass, capsys):
+    out = ["--lanes", "2", "--out", str(tmp_path / "shared")]
+    assert cli.main([*COMMAND, *out, "--share", "2/2"]) == 0
+    assert "2 runs, share 2/2 of the sweep; writing to" in capsys.readouterr().out
+    assert {row["seed"] for row in table(tmp_path / "shared", sweep.FINALS)} == {"1"}
+    assert cli.main([*COMMAND, *out, "--share", "1/2"]) == 0
+    written = {name: (tmp_path / "shared" / name).read_bytes() for name in ("results.csv", "finals.csv", "comparison.csv")}
+    assert len(table(tmp_path / "shared", sweep.FINALS)) == 4
+    assert cli.main([*COMMAND, *out]) == 0
+    assert "4 runs; 4 of them are done already" in capsys.readouterr().out
+    assert written == {name: (tmp_path / "shared" / name).read_bytes() for name in written}
+
+
+def test_a_run_that_another_program_trains_is_refused(tmp_path):
+    cells = grid(seeds=(0, 1))
+    path = tmp_path / "cells" / cells[3].name
+    path.mkdir(parents=True)
+    with run_folder.lock(path, "lock"), pytest.raises(RunFolderError, match=f"{cells[3].name} is being trained by another"):
+        run(tmp_path, cells, lanes=2)
+    assert [sweep.is_done(tmp_path, cell) for cell in cells] == [True, True, False, False]
+    run(tmp_path, cells[2:], lanes=2)
+    assert not list(tmp_path.glob("cells/*/lock"))
+
+
+def test_another_program_s_checkpoints_stay(tmp_path):
+    first, second = grid(("future",), (0, 1), static=LONGER)
+    cut_short(tmp_path, [first], 2)
+    run(tmp_path, [second])
+    assert len(list((tmp_path / "unfinished").iterdir())) == 1
+    run(tmp_path, [first])
+    assert not (tmp_path / "unfinished").exists()
 
 
 def test_a_lane_is_that_run_alone(tmp_path):
@@ -126,9 +176,6 @@ def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had
     assert table(cut, sweep.FINALS) == table(whole, sweep.FINALS)
 
 
-LONGER = dataclasses.replace(CONFIG, total_steps=5 * CONFIG.total_steps)
-
-
 def cut_short(folder, cells, epoch, **options):
     """Trains until KeyboardInterrupt after `epoch`."""
 
@@ -170,9 +217,7 @@ def test_a_checkpoint_is_made_every_so_many_epochs_and_one_is_kept(tmp_path):
 
 def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
     """Alone, `closest` is the first of the samplers, and was the second when it was cut short."""
-    future, closest = grid(("future", "closest"), (0,), static=LONGER)
-    run(tmp_path / "first", [future], lanes=1)
-    cells = [future, closest]
+    cells = grid(("future", "closest"), (0,), static=LONGER)
     ended = []
 
     def interrupt(chunk, progress):
@@ -183,9 +228,9 @@ def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "cut", cells, lanes=1, on_epoch=interrupt)
     assert [sweep.is_done(tmp_path / "cut", cell) for cell in cells] == [True, False]
-    run(tmp_path / "cut", [closest], lanes=1, on_epoch=lambda chunk, progress: ended.append(progress.epoch))
+    run(tmp_path / "cut", cells[1:], lanes=1, on_epoch=lambda chunk, progress: ended.append(progress.epoch))
     assert ended[-2:] == [4, 5]
-    run(tmp_path / "whole", [closest], lanes=1)
+    run(tmp_path / "whole", cells[1:], lanes=1)
     ours, alone = table(tmp_path / "cut"), table(tmp_path / "whole")
     ours = [row for row in ours if row["sampler"] == "closest"]
     for a, b in zip(ours, alone, strict=True):
@@ -207,6 +252,7 @@ def test_without_a_checkpoint_that_fits_runs_begin_anew(tmp_path, harm):
     assert seen == [1, 2, 3, 4, 5] * (1 if harm == "damaged" else 2)
     assert any("manifest.json is not as it was written" in line for line in said) == (harm == "damaged")
     assert [len(cell["curve"]["epoch"]) for cell in sweep.read(tmp_path)] == [5] * 4
+    assert not (tmp_path / "unfinished").exists()
 
 
 def test_a_checkpoint_that_cannot_be_written_does_not_end_the_sweep(tmp_path, monkeypatch):
@@ -356,6 +402,9 @@ def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path
         (["--seeds", "0"], "seeds must be an integer of at least 1; got 0"),
         (["--first-seed", "-1"], "first_seed must be an integer of at least 0; got -1"),
         (["--checkpoint-every", "-1"], "checkpoint_every must be a number of epochs, or 0; got -1"),
+        (["--share", "3/2"], "share must be N/M, 1 to M, such as 2/4; got '3/2'"),
+        (["--share", "half"], "share must be N/M, 1 to M, such as 2/4; got 'half'"),
+        (["--share", "1/9", "--seeds", "2", "--sampler", "future"], "share 1/9 is empty: there are 2 runs in all"),
         (["--lanes", "0"], "lanes must be an integer of at least 1; got 0"),
         (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
         (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 1\); got 1.5"),

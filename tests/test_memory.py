@@ -1,0 +1,49 @@
+"""What the C library keeps of freed memory, in programs of their own."""
+
+import subprocess
+import sys
+
+import pytest
+from conftest import ROOT
+
+from mjx_dher import memory
+
+pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="not glibc")
+
+# Blocks that are freed while a smaller one on top of each stays: a hole each, which the heap cannot give back by itself.
+HOLES = """
+import ctypes
+from mjx_dher import memory
+c = ctypes.CDLL("libc.so.6")
+c.malloc.restype, c.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+{before}
+def make_holes(number, size):
+    blocks = []
+    for _ in range(number):
+        blocks.append(c.malloc(size))
+        ctypes.memset(blocks[-1], 1, size)
+        c.malloc(60_000)
+    for block in blocks:
+        c.free(block)
+start = memory.used_bytes()
+make_holes(2, {size})
+make_holes(100_000_000 // {size}, {size})
+{after}
+print((memory.used_bytes() - start) / 1e6)
+"""
+
+
+def kept(size, before="", after=""):
+    """Of 100 MB that were freed, how many the program still holds."""
+    code = HOLES.format(size=size, before=before, after=after)
+    return float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout)
+
+
+def test_blocks_of_some_megabytes_go_back_to_the_system_when_they_are_freed():
+    assert kept(5_000_000) > 80
+    assert kept(5_000_000, before="memory.keep_heap_small()") < 10
+
+
+def test_release_gives_back_what_was_freed():
+    assert kept(100_000) > 80
+    assert kept(100_000, after="memory.release()") < 20
