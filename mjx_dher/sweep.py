@@ -12,6 +12,7 @@ import collections
 import contextlib
 import csv
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -190,7 +191,7 @@ def _run_group(env: Any, group: list[Cell], settings: _Settings) -> None:
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
-        progress = _train(env, chunk, compiled, compiled.init(keys, hparams), settings)
+        progress = _train(env, chunk, size, compiled, functools.partial(compiled.init, keys, hparams), settings)
         final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
         final = jax.device_get(evaluate(progress.state, final_keys))
         trainer.check_steps(env)
@@ -223,17 +224,19 @@ def _compile(
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
 
 
-def _train(env: Any, chunk: Sequence[Cell], compiled: Compiled, state: TrainState, settings: _Settings) -> Progress:
-    """Trains cells side by side, from `state` or the checkpoint that they were left with, to their end."""
+def _train(
+    env: Any, chunk: Sequence[Cell], size: int, compiled: Compiled, init: Callable[[], TrainState], settings: _Settings
+) -> Progress:
+    """Trains cells side by side, from their start or the checkpoint that they were left with, to their end."""
     from mjx_dher import metrics, trainer
 
-    folder, size = settings.folder, state.env_steps.shape[0]
+    folder = settings.folder
     unfinished = _Unfinished(folder, chunk, size, settings.on_program)
     with contextlib.ExitStack() as stack:
         for cell in chunk:
             _path(folder, cell).mkdir(exist_ok=True)
             stack.enter_context(run_folder.lock(_path(folder, cell), _LOCK))
-        begin = unfinished.restore(state)
+        begin = unfinished.restore(init)
         sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size, begin.epoch)) for cell in chunk]
         for progress in trainer.run(env, chunk[0].config, compiled, begin):
             counts = {name: getattr(progress, name) for name in metrics.COUNTS}
@@ -283,22 +286,25 @@ class _Unfinished:
         digest = hashlib.sha256(json.dumps([size, *self.names]).encode()).hexdigest()[:10]
         self.folder = folder / UNFINISHED / digest
 
-    def restore(self, state: TrainState) -> Start:
-        """Where these cells go on from: `state`, a fresh one, if there is no checkpoint that can be used."""
+    def restore(self, init: Callable[[], TrainState]) -> Start:
+        """Where these cells go on from: what `init` makes, if there is no checkpoint that can be used."""
         import jax
 
         from mjx_dher import checkpoint, trainer
 
+        state = init()
         if not run_folder.checkpoints(self.folder):
             return trainer.Start(state)
+        template, hparams = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state), state.hparams
+        del state  # there may be no memory for two
         try:
-            found = checkpoint.restore(self.folder, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state))
+            found = checkpoint.restore(self.folder, template)
         except RunFolderError as error:
             self.say(f"{error}; training these runs from their start")
-            return trainer.Start(state)
+            return trainer.Start(init())
         self.say(f"going on after epoch {found.epoch}")
         # A lane's number for its sampler depends on which others there still are.
-        return trainer.Start(dataclasses.replace(found.state, hparams=state.hparams), found.epoch, found.wall_seconds)
+        return trainer.Start(dataclasses.replace(found.state, hparams=hparams), found.epoch, found.wall_seconds)
 
     def save(self, progress: Progress) -> None:
         """A checkpoint in place of the one before. One that cannot be written is said to be so, and costs nothing else."""
