@@ -223,8 +223,8 @@ def test_a_checkpoint_is_made_every_so_many_epochs_and_one_is_kept(tmp_path):
 
 
 def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
-    """Alone, `closest` is the first of the samplers, and was the second when it was cut short."""
-    cells = grid(("future", "closest"), (0,), static=LONGER)
+    """`closest` is the first of two samplers, and was the second of three when it was cut short."""
+    cells = grid(("future", "closest", "weighted"), (0,), static=LONGER)
     ended = []
 
     def interrupt(chunk, progress):
@@ -234,10 +234,10 @@ def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "cut", cells, lanes=1, on_epoch=interrupt)
-    assert [sweep.is_done(tmp_path / "cut", cell) for cell in cells] == [True, False]
+    assert [sweep.is_done(tmp_path / "cut", cell) for cell in cells] == [True, False, False]
     run(tmp_path / "cut", cells[1:], lanes=1, on_epoch=lambda chunk, progress: ended.append(progress.epoch))
-    assert ended[-2:] == [4, 5]
-    run(tmp_path / "whole", cells[1:], lanes=1)
+    assert ended[8:] == [4, 5, 1, 2, 3, 4, 5]
+    run(tmp_path / "whole", cells[1:2], lanes=1)
     ours, alone = table(tmp_path / "cut"), table(tmp_path / "whole")
     ours = [row for row in ours if row["sampler"] == "closest"]
     for a, b in zip(ours, alone, strict=True):
