@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 import shutil
 import signal
 import sys
@@ -22,6 +21,7 @@ from rich.console import Console
 from mjx_dher import cli_doctor, cli_export, cli_sweep, config, envs, metrics, run_folder
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunConfig
+from mjx_dher.stopping import Stop
 
 if TYPE_CHECKING:
     from mjx_dher.envs import GoalEnv
@@ -261,7 +261,7 @@ class _Training:
 
     def __init__(self, env: GoalEnv, run: RunConfig, folder: Path, options: dict[str, Any], console: Console):
         self.env, self.run, self.folder, self.options, self.console = env, run, folder, options, console
-        self.stop_asked: int | None = None  # the signal
+        self.stop = Stop(console, folder)
 
     def __call__(self, create: Callable[[], None] | None = None) -> int:
         """Trains; `create` makes the folder of a new run, and without it the one that is there is resumed."""
@@ -282,21 +282,18 @@ class _Training:
                 f" writing to {self.folder}",
                 soft_wrap=True,
             )
-            handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
             try:
-                last, learned = self._train(start)
+                with self.stop:
+                    last, learned = self._train(start)
             except OSError as error:
                 raise run_folder.RunFolderError(f"{self.folder} cannot be written to ({error}); {self._last()}") from error
-            finally:
-                for number, handler in handlers.items():
-                    signal.signal(number, handler)
             if last.epoch < last.num_epochs:
                 console.print(
                     f"stopped after epoch {last.epoch} of {last.num_epochs}; the policy so far is in {self.folder}, and"
                     f" `train.py resume {self.folder}` goes on",
                     soft_wrap=True,
                 )
-                return 128 + (self.stop_asked or 0)
+                return 128 + (self.stop.asked or 0)
             outcome = play(self.env, learned, self.options["final_episodes"], run.seed + 1)
             result = report(outcome.success, outcome.reset_success, outcome.ret, console)
             ended = {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result}
@@ -338,7 +335,7 @@ class _Training:
                 learned.save(self.folder / run_folder.POLICY_FILE)
                 for sink in sinks:
                     sink.write(_row(progress))
-                stop = self.stop_asked is not None
+                stop = self.stop.asked is not None
                 if progress.epoch < progress.num_epochs and (stop or (every and progress.epoch % every == 0)):
                     keep = self.options["keep"]
                     path = checkpoint.save(self.folder, progress.state, progress.epoch, progress.wall_seconds, keep)
@@ -360,19 +357,7 @@ class _Training:
         if seconds is None:
             self.console.print("compiling the training loop (physics, replay, learner, evaluation) ...")
         else:
-            from mjx_dher import memory
-
-            memory.release()
             self.console.print(f"compiled in {seconds:.1f} s")
-
-    def _on_signal(self, signum: int, frame: Any) -> None:
-        if self.stop_asked is not None:
-            self.console.show_cursor(True)
-            self.console.print(f"stopped at once; what was saved is in {self.folder}", soft_wrap=True)
-            sys.stdout.flush()
-            os._exit(128 + signum)  # a compiled epoch cannot be interrupted, and all that was saved is on the disk already
-        self.stop_asked = signum
-        self.console.print("stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved")
 
 
 def eval_command(argv: list[str], console: Console) -> int:

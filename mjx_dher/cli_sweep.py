@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import os
 import signal
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,6 +20,7 @@ from rich.table import Table
 from mjx_dher import comparison, config, envs, run_folder, sweep
 from mjx_dher.config import Config, HParams
 from mjx_dher.run_folder import RunFolderError
+from mjx_dher.stopping import Stop
 from mjx_dher.sweep import Cell
 
 _GRID = ("env", "sampler", "weight_kernel", "metric")
@@ -177,22 +176,21 @@ def sweep_command(argv: list[str], console: Console) -> int:
     console.print(f"{len(cells)} runs{of}{done}; writing to {args.out}", soft_wrap=True)
     if todo:
         prepare()
-        screen = _Screen(console, todo)
-        handlers = {number: signal.signal(number, screen.on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        stop = Stop(console, args.out)
+        screen = _Screen(console, todo, stop)
+        make_env = lambda static: envs.make(static.env, engine=static.engine)  # noqa: E731
+        options = (args.lanes, args.final_episodes, args.checkpoint_every)
+        say = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
         try:
-            make_env = lambda static: envs.make(static.env, engine=static.engine)  # noqa: E731
-            options = (args.lanes, args.final_episodes, args.checkpoint_every)
-            say = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
-            sweep.run(args.out, todo, make_env, *options, say, screen.show)
+            with stop:
+                sweep.run(args.out, todo, make_env, *options, say, screen.show)
         except KeyboardInterrupt:
-            left = sum(not sweep.is_done(args.out, cell) for cell in cells)
-            console.print(f"stopped; {len(cells) - left} runs are done, and the same command goes on with the other {left}")
-            return 128 + (screen.stop_asked or signal.SIGINT)
+            if left := sum(not sweep.is_done(args.out, cell) for cell in cells):
+                console.print(f"stopped; {len(cells) - left} runs are done, and the same command goes on with the other {left}")
+                return 128 + (stop.asked or signal.SIGINT)
         finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
             screen.close()
-    with run_folder.lock(args.out / sweep.CELLS, "lock", wait=True):  # another share's program may be writing them
+    with run_folder.lock(args.out / sweep.CELLS, sweep.LOCK, wait=True):  # another share's program may be writing them
         found = sweep.read(args.out)
         sweep.write_tables(args.out, found)
         _compare(args.out, comparison.groups(found), args.baseline, args.threshold, console)
@@ -244,8 +242,8 @@ def _compare(
 class _Screen:
     """Progress over the whole sweep: a live bar on a terminal, elsewhere a line now and then."""
 
-    def __init__(self, console: Console, todo: Sequence[Cell]):
-        self._console = console
+    def __init__(self, console: Console, todo: Sequence[Cell], stop: Stop):
+        self._console, self._stop = console, stop
         self._total = sum(cell.config.total_steps for cell in todo)
         self._done = 0.0  # environment steps, of all runs
         self._done_before = 0.0  # the present ones
@@ -253,27 +251,17 @@ class _Screen:
         self._trained = 0.0  # since this start of the sweep, in `_seconds`
         self._seconds = 0.0
         self._printed = time.monotonic()
-        self.stop_asked: int | None = None  # the signal
         self._bar: Bar | None = None
         if console.is_terminal:
             self._bar = Bar(BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
             self._task = self._bar.add_task("...", total=self._total)
             self._bar.start()
 
-    def on_interrupt(self, signum: int, frame: Any) -> None:
-        """Ctrl-C or SIGTERM: the epoch under way cannot be cut short, so the first one waits for its end."""
-        if self.stop_asked is not None:
-            self._console.show_cursor(True)
-            sys.stdout.flush()
-            os._exit(128 + signum)  # what has ended is on the disk already
-        self.stop_asked = signum
-        self._console.print("stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved")
-
     def show(self, cells: Sequence[Cell], progress: Any) -> None:
         """After each epoch of those side by side; raises KeyboardInterrupt where a stop was asked for."""
         from mjx_dher.metrics import clock
 
-        if self.stop_asked is not None:
+        if self._stop.asked is not None:
             raise KeyboardInterrupt
         total = cells[0].config.total_steps
         if cells is not self._present:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 CELLS = "cells"
 UNFINISHED = "unfinished"
 _NAMES = "cells.json"
-_LOCK = "lock"
+LOCK = "lock"
 RESULTS = "results.csv"
 FINALS = "finals.csv"
 
@@ -138,7 +138,8 @@ def run(
       final_episodes: of the evaluation that ends each run.
       checkpoint_every: epochs between checkpoints of those side by side; 0: only when the sweep is stopped.
       on_program: called with a line about each program, before it is compiled and after, and about checkpoints.
-      on_epoch: called after every epoch of those side by side. It stops the sweep by raising KeyboardInterrupt.
+      on_epoch: called after every epoch of those side by side, after the last one when their results are written. It stops
+        the sweep by raising KeyboardInterrupt.
 
     Raises:
       ValueError: a setting that cannot run, or a ring that does not fit into memory even alone.
@@ -148,10 +149,9 @@ def run(
     (folder / CELLS).mkdir(parents=True, exist_ok=True)
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
+    settings = _Settings(folder, lanes, final_episodes, checkpoint_every, on_program, on_epoch)
     for static, group in itertools.groupby(todo, key=lambda cell: _shared(cell.config)):
-        settings = _Settings(folder, lanes, final_episodes, checkpoint_every, on_program, on_epoch)
         _run_group(make_env(static), list(group), settings)
-    _clear(folder)
 
 
 class _Settings(NamedTuple):
@@ -191,11 +191,25 @@ def _run_group(env: Any, group: list[Cell], settings: _Settings) -> None:
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
-        progress = _train(env, chunk, size, compiled, functools.partial(compiled.init, keys, hparams), settings)
-        final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
-        final = jax.device_get(evaluate(progress.state, final_keys))
-        trainer.check_steps(env)
-        _end(chunk, progress, final, settings)
+        with _locked(settings.folder, chunk):
+            progress = _train(env, chunk, size, compiled, functools.partial(compiled.init, keys, hparams), settings)
+            final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
+            final = jax.device_get(evaluate(progress.state, final_keys))
+            trainer.check_steps(env)
+            _end(chunk, progress, final, settings)
+        settings.on_epoch(chunk, progress)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path, chunk: Sequence[Cell]) -> Iterator[None]:
+    """Keeps other programs off these cells; their folders are made."""
+    with contextlib.ExitStack() as stack:
+        for cell in chunk:
+            _path(folder, cell).mkdir(exist_ok=True)
+            stack.enter_context(run_folder.lock(_path(folder, cell), LOCK))
+        yield
+        for cell in chunk:
+            (_path(folder, cell) / LOCK).unlink(missing_ok=True)
 
 
 def _compile(
@@ -218,7 +232,6 @@ def _compile(
         trainer.check_steps(env)
         needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
         settings.on_program(f"{name}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
-        memory.release()
         if available is None or compiled.nbytes <= available or size == 1:
             return compiled, size
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
@@ -233,15 +246,14 @@ def _train(
     folder = settings.folder
     unfinished = _Unfinished(folder, chunk, size, settings.on_program)
     with contextlib.ExitStack() as stack:
-        for cell in chunk:
-            _path(folder, cell).mkdir(exist_ok=True)
-            stack.enter_context(run_folder.lock(_path(folder, cell), _LOCK))
         begin = unfinished.restore(init)
         sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size, begin.epoch)) for cell in chunk]
         for progress in trainer.run(env, chunk[0].config, compiled, begin):
             counts = {name: getattr(progress, name) for name in metrics.COUNTS}
             for lane, sink in enumerate(sinks):
                 sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
+            if progress.epoch == progress.num_epochs:
+                continue  # what they leave comes first
             try:
                 settings.on_epoch(chunk, progress)
             except KeyboardInterrupt:
@@ -267,7 +279,6 @@ def _end(chunk: Sequence[Cell], progress: Progress, final: dict[str, Any], setti
         result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": settings.final_episodes}
         # Last of all: the cell is done when this is there.
         run_folder.write_json(path / run_folder.RESULT_FILE, {**last, **result})
-        (path / _LOCK).unlink(missing_ok=True)
     _clear(settings.folder)
 
 
@@ -310,8 +321,6 @@ class _Unfinished:
         """A checkpoint in place of the one before. One that cannot be written is said to be so, and costs nothing else."""
         from mjx_dher import checkpoint
 
-        if progress.epoch == progress.num_epochs:
-            return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             run_folder.write_json(self.folder / _NAMES, {"cells": self.names})
@@ -346,7 +355,7 @@ def _path(folder: Path, cell: Cell) -> Path:
 
 
 def _begin(folder: Path, cell: Cell, engine: str, lanes: int, epochs: int) -> contextlib.closing[Sink]:
-    """Makes the cell's folder, and the sink for its curve, of which `epochs` are there already."""
+    """Writes the cell's config.json, and makes the sink for its curve, of which `epochs` are there already."""
     from mjx_dher import metrics
 
     path = _path(folder, cell)

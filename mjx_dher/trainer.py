@@ -317,6 +317,7 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
             sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
         )
     compiled_init = jax.jit(init).lower(key, hparams).compile()
+    memory.release()
     return Compiled(init=lambda key, hparams: compiled_init(key, _arrays(hparams)), epoch=compiled, nbytes=nbytes)
 
 

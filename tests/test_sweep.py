@@ -98,14 +98,25 @@ def test_two_programs_share_a_sweep_and_the_last_one_s_tables_have_it_all(tmp_pa
     assert written == {name: (tmp_path / "shared" / name).read_bytes() for name in written}
 
 
-def test_a_run_that_another_program_trains_is_refused(tmp_path):
+def test_a_run_that_another_program_trains_is_refused(tmp_path, monkeypatch):
     cells = grid(seeds=(0, 1))
     path = tmp_path / "cells" / cells[3].name
     path.mkdir(parents=True)
     with run_folder.lock(path, "lock"), pytest.raises(RunFolderError, match=f"{cells[3].name} is being trained by another"):
         run(tmp_path, cells, lanes=2)
     assert [sweep.is_done(tmp_path, cell) for cell in cells] == [True, True, False, False]
+    held, end = [], sweep._end
+
+    def look(chunk, *rest):
+        for cell in chunk:
+            with pytest.raises(RunFolderError), run_folder.lock(tmp_path / "cells" / cell.name, "lock"):
+                pass
+            held.append(cell)
+        end(chunk, *rest)
+
+    monkeypatch.setattr(sweep, "_end", look)
     run(tmp_path, cells[2:], lanes=2)
+    assert held == cells[2:]  # until their results are written
     assert not list(tmp_path.glob("cells/*/lock"))
 
 
@@ -160,17 +171,17 @@ def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had
     cells, cut, whole = grid(seeds=(0, 1, 2)), tmp_path / "cut", tmp_path / "whole"
     trained = []
 
-    def stop_in_the_second_chunk(chunk, progress):
+    def stop_after_the_second_chunk(chunk, progress):
         trained.extend(c.name for c in chunk)
         if len(trained) > 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(cut, cells, lanes=2, on_epoch=stop_in_the_second_chunk)
-    assert [sweep.is_done(cut, cell) for cell in cells] == [True] * 2 + [False] * 4
+        run(cut, cells, lanes=2, on_epoch=stop_after_the_second_chunk)
+    assert [sweep.is_done(cut, cell) for cell in cells] == [True] * 4 + [False] * 2
     curves = [cut / "cells" / cell.name / "metrics.csv" for cell in cells]
     assert [path.exists() and len(path.read_text().splitlines()) for path in curves] == [2, 2, 2, 2, False, False]
-    assert len(table(cut)) == 2
+    assert len(table(cut)) == 4
     run(cut, [cell for cell in cells if not sweep.is_done(cut, cell)], lanes=2)
     run(whole, cells, lanes=2)
     assert table(cut) == table(whole)
@@ -216,7 +227,7 @@ def test_a_checkpoint_is_made_every_so_many_epochs_and_one_is_kept(tmp_path):
         found.append([path.name for path in tmp_path.glob("unfinished/*/checkpoints/*")])
 
     run(tmp_path, grid(("future",), (0,), static=LONGER), checkpoint_every=2, on_epoch=look)
-    assert found == [[], [], ["epoch-000002"], ["epoch-000002"], ["epoch-000004"]]
+    assert found == [[], [], ["epoch-000002"], ["epoch-000002"], []]  # none when the results are written
     found.clear()
     run(tmp_path, grid(("future",), (1,), static=LONGER), on_epoch=look)
     assert found == [[]] * 5
@@ -369,18 +380,24 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     assert min(written.values()) > 5000
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys, number):
-    """In the first epoch of the second of two programs."""
+def interrupting(monkeypatch, after, number):
+    """The epochs that are shown; in the one after which `after` are, the signal comes."""
     show, seen = cli_sweep._Screen.show, []
 
     def interrupt(screen, cells, progress):
         seen.append(progress.epoch)
-        if len(seen) == 5:
+        if len(seen) == after:
             signal.raise_signal(number)
         show(screen, cells, progress)
 
     monkeypatch.setattr(cli_sweep._Screen, "show", interrupt)
+    return seen
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys, number):
+    """In the first epoch of the second of two programs."""
+    seen = interrupting(monkeypatch, 5, number)
     handler = signal.getsignal(number)
     command = [*COMMAND, "--lanes", "2", "--out", str(tmp_path)]
     assert cli.main(command) == 128 + number
@@ -395,6 +412,18 @@ def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path
     said = capsys.readouterr().out
     assert "going on after epoch 1" in said
     assert "100%  point_mass, 2 runs: epoch 4/4" in said
+
+
+@pytest.mark.parametrize(("lanes", "done", "status"), [(2, 2, 128 + signal.SIGINT), (4, 4, 0)])
+def test_a_signal_in_the_last_epoch_loses_nothing(tmp_path, point_mass, monkeypatch, capsys, lanes, done, status):
+    """Of the first of two programs, which has results by then, or of the only one, after which there is nothing to stop."""
+    seen = interrupting(monkeypatch, 4, signal.SIGINT)
+    assert cli.main([*COMMAND, "--lanes", str(lanes), "--out", str(tmp_path)]) == status
+    assert seen == [1, 2, 3, 4]
+    assert len(list(tmp_path.glob("cells/*/result.json"))) == done
+    assert (tmp_path / sweep.FINALS).exists() == (status == 0)
+    assert not (tmp_path / "unfinished").exists()
+    assert ("the same command goes on with the other 2" in capsys.readouterr().out) == (done == 2)
 
 
 @pytest.mark.parametrize(

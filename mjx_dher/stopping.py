@@ -1,0 +1,43 @@
+"""Ctrl-C and SIGTERM, while something trains."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+
+class Stop:
+    """While it is entered, the first signal asks for a stop, and the next one ends the program at once.
+
+    A compiled epoch cannot be interrupted, so whoever trains looks at `asked` after each. All that was saved is on the disk.
+
+    Args:
+      console: to print to.
+      folder: where things are saved.
+    """
+
+    def __init__(self, console: Console, folder: Path):
+        self.asked: int | None = None  # the signal
+        self._console, self._folder = console, folder
+
+    def __enter__(self) -> Stop:
+        self._handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    def _on_signal(self, signum: int, frame: Any) -> None:
+        if self.asked is not None:
+            self._console.show_cursor(True)
+            self._console.print(f"stopped at once; what was saved is in {self._folder}", soft_wrap=True)
+            sys.stdout.flush()
+            os._exit(128 + signum)
+        self.asked = signum
+        self._console.print("stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved")
