@@ -1,6 +1,6 @@
 """Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
 
-    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
+    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted] [--dtype bfloat16]
 
 As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one, until 500
 updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one seed.
@@ -57,8 +57,10 @@ def main() -> None:
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[256, 512, 1024])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--sampler", default="weighted")
+    parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
     args = parser.parse_args()
-    networks = Networks(actor=Actor(4), critic=Critic(Config().hidden_sizes))
+    hidden_sizes, dtype = Config().hidden_sizes, jnp.dtype(args.dtype)
+    networks = Networks(actor=Actor(4, hidden_sizes, dtype), critic=Critic(hidden_sizes, dtype))
     hparams = jax.tree.map(jnp.float32, HParams(eventful_share=0.5))
     sampler, ring = samplers.make(args.sampler), full_ring()
     counts = replay.count_eventful(ring)

@@ -33,7 +33,7 @@ def _fields_of(of: Any, kind: Any, but: Sequence[str] = ()) -> list[tuple[str, A
 
 
 def _optional(of: Any, name: str) -> Any:
-    kinds = {"engine": str, "hidden_sizes": tuple[int, ...]}
+    kinds = {"engine": str, "learner_dtype": str, "hidden_sizes": tuple[int, ...]}
     return Annotated[kinds.get(name, int) | None, tyro.conf.arg(help=f"The preset's {name}, changed.")]
 
 

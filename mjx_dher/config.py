@@ -19,6 +19,7 @@ ENGINES = ("auto", "native", "jax", "warp")
 SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
 WEIGHT_KERNELS = ("linear", "inverse", "softmax")
 METRICS = ("position",)
+DTYPES = ("float32", "bfloat16")
 PRESETS = ("cpu", "gpu", "paper")
 
 
@@ -57,6 +58,9 @@ class Config:
     """Transitions that the replay ring holds."""
     hidden_sizes: tuple[int, ...] = (256, 256, 256)
     """Units of the hidden layers, of actor and critic both."""
+    learner_dtype: str = "float32"
+    """Of the hidden layers while learning: float32, or bfloat16, which is faster on a GPU with large batches or many runs side
+    by side. Parameters, and the policy that plays, are float32 with either."""
     eval_episodes: int = 100
     """Episodes of the deterministic evaluation that ends each epoch."""
 
@@ -313,6 +317,7 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
         ("weight_kernel", c.weight_kernel, WEIGHT_KERNELS),
         ("metric", c.metric, metric_names()),
         ("engine", c.engine, ENGINES),
+        ("learner_dtype", c.learner_dtype, DTYPES),
     ):
         try:
             check_name(field, value, allowed, own=field == "sampler")

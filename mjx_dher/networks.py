@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -10,30 +11,34 @@ import jax.numpy as jnp
 from mjx_dher.types import Array
 
 
-def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int) -> Array:
+def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: Any) -> Array:
     for size in hidden_sizes:
-        x = nn.relu(nn.Dense(size, kernel_init=nn.initializers.xavier_uniform())(x))
-    return nn.Dense(output_size, kernel_init=nn.initializers.xavier_uniform())(x)
+        x = nn.relu(nn.Dense(size, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x))
+    return nn.Dense(output_size, dtype=jnp.float32, kernel_init=nn.initializers.xavier_uniform())(x)
 
 
 class Actor(nn.Module):
-    """Deterministic policy: normalized observation and goal to an action in [-1, 1]."""
+    """Deterministic policy: normalized observation and goal to an action in [-1, 1]. Parameters and actions are float32."""
 
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
+    dtype: Any = jnp.float32  # of the hidden layers' products and activations
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> Array:
         """[..., D], [..., G] -> [..., A]."""
-        return jnp.tanh(_mlp(jnp.concatenate([observation, goal], axis=-1), self.hidden_sizes, self.action_size))
+        inputs = jnp.concatenate([observation, goal], axis=-1)
+        return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype))
 
 
 class Critic(nn.Module):
-    """Q value of an action in a state, for a goal."""
+    """Q value of an action in a state, for a goal. Parameters and values are float32."""
 
     hidden_sizes: Sequence[int] = (256, 256, 256)
+    dtype: Any = jnp.float32  # of the hidden layers' products and activations
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array, action: Array) -> Array:
         """[..., D], [..., G], [..., A] -> [...]."""
-        return _mlp(jnp.concatenate([observation, goal, action], axis=-1), self.hidden_sizes, 1)[..., 0]
+        inputs = jnp.concatenate([observation, goal, action], axis=-1)
+        return _mlp(inputs, self.hidden_sizes, 1, self.dtype)[..., 0]

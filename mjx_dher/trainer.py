@@ -69,7 +69,7 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
     """
     config_lib.validate(config, HParams(), env.episode_length)
     chosen = samplers.make(config.sampler, config.weight_kernel, config.metric) if sampler is None else sampler
-    networks = Networks(actor=Actor(env.action_size, config.hidden_sizes), critic=Critic(config.hidden_sizes))
+    networks, learning = (_networks(env.action_size, config.hidden_sizes, dtype) for dtype in ("float32", config.learner_dtype))
     template = episode_template(env)
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
     updates_per_target = config.target_period
@@ -109,7 +109,7 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         hparams = anneal(hparams, learner.num_updates / (num_cycles * config.updates_per_cycle))
 
         def update(learner: DDPGState, batch: Batch) -> tuple[DDPGState, Losses]:
-            return ddpg.update(networks, learner, batch, hparams)
+            return ddpg.update(learning, learner, batch, hparams)
 
         def update_with_target(learner: DDPGState, batches: Batch) -> tuple[DDPGState, Losses]:
             learner, losses = jax.lax.scan(update, learner, batches)
@@ -165,6 +165,11 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         return dataclasses.replace(state, key=key), metrics
 
     return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+
+
+def _networks(action_size: int, hidden_sizes: tuple[int, ...], dtype: str) -> Networks:
+    """Both networks; those of another dtype have the same parameters."""
+    return Networks(actor=Actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=Critic(hidden_sizes, jnp.dtype(dtype)))
 
 
 def _moved(goal: Array, hindsight: Array) -> Metrics:

@@ -38,6 +38,7 @@ def test_sizes_that_follow():
 BAD_CONFIG = [
     ({"sampler": "wieghted"}, "sampler must be one of random, .*; got 'wieghted' .did you mean 'weighted'"),
     ({"weight_kernel": "cubic"}, "weight_kernel must be one of linear, inverse, softmax; got 'cubic'"),
+    ({"learner_dtype": "float16"}, "learner_dtype must be one of float32, bfloat16; got 'float16'"),
     ({"engine": "warpp"}, "engine must be one of auto, native, jax, warp; got 'warpp'"),
     ({"num_envs": 0}, "num_envs must be an integer of at least 1; got 0"),
     ({"num_envs": 2.5}, "num_envs must be an integer of at least 1; got 2.5"),

@@ -3,6 +3,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from mjx_dher import ddpg
 from mjx_dher.config import HParams
@@ -141,6 +142,30 @@ def test_paper_networks():
     assert kernels(actor_params) == [(28, 256), (256, 256), (256, 256), (256, 4)]
     assert kernels(critic_params) == [(32, 256), (256, 256), (256, 256), (256, 1)]
     assert float(jnp.abs(actor.apply(actor_params, obs + 1e6, goal)).max()) <= 1.0
+
+
+def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
+    """8 bits of mantissa: values to half a per cent, and directions of gradients within five degrees."""
+    exact = Networks(Actor(4), Critic())
+    rounded = Networks(Actor(4, dtype=jnp.bfloat16), Critic(dtype=jnp.bfloat16))
+    params = ddpg.init(jax.random.key(0), exact, 25, 3, 4).params
+    observation, following, goal, action = (
+        jax.random.normal(jax.random.key(i), (512, size)) for i, size in enumerate((25, 25, 3, 4))
+    )
+    batch = Batch(observation, following, goal, jnp.tanh(action), -jnp.ones(512))
+    hparams = HParams()
+
+    def passes(networks):
+        target = ddpg.target_value(networks, params, batch, hparams)
+        critic = jax.grad(lambda critic: ddpg.critic_loss(networks, critic, batch, target)[0])(params.critic)
+        actor = jax.grad(lambda actor: ddpg.actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
+        return target, ravel_pytree(critic)[0], ravel_pytree(actor)[0]
+
+    (target, *gradients), (near, *others) = passes(exact), passes(rounded)
+    assert 0 < float(jnp.abs(target - near).max()) < 0.05
+    for ours, other in zip(gradients, others, strict=True):
+        assert other.dtype == jnp.float32
+        assert float(ours @ other / jnp.linalg.norm(ours) / jnp.linalg.norm(other)) > np.cos(np.radians(5))
 
 
 def test_critic_learns_a_known_value():

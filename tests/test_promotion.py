@@ -36,9 +36,9 @@ def test_it_would_be_noticed():
         jnp.zeros(3) + jnp.zeros(3, jnp.int32)
 
 
-@pytest.mark.parametrize("sampler", ["future", "random"])
-def test_an_epoch_in_which_physics_may_blow_up(sampler):
-    program = make_train(Explodes(None), dataclasses.replace(SMALL, sampler=sampler))
+@pytest.mark.parametrize(("sampler", "dtype"), [("future", "float32"), ("random", "bfloat16")])
+def test_an_epoch_in_which_physics_may_blow_up(sampler, dtype):
+    program = make_train(Explodes(None), dataclasses.replace(SMALL, sampler=sampler, learner_dtype=dtype))
     jax.eval_shape(program.epoch, trainer.state_template(program))
 
 

@@ -182,8 +182,10 @@ def test_hparams_are_traced_one_compilation_serves_all():
     assert epoch._cache_size() == 1
 
 
-def test_training_solves_the_point_mass():
-    records = list(trainer.train(ENV, LEARNS, HParams(polyak=0.98, gamma=0.9)))
+@pytest.mark.parametrize("dtype", config.DTYPES)
+def test_training_solves_the_point_mass(dtype):
+    static = dataclasses.replace(LEARNS, learner_dtype=dtype)
+    records = list(trainer.train(ENV, static, HParams(polyak=0.98, gamma=0.9)))
     curve = [record.metrics["success_rate"] for record in records]
     assert [record.epoch for record in records] == list(range(1, 11))
     assert records[-1].env_steps == 16_000
@@ -197,6 +199,20 @@ def test_a_frozen_learner_stays_near_chance():
     """The probe can fail: a frozen learner stays at the level of chance."""
     records = list(trainer.train(ENV, LEARNS, HParams(actor_lr=0.0, critic_lr=0.0)))
     assert records[-1].metrics["success_rate"] < 0.5
+
+
+def test_bfloat16_is_for_learning_alone():
+    """First networks, parameters, normalizers and the policy that plays are those of float32."""
+    program, other = (make_train(ENV, dataclasses.replace(SMALL, learner_dtype=dtype)) for dtype in config.DTYPES)
+    first = other.init(jax.random.key(0), HParams())
+    jax.tree.map(np.testing.assert_array_equal, first.learner, program.init(jax.random.key(0), HParams()).learner)
+    learned = jax.jit(other.epoch)(first)[0].learner
+    assert {leaf.dtype for leaf in jax.tree.leaves(learned)} == {jnp.dtype("float32"), jnp.dtype("int32")}
+    moved = jax.tree.map(lambda new, old: float(jnp.abs(new - old).max()), learned.params, first.learner.params)
+    assert min(jax.tree.leaves(moved)) > 0.001
+    assert ["bf16" in str(jax.make_jaxpr(p.epoch)(first)) for p in (program, other)] == [False, True]
+    play = lambda state, key: trainer.evaluate_state(ENV, other.networks, state, key, 8)  # noqa: E731
+    assert "bf16" not in str(jax.make_jaxpr(play)(first, jax.random.key(1)))
 
 
 def test_the_same_seed_gives_the_same_run():
