@@ -507,8 +507,8 @@ def prepare() -> None:
     """What a program that trains for hours needs: compiled programs are kept, and memory is not."""
     from mjx_dher import memory
 
+    memory.keep_heap_small()  # before JAX starts threads
     keep_compiled_programs()
-    memory.keep_heap_small()
 
 
 def _row(progress: Progress) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import ctypes
 import os
 from pathlib import Path
 
-_M_MMAP_THRESHOLD = -3  # of glibc's malloc.h
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of glibc's malloc.h
 
 
 def available_bytes() -> int | None:
@@ -39,13 +39,15 @@ def used_bytes() -> int | None:
 
 
 def keep_heap_small() -> None:
-    """Has the C library take blocks of a megabyte and more from the system, and give them back when they are freed.
+    """Has the C library give freed blocks of a megabyte and more back to the system, and keep the others in one heap.
 
-    As it comes, glibc keeps freed blocks of up to 32 MB for later ones. Buffers of checkpoints then leave holes that the
-    next ones do not fit into, and a long run grows by some MB with each. Elsewhere than on Linux with glibc: nothing.
+    As it comes, glibc keeps freed blocks of up to 32 MB for later ones, in as many heaps as threads ask for. Buffers of
+    checkpoints then leave holes that the next ones, of other threads, do not fit into, and a long run grows by some MB with
+    each. To be called before threads are started. Elsewhere than on Linux with glibc: nothing.
     """
     if (library := _glibc()) is not None:
         library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
+        library.mallopt(_M_ARENA_MAX, 1)
 
 
 def release() -> None:

@@ -44,6 +44,37 @@ def test_blocks_of_some_megabytes_go_back_to_the_system_when_they_are_freed():
     assert kept(5_000_000, before="memory.keep_heap_small()") < 10
 
 
+THREADS = """
+import ctypes, threading
+from mjx_dher import memory
+c = ctypes.CDLL("libc.so.6")
+{before}
+together = threading.Barrier(4)
+def allocate():
+    together.wait()
+    for _ in range(1000):
+        c.malloc(1000)
+threads = [threading.Thread(target=allocate) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+stdout = ctypes.c_void_p.in_dll(c, "stdout")
+c.malloc_info(0, stdout)
+c.fflush(stdout)
+"""
+
+
+def heaps(before=""):
+    """How many heaps threads have that allocate at the same time."""
+    code = THREADS.format(before=before)
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    return found.count("<heap nr=")
+
+
+def test_all_threads_have_one_heap():
+    assert heaps() > 1
+    assert heaps(before="memory.keep_heap_small()") == 1
+
+
 def test_release_gives_back_what_was_freed():
     assert kept(100_000) > 80
     assert kept(100_000, after="memory.release()") < 20
