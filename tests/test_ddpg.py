@@ -156,6 +156,8 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     hparams = HParams()
 
     def passes(networks):
+        action = networks.actor.apply(params.actor, observation, goal)
+        assert action.dtype == networks.critic.apply(params.critic, observation, goal, action).dtype == jnp.float32
         target = ddpg.target_value(networks, params, batch, hparams)
         critic = jax.grad(lambda critic: ddpg.critic_loss(networks, critic, batch, target)[0])(params.critic)
         actor = jax.grad(lambda actor: ddpg.actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)

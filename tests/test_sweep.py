@@ -463,11 +463,15 @@ def test_a_folder_that_holds_something_else_is_refused(tmp_path, capsys):
     assert "formats must be among png, svg, pdf; got jpg" in capsys.readouterr().err
 
 
+OTHERS = ("--learner-dtype", "bfloat16", "--engine", "jax")
+
+
 def test_every_number_and_every_shape_can_be_set():
-    args, cells = cli_args("--sweep.her-k", "2", "4", "--num-envs", "4", "--hidden-sizes", "8", "8", "--seeds", "3")
+    args, cells = cli_args("--sweep.her-k", "2", "4", "--num-envs", "4", "--hidden-sizes", "8", "8", "--seeds", "3", *OTHERS)
     assert {c.hparams.her_k for c in cells} == {2.0, 4.0}
     assert {c.config.num_envs for c in cells} == {4}
     assert {c.config.hidden_sizes for c in cells} == {(8, 8)}
+    assert {(c.config.learner_dtype, c.config.engine) for c in cells} == {("bfloat16", "jax")}
     assert len(cells) == 4 * 2 * 3
     assert {*vars(args.sweep)} == set(HParams._fields)
     assert {*vars(args.changes)} == {f.name for f in dataclasses.fields(config.Config)} - {
