@@ -89,7 +89,7 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
         last = f"the last one is {kept[0]}" if kept else "there is none before it"
         raise CheckpointError(f"cannot write the checkpoint {target} ({error}); {last}") from error
     finally:
-        memory.release()  # the threads that compress leave holes in heaps of their own: some 20 MB more each time
+        memory.release()  # the buffers of the threads that compress leave holes
     return target
 
 

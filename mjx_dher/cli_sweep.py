@@ -9,7 +9,7 @@ import signal
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import tyro
 from rich.console import Console
@@ -33,8 +33,7 @@ def _fields_of(of: Any, kind: Any, but: Sequence[str] = ()) -> list[tuple[str, A
 
 
 def _optional(of: Any, name: str) -> Any:
-    kinds = {"engine": str, "learner_dtype": str, "hidden_sizes": tuple[int, ...]}
-    return Annotated[kinds.get(name, int) | None, tyro.conf.arg(help=f"The preset's {name}, changed.")]
+    return Annotated[get_type_hints(of)[name] | None, tyro.conf.arg(help=f"The preset's {name}, changed.")]
 
 
 def _values(of: Any, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""How much memory there is to allocate."""
+"""How much memory there is, how much is held, and having the C library give back what is free."""
 
 from __future__ import annotations
 

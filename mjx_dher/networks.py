@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from mjx_dher.types import Array
 
 
-def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: Any) -> Array:
+def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike) -> Array:
     for size in hidden_sizes:
         x = nn.relu(nn.Dense(size, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x))
     return nn.Dense(output_size, dtype=jnp.float32, kernel_init=nn.initializers.xavier_uniform())(x)
@@ -22,7 +22,7 @@ class Actor(nn.Module):
 
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
-    dtype: Any = jnp.float32  # of the hidden layers' products and activations
+    dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> Array:
@@ -35,7 +35,7 @@ class Critic(nn.Module):
     """Q value of an action in a state, for a goal. Parameters and values are float32."""
 
     hidden_sizes: Sequence[int] = (256, 256, 256)
-    dtype: Any = jnp.float32  # of the hidden layers' products and activations
+    dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array, action: Array) -> Array:
