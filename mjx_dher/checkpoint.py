@@ -205,7 +205,8 @@ def _checkpointer() -> Any:
     import orbax.checkpoint
 
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax tells how long each step took
-    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler())
+    # A folder for each array: the process keeps some memory of every checkpoint in orbax's other format, OCDBT.
+    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False))
 
 
 def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
