@@ -18,8 +18,8 @@ class DoctorArgs:
 
     json: bool = False
     """Print one JSON object instead."""
-    seconds: float = 60.0
-    """Time that each engine and each way to draw may take. Warp compiles its kernels, once a machine, for most of a minute."""
+    seconds: float = 180.0
+    """Time that each engine and each way to draw may take. Warp compiles its kernels, once a machine, for a minute or more."""
 
 
 def doctor_command(argv: list[str], console: Console) -> int:
