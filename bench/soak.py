@@ -3,10 +3,11 @@
     python bench/soak.py [--env push] [--minutes 60] [--out soak.csv] [-- OPTIONS OF train.py]
 
 Trains, with checkpoints and a log of JSON lines, until the time is up, and is then stopped as by SIGTERM. After each epoch it
-notes the memory held (resident), how often XLA has compiled, and how fast the machine is (MuJoCo alone, for a moment). The
+notes the memory held (resident), how often XLA has compiled, and how fast the machine is just then: another process, which
+began with the run and does nothing in between, plays episodes and multiplies matrices on all cores for half a second. The
 epochs after the first tenth of the time, in which the replay ring fills, are cut into ten blocks; a line is fitted to the
 blocks' medians. Exits with 1 if anything compiled after the first epoch, if the 95 % interval of memory's slope lies above
-zero, or if environment steps per second change by 5 % or more along the line: on a machine that does nothing else.
+zero, or if environment steps per second, as a multiple of the machine's speed, change by 5 % or more along the line.
 """
 
 from __future__ import annotations
@@ -15,34 +16,44 @@ import argparse
 import csv
 import os
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
 import jax
-import mujoco
+import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from timing import print_table
 
-from mjx_dher import cli, envs, memory, metrics
+from mjx_dher import cli, envs, memory, metrics, rollout
 
 BLOCKS = 10
-REFERENCE_STEPS = 50_000
+REFERENCE_EPISODES = 24  # some 0.1 s on two cores
+REFERENCE_PRODUCTS = 600  # some 0.3 s
+COLUMNS = ("epoch", "env_steps", "seconds", "epoch_seconds", "reference_seconds", "memory", "compilations")
 COMPILATION = "/jax/core/compile/backend_compile_duration"
 
 
 class Watch:
     """A sink that notes what each epoch leaves, and stops the run when its time is up.
 
-    Between epochs, while training waits, it also steps MuJoCo alone for a moment, to know how fast the machine is just then.
+    Rows go to a file at once: kept in memory they would grow like what is looked for.
     """
 
-    def __init__(self, env, seconds):
-        self.model, self.seconds, self.rows, self.compilations = envs.make(env, engine="native").model, seconds, [], 0
+    def __init__(self, path, seconds):
+        self.seconds, self.compilations = seconds, 0
         jax.monitoring.register_event_duration_secs_listener(self._on_event)
         self.since = None  # the first epoch's end
+        self.file = path.open("w", newline="", buffering=1)
+        self.writer = csv.DictWriter(self.file, COLUMNS)
+        self.writer.writeheader()
+        command = [sys.executable, __file__, "--reference"]
+        # A session of its own: Ctrl-C is for the run.
+        self.clock = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+        self._reference()
 
     def _on_event(self, name, seconds, **_):
         self.compilations += name == COMPILATION
@@ -53,7 +64,7 @@ class Watch:
             self.since = self.begin = now
         elif now - self.since > self.seconds:
             os.kill(os.getpid(), signal.SIGTERM)
-        self.rows.append(
+        self.writer.writerow(
             {
                 "epoch": row["epoch"],
                 "env_steps": row["env_steps"],
@@ -67,14 +78,31 @@ class Watch:
         self.begin = time.perf_counter()
 
     def _reference(self):
-        data = mujoco.MjData(self.model)
-        started = time.perf_counter()
-        for _ in range(REFERENCE_STEPS):
-            mujoco.mj_step(self.model, data)
-        return time.perf_counter() - started
+        self.clock.stdin.write("\n")
+        self.clock.stdin.flush()
+        return float(self.clock.stdout.readline())
 
     def close(self):
-        pass
+        self.clock.communicate()
+        self.file.close()
+
+
+def tell_speed() -> None:
+    """The other process: for each line that it reads it does the same work once and prints the seconds that it took."""
+    env = envs.make("push", engine="native")
+    actions = jnp.zeros((env.episode_length, REFERENCE_EPISODES, env.action_size))
+
+    @jax.jit
+    def work(x):
+        played = rollout.rollout(env, lambda action, obs: action, jax.random.key(0), REFERENCE_EPISODES, actions)[1]
+        return played, jax.lax.scan(lambda x, _: (jnp.tanh(x @ x[:256]), None), x, length=REFERENCE_PRODUCTS)[0]
+
+    x = jax.random.normal(jax.random.key(0), (1024, 256))
+    jax.block_until_ready(work(x))
+    for _ in sys.stdin:
+        started = time.perf_counter()
+        jax.block_until_ready(work(x))
+        print(time.perf_counter() - started, flush=True)
 
 
 def line(minutes, values):
@@ -90,37 +118,43 @@ def main() -> int:
     parser.add_argument("--env", default="push")
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--reference", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("options", nargs="*", help="of train.py, after --")
     args = parser.parse_args()
-    watch, open_sinks = Watch(args.env, args.minutes * 60), metrics.open_sinks
-    metrics.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
+    if args.reference:
+        tell_speed()
+        return 0
+    open_sinks = metrics.open_sinks
     with tempfile.TemporaryDirectory() as parent:
+        out = args.out or Path(parent) / "soak.csv"
+        watch = Watch(out, args.minutes * 60)
+        metrics.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
         command = ["--env", args.env, "--total-steps", "1000000000", "--checkpoint-every", "20", "--log", "jsonl"]
         status = cli.main([*command, "--out", str(Path(parent) / "run"), *args.options])
-    if status != 128 + signal.SIGTERM:
-        print(f"the run ended by itself, with status {status}", file=sys.stderr)
-        return 1
-    if args.out:
-        with args.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(watch.rows[0]))
-            writer.writeheader()
-            writer.writerows(watch.rows)
-    return report(watch.rows)
+        if status != 128 + signal.SIGTERM:
+            print(f"the run ended by itself, with status {status}", file=sys.stderr)
+            return 1
+        with out.open(newline="") as file:
+            return report(list(csv.DictReader(file)))
 
 
 def report(rows) -> int:
     column = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
     minutes = column["seconds"] / 60
     used = minutes > minutes[-1] / 10
+    if used.sum() < 2 * BLOCKS:
+        print(f"only {used.sum()} epochs after the first tenth of the time; {2 * BLOCKS} are needed", file=sys.stderr)
+        return 1
     along, held = minutes[used], column["memory"][used] / 1e6
     speed = (np.diff(column["env_steps"], prepend=0) / column["epoch_seconds"].clip(1e-9))[used]
-    machine_speed = (REFERENCE_STEPS / column["reference_seconds"])[used]
+    machine_speed = 1 / column["reference_seconds"][used]
     span = along[-1] - along[0]
     again = int(column["compilations"][-1] - column["compilations"][0])
     measured = {
         "memory, MB": held,
         "env steps/s": speed,
-        "the machine: mj_step/s, alone": machine_speed,
+        "the machine, units of work/s": machine_speed,
+        "env steps a unit of the machine's work": speed / machine_speed,
     }
     table, wrong = [], [] if again == 0 else [f"{again} programs were compiled after the first epoch"]
     for name, values in measured.items():
@@ -130,8 +164,8 @@ def report(rows) -> int:
         table.append((name, f"{median:,.1f}", f"{values.min():,.1f}", f"{values.max():,.1f}", f"{slope:+,.1f}", shares))
         if name == "memory, MB" and low > 0:
             wrong.append(f"memory grows by {slope:.1f} MB in {span:.0f} minutes ({low:.1f} to {high:.1f})")
-        if name == "env steps/s" and abs(slope) >= 0.05 * median:
-            wrong.append(f"speed changes by {slope / median:+.1%}")
+        if name.startswith("env steps a unit") and abs(slope) >= 0.05 * median:
+            wrong.append(f"speed changes by {slope / median:+.1%}, beside the machine's own")
     print_table(("of the epochs", "median", "least", "most", f"change in {span:.0f} min", "95 % interval"), table)
     print(f"\n{len(rows)} epochs, {column['env_steps'][-1]:,.0f} env steps in {minutes[-1]:.1f} min;", end=" ")
     print(f"compiled before the first epoch's end: {int(column['compilations'][0])}, after it: {again}")

@@ -251,7 +251,7 @@ def _train(
         for progress in trainer.run(env, chunk[0].config, compiled, begin):
             counts = {name: getattr(progress, name) for name in metrics.COUNTS}
             for lane, sink in enumerate(sinks):
-                sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
+                sink.write({**counts, **{name: trainer.to_float(values[lane]) for name, values in progress.metrics.items()}})
             if progress.epoch == progress.num_epochs:
                 continue  # what they leave comes first
             try:
@@ -268,7 +268,7 @@ def _end(chunk: Sequence[Cell], progress: Progress, final: dict[str, Any], setti
     """Writes what cells that have ended leave: policies and the last evaluations."""
     import jax
 
-    from mjx_dher import policy
+    from mjx_dher import policy, trainer
 
     learners = jax.device_get(progress.state.learner)
     lanes = len(learners.num_updates)
@@ -276,9 +276,9 @@ def _end(chunk: Sequence[Cell], progress: Progress, final: dict[str, Any], setti
     for lane, cell in enumerate(chunk):
         path, learner = _path(settings.folder, cell), jax.tree.map(lambda x, lane=lane: x[lane], learners)
         policy.from_learner(learner, cell.hparams).save(path / run_folder.POLICY_FILE)
-        result = {name: float(values[lane]) for name, values in final.items()} | {"episodes": settings.final_episodes}
+        result = {name: trainer.to_float(values[lane]) for name, values in final.items()}
         # Last of all: the cell is done when this is there.
-        run_folder.write_json(path / run_folder.RESULT_FILE, {**last, **result})
+        run_folder.write_json(path / run_folder.RESULT_FILE, {**last, **result, "episodes": settings.final_episodes})
     _clear(settings.folder)
 
 

@@ -294,8 +294,12 @@ def train(
     check_steps(env)
     on_compile(time.perf_counter() - started)
     for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
-        # To the digits that float32 has: 95 of 100 are 0.95, which float(float32) is not.
-        yield progress._replace(metrics={name: float(f"{value:.6g}") for name, value in progress.metrics.items()})
+        yield progress._replace(metrics={name: to_float(value) for name, value in progress.metrics.items()})
+
+
+def to_float(value: Any) -> float:
+    """A float32 to the digits that it has: 95 of 100 are 0.95, which float(float32) is not."""
+    return float(f"{value:.6g}")
 
 
 class Compiled(NamedTuple):
