@@ -122,8 +122,12 @@ def test_batching_is_vmap_in_any_nesting(engine):
     keys = jax.random.split(jax.random.key(2), 6).reshape(2, 3)
     actions = jax.random.uniform(jax.random.key(3), (2, 3, 4, 4), minval=-1, maxval=1)
 
+    def step(state, action):
+        following = env.step(state, action)
+        return following, following.obs["observation"]
+
     def episode(key, actions):
-        return jax.lax.scan(lambda s, a: (env.step(s, a), env.step(s, a).obs["observation"]), env.reset(key), actions)[1]
+        return jax.lax.scan(step, env.reset(key), actions)[1]
 
     nested = jax.jit(jax.vmap(jax.vmap(episode)))(keys, actions)
     assert nested.shape == (2, 3, 4, 25)
