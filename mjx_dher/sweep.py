@@ -251,7 +251,7 @@ def _train(
         for progress in trainer.run(env, chunk[0].config, compiled, begin):
             counts = {name: getattr(progress, name) for name in metrics.COUNTS}
             for lane, sink in enumerate(sinks):
-                sink.write({**counts, **{name: trainer.to_float(values[lane]) for name, values in progress.metrics.items()}})
+                sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
             if progress.epoch == progress.num_epochs:
                 continue  # what they leave comes first
             try:
