@@ -8,8 +8,9 @@ import pytest
 
 from mjx_dher import envs
 from mjx_dher.envs import engines
+from mjx_dher.envs.engines import warp_substep
 from mjx_dher.envs.engines.base import with_stand_ins
-from mjx_dher.envs.engines.warp import capacities
+from mjx_dher.envs.engines.warp import capacities, mujoco_warp, wp
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +67,90 @@ def test_a_failed_environment_leaves_the_others_alone(warp):
     np.testing.assert_array_equal(failed, np.broadcast_to(bad, (3, 2, 2)))
     np.testing.assert_allclose(played[:, ~bad], clean[:, ~bad], atol=1e-4)  # rounding: atomic sums
     assert np.isfinite(played).all()
+
+
+def test_a_step_depends_on_nothing_that_came_before(warp):
+    """Where environments blew up, were put back to a start, and go on with other actions: as if nothing had been."""
+    start = starts(warp)
+    actions = jax.random.uniform(jax.random.key(3), (2, 2, 2, 4), minval=-1, maxval=1)
+    fresh, _ = play(warp, start, actions)
+    qvel = start.physics.qvel.at[:].set(jnp.nan)
+    _, failed = play(warp, start.replace(physics=start.physics.replace(qvel=qvel)), actions)
+    assert failed.all()
+    again, failed = play(warp, start, actions)
+    assert not failed.any()
+    np.testing.assert_allclose(again, fresh, atol=1e-4)  # rounding: atomic sums
+
+
+def simulated(model, num_envs, seed):
+    """Model and Data of MuJoCo Warp; at random states, in which the fingers touch table and object."""
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model, nworld=num_envs, naconmax=64 * num_envs, njmax=256)
+    rng = np.random.default_rng(seed)
+    qpos = np.tile(model.qpos0, (num_envs, 1)) + 0.05 * rng.standard_normal((num_envs, model.nq))
+    d.qpos = wp.array(qpos, dtype=wp.float32)
+    d.qvel = wp.array(0.5 * rng.standard_normal((num_envs, model.nv)), dtype=wp.float32)
+    d.ctrl = wp.array(0.05 * rng.standard_normal((num_envs, model.nu)), dtype=wp.float32)
+    return m, d
+
+
+@pytest.mark.parametrize(
+    "task", ["pick_and_place", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "slide"))]
+)
+def test_a_substep_is_mujoco_warp_s_where_that_knows_the_velocities(task):
+    env = envs.make(task, engine="warp", allow_cpu=True)
+    results = []
+    for ours in (True, False):
+        m, d = simulated(env.engine._model, 16, seed=0)
+        assert warp_substep.needs(env.engine._model, m) == []
+        if ours:
+            warp_substep.make_substep(env.engine._model, m, d)()
+        else:
+            mujoco_warp.forward(m, d)  # computes the velocities of bodies that constraints read in the step
+            d.qacc_warmstart.zero_()
+            mujoco_warp.step(m, d)
+        results.append({name: getattr(d, name).numpy() for name in ("nefc", "M", "qfrc_smooth", "qacc", "qvel", "qpos")})
+    here, there = results
+    assert there["nefc"].max() > (6 if env.has_object else 5)  # the weld, and contacts
+    np.testing.assert_array_equal(here["nefc"], there["nefc"])
+    for name, scale in (("M", 1e-5), ("qfrc_smooth", 1e-5), ("qacc", 1e-3), ("qvel", 1e-4), ("qpos", 1e-5)):
+        size = np.abs(there[name]).max()
+        np.testing.assert_allclose(here[name], there[name], atol=scale * size, rtol=0, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "what"),
+    [
+        ('<option integrator="implicitfast"/>', "an integrator other than Euler"),
+        ('<option><flag gravity="disable"/></option>', "options disabled or enabled"),
+        ('<option density="1.2"/>', "a medium"),
+        ('<sensor><jointpos joint="j"/></sensor>', "sensors"),
+        ('<default><joint stiffness="1 2"/></default>', "springs or damping that are not linear"),
+        (
+            '<worldbody><body><joint type="ball" stiffness="1"/><geom size="1"/></body></worldbody>',
+            "springs of free or ball joints",
+        ),
+        ('<tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>', "tendons"),
+        ('<worldbody><body gravcomp="1"><freejoint/><geom size="1"/></body></worldbody>', "gravity compensation"),
+    ],
+)
+def test_a_model_with_more_to_it_is_stepped_by_mujoco_warp(attribute, what, monkeypatch):
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco>{attribute}<worldbody><body><joint name='j'/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    m, d = mujoco_warp.put_model(model), mujoco_warp.make_data(model)
+    assert warp_substep.needs(model, m) == [what]
+    stepped = []
+    monkeypatch.setattr(mujoco_warp, "step", lambda *given: stepped.append(given))
+    warp_substep.make_substep(model, m, d)()
+    assert stepped == [(m, d)]
+
+
+def test_bodies_below_one_another_are_neighbours():
+    """1 has 2 and 4 below it, 2 has 3."""
+    body = "<body>{}</body>".format
+    tree = body(body(body("")) + body("")) + body("")
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{tree}</worldbody></mujoco>")
+    assert warp_substep.last_below(model).tolist() == [5, 4, 3, 3, 4, 5]
 
 
 @pytest.mark.parametrize(("memory", "kind"), [({"contacts": 1}, "narrowphase"), ({"constraints": 8}, "nefc")])

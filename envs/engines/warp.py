@@ -26,6 +26,8 @@ with contextlib.redirect_stdout(io.StringIO()):
     # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.
     from mujoco.mjx.third_party import mujoco_warp
 
+    from mjx_dher.envs.engines.warp_substep import make_substep
+
 wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
 
 # Contacts between two geoms, at most.
@@ -166,7 +168,7 @@ class _Simulation:
         self._model = mujoco_warp.put_model(model)
         self._model.opt.warn_overflow = 0  # a print from a kernel would stop all others
         self._data = mujoco_warp.make_data(model, nworld=num_envs, naconmax=num_envs * contacts, njmax=constraints)
-        self._substeps = substeps
+        self._substep, self._substeps = make_substep(model, self._model, self._data), substeps
         self._graph: Any = None
         self._inputs = wp.zeros((num_envs, 7 + model.nu), dtype=float)
 
@@ -191,7 +193,7 @@ class _Simulation:
         num_envs = data.nworld
         wp.launch(_set_inputs, dim=num_envs, inputs=[self._inputs], outputs=[data.mocap_pos, data.mocap_quat, data.ctrl])
         for _ in range(self._substeps):
-            mujoco_warp.step(self._model, data)
+            self._substep()
 
     def overflow(self) -> int:
         """The kinds of overflow since the last call, as a mask."""
