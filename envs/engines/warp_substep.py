@@ -33,7 +33,7 @@ def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
     """
     if needs(model, m):
         return lambda: mujoco_warp.step(m, d)
-    last = wp.array(last_below(model), dtype=int)
+    last: Any = wp.array(last_below(model), dtype=int)
     springs = _springs(model)
     damped = _Damped(m, d)
     smooth._rne_cacc_world(m, d)  # gravity, as the world's acceleration: it stays
@@ -147,7 +147,7 @@ def _subtree_com(
     subtree_com: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
 ):
     """Where the centre of mass is of each body and those below it."""
-    world, body = wp.tid()
+    world, body = wp.tid()  # type: ignore[misc]
     row = world % mass.shape[0]
     total = wp.vec3(0.0)
     for other in range(body, last[body] + 1):
@@ -165,7 +165,7 @@ def _composite_inertia(
     crb: wp.array2d(dtype=vec10),  # type: ignore[valid-type]
 ):
     """The inertia of each body with those below it as one."""
-    world, body = wp.tid()
+    world, body = wp.tid()  # type: ignore[misc]
     if body == 0:
         return
     total = vec10()
@@ -190,7 +190,7 @@ def _forces(
     force: wp.array2d(dtype=float),  # type: ignore[valid-type]
 ):
     """Of springs, damping and actuators, less what gravity and motion ask for: `cfrc` of the body and of those below it."""
-    world, dof = wp.tid()
+    world, dof = wp.tid()  # type: ignore[misc]
     body = dof_body[dof]
     total = wp.spatial_vector()
     for other in range(body, last[body] + 1):
@@ -210,7 +210,7 @@ def _damped_mass(
     damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
 ):
     """The mass matrix, with the timestep times the damping on its diagonal, which ends each row."""
-    world, dof = wp.tid()
+    world, dof = wp.tid()  # type: ignore[misc]
     begin = rowadr[dof]
     end = begin + rownnz[dof]
     for i in range(begin, end):
