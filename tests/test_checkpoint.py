@@ -11,6 +11,7 @@ import time
 
 import jax
 import numpy as np
+import orbax.checkpoint
 import pytest
 from conftest import ROOT
 from test_trainer import SMALL
@@ -176,6 +177,17 @@ def test_another_dtype_is_refused(saved, program):
     template = dataclasses.replace(template, env_steps=jax.ShapeDtypeStruct((), "float32"))
     with pytest.raises(CheckpointError, match=r"env_steps int32\[\] where .*env_steps float32\[\] is needed"):
         checkpoint.restore(saved[0], template)
+
+
+def test_a_checkpoint_in_orbax_s_default_format_is_read(saved, program, tmp_path, monkeypatch):
+    """As earlier versions wrote them."""
+    state = restore(saved[0], program).state
+    handler = orbax.checkpoint.PyTreeCheckpointHandler
+    with monkeypatch.context() as patch:
+        patch.setattr(orbax.checkpoint, "PyTreeCheckpointHandler", lambda use_ocdbt: handler(use_ocdbt=True))
+        checkpoint.save(tmp_path, state, 3, 1.0, keep=1)
+    assert list(tmp_path.rglob("manifest.ocdbt"))
+    assert bits(restore(tmp_path, program).state) == bits(state)
 
 
 def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch):

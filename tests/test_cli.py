@@ -236,3 +236,12 @@ def test_an_unwritable_out_is_refused(tmp_path):
     run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
     with pytest.raises(run_folder.RunFolderError, match="out: cannot create"):
         run_folder.create(blocker / "run", run, {})
+
+
+def test_a_reader_that_goes_is_no_error():
+    """As in `python train.py --help | head -1`."""
+    command = [sys.executable, "train.py", "--help"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 128 + signal.SIGPIPE
