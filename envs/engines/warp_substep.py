@@ -11,6 +11,7 @@ included. Here velocities come first, and a step depends on its arguments alone.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +33,7 @@ def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
       m, d: Model and Data of MuJoCo Warp, made from it.
     """
     if needs(model, m):
-        return lambda: mujoco_warp.step(m, d)
+        return functools.partial(_library_substep, m, d)
     last: Any = wp.array(last_below(model), dtype=int)
     springs = _springs(model)
     damped = _Damped(m, d)
@@ -46,6 +47,13 @@ def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
         damped.integrate()
 
     return substep
+
+
+def _library_substep(m: Any, d: Any) -> None:
+    """MuJoCo Warp's step, with the velocities of bodies before constraints here, too."""
+    forward.fwd_kinematics(m, d)
+    smooth.com_vel(m, d)
+    mujoco_warp.step(m, d)
 
 
 def needs(model: mujoco.MjModel, m: Any) -> list[str]:
