@@ -104,7 +104,8 @@ def test_a_substep_is_mujoco_warp_s_where_that_knows_the_velocities(task, monkey
         assert warp_substep.needs(env.engine._model, m) == []
         with monkeypatch.context() as patch:
             patch.setattr(warp_substep, "needs", lambda model, m, needed=needed: needed)
-            warp_substep.make_substep(env.engine._model, m, d)()
+            substep = warp_substep.make_substep(env.engine._model, m, d)
+        substep(), substep()  # the second finds what the first has left behind
         results.append({name: getattr(d, name).numpy() for name in ("nefc", "M", "qfrc_smooth", "qacc", "qvel", "qpos")})
     here, there = results
     assert there["nefc"].max() > (6 if env.has_object else 5)  # the weld, and contacts
@@ -143,11 +144,11 @@ def test_a_model_with_more_to_it_is_stepped_by_mujoco_warp(attribute, what, monk
 
 
 def test_bodies_below_one_another_are_neighbours():
-    """1 has 2 and 4 below it, 2 has 3."""
+    """1 has 2 and 4 below it, 2 has 3, 4 has 5."""
     body = "<body>{}</body>".format
-    tree = body(body(body("")) + body("")) + body("")
+    tree = body(body(body("")) + body(body(""))) + body("")
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{tree}</worldbody></mujoco>")
-    assert warp_substep.last_below(model).tolist() == [5, 4, 3, 3, 4, 5]
+    assert warp_substep.last_below(model).tolist() == [6, 5, 3, 3, 5, 5, 6]
 
 
 @pytest.mark.parametrize(("memory", "kind"), [({"contacts": 1}, "narrowphase"), ({"constraints": 8}, "nefc")])
