@@ -1,6 +1,7 @@
 """Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
 
-    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted] [--dtype bfloat16]
+    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
+        [--dtype bfloat16 [--kernels hopper]]
 
 As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one, until 500
 updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one seed.
@@ -15,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from timing import median_seconds, print_table
 
-from mjx_dher import Config, HParams, ddpg, replay, samplers
+from mjx_dher import Config, HParams, ddpg, fused, replay, samplers
 from mjx_dher.ddpg import Networks
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.relabel import draw_batches
@@ -58,7 +59,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
+    parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
     args = parser.parse_args()
+    gradients = fused.gradients if args.kernels == "hopper" else ddpg.gradients
     hidden_sizes, dtype = Config().hidden_sizes, jnp.dtype(args.dtype)
     networks = Networks(actor=Actor(4, hidden_sizes, dtype), critic=Critic(hidden_sizes, dtype))
     hparams = jax.tree.map(jnp.float32, HParams(eventful_share=0.5))
@@ -78,7 +81,7 @@ def main() -> None:
             return jax.lax.scan(add_up, None, jax.random.split(key, draws))[1]
 
         def update(learner, batch):
-            learner, losses = ddpg.update(networks, learner, batch, hparams)
+            learner, losses = ddpg.update(networks, learner, batch, hparams, gradients)
             return ddpg.update_target(learner, hparams), losses
 
         def updates_only(learner, batches, update=update, draws=draws):

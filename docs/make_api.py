@@ -17,7 +17,17 @@ ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "api.md"
 MODULES = {
     "Environments": ("envs", "envs.base", "types", "testing"),
-    "Parts of the algorithm": ("replay", "samplers", "relabel", "normalizer", "networks", "ddpg", "rollout", "evaluate"),
+    "Parts of the algorithm": (
+        "replay",
+        "samplers",
+        "relabel",
+        "normalizer",
+        "networks",
+        "ddpg",
+        "fused",
+        "rollout",
+        "evaluate",
+    ),
     "Runs": ("config", "trainer", "checkpoint", "policy", "sweep", "comparison", "stats"),
 }
 HEAD = """# API

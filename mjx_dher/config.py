@@ -20,6 +20,7 @@ SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest"
 WEIGHT_KERNELS = ("linear", "inverse", "softmax")
 METRICS = ("position",)
 DTYPES = ("float32", "bfloat16")
+LEARNER_KERNELS = ("auto", "xla", "hopper")
 PRESETS = ("cpu", "gpu", "paper")
 
 
@@ -61,6 +62,9 @@ class Config:
     learner_dtype: str = "float32"
     """Of the hidden layers while learning: float32, or bfloat16, which is faster on a GPU with large batches or many runs side
     by side. Parameters, and the policy that plays, are float32 with either."""
+    learner_kernels: str = "auto"
+    """What computes the gradients: xla, hopper (this library's kernels for an NVIDIA H100 or H200, for bfloat16) or auto, which
+    takes hopper wherever it can."""
     eval_episodes: int = 100
     """Episodes of the deterministic evaluation that ends each epoch."""
 
@@ -318,6 +322,7 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
         ("metric", c.metric, metric_names()),
         ("engine", c.engine, ENGINES),
         ("learner_dtype", c.learner_dtype, DTYPES),
+        ("learner_kernels", c.learner_kernels, LEARNER_KERNELS),
     ):
         try:
             check_name(field, value, allowed, own=field == "sampler")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple, cast
 
 import jax
@@ -52,6 +53,10 @@ class Losses(NamedTuple):
     critic_loss: Array  # mean squared Bellman error
     actor_loss: Array  # minus the mean Q value, plus the action penalty
     q_mean: Array  # mean Q value of the critic on the batch
+
+
+# What `gradients` is: networks, parameters, target parameters, a normalized batch and numbers to gradients and losses.
+Gradients = Callable[[Networks, Params, Params, Batch, HParams], tuple[Params, Losses]]
 
 
 def init(key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int) -> DDPGState:
@@ -138,8 +143,23 @@ def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, 
     return -jnp.mean(q) + hparams.action_l2 * jnp.mean(jnp.square(action))
 
 
-def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Losses]:
-    """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`."""
+def gradients(networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams) -> tuple[Params, Losses]:
+    """The gradients of both losses, each by its own network's parameters. `batch` is normalized."""
+    value = target_value(networks, target, batch, hparams)
+    (c_loss, q_mean), c_grad = jax.value_and_grad(lambda critic: critic_loss(networks, critic, batch, value), has_aux=True)(
+        params.critic
+    )
+    a_loss, a_grad = jax.value_and_grad(lambda actor: actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
+    return Params(actor=a_grad, critic=c_grad), Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
+
+
+def update(
+    networks: Networks, state: DDPGState, batch: Batch, hparams: HParams, gradients: Gradients = gradients
+) -> tuple[DDPGState, Losses]:
+    """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`.
+
+    `gradients` computes both: those above, or `fused.gradients`.
+    """
     batch = dataclasses.replace(
         batch,
         observation=_normalize(state.observation_norm, batch.observation, hparams),
@@ -147,18 +167,14 @@ def update(networks: Networks, state: DDPGState, batch: Batch, hparams: HParams)
         desired_goal=_normalize(state.goal_norm, batch.desired_goal, hparams),
     )
     params = state.params
-    target = target_value(networks, state.target, batch, hparams)
-    (c_loss, q_mean), c_grad = jax.value_and_grad(lambda critic: critic_loss(networks, critic, batch, target), has_aux=True)(
-        params.critic
-    )
-    a_loss, a_grad = jax.value_and_grad(lambda actor: actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
-    direction, opt_state = _ADAM.update(Params(actor=a_grad, critic=c_grad), state.opt_state)
+    found, losses = gradients(networks, params, state.target, batch, hparams)
+    direction, opt_state = _ADAM.update(found, state.opt_state)
     params = Params(
         actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
         critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),
     )
     state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
-    return state, Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
+    return state, losses
 
 
 def update_target(state: DDPGState, hparams: HParams) -> DDPGState:

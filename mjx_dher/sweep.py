@@ -9,6 +9,7 @@ missing. Those side by side when it was cut short go on from their checkpoint, w
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import contextlib
 import csv
 import dataclasses
@@ -154,6 +155,10 @@ def run(
         _run_group(make_env(static), list(group), settings)
 
 
+# The last evaluation of runs side by side, compiled.
+Evaluate = Callable[["TrainState", "PRNGKey"], "Metrics"]
+
+
 class _Settings(NamedTuple):
     """What `run` was called with, for all of its programs."""
 
@@ -181,13 +186,7 @@ def _run_group(env: Any, group: list[Cell], settings: _Settings) -> None:
     choices = list(dict.fromkeys(cell.choice for cell in group))
     program = trainer.make_train(env, static, samplers.one_of([samplers.make(*choice) for choice in choices]))
     trainer.check_memory(program.replay_bytes, static)
-    compiled, size = _compile(env, program, group, choices, settings)
-
-    @jax.jit
-    @jax.vmap
-    def evaluate(state: TrainState, key: PRNGKey) -> Metrics:
-        return trainer.evaluate_state(env, program.networks, state, key, settings.final_episodes)
-
+    compiled, evaluate, size = _compile(env, program, group, choices, settings)
     for start in range(0, len(group), size):
         chunk = group[start : start + size]
         keys, hparams = _stack(chunk, choices, size)
@@ -214,9 +213,16 @@ def _locked(folder: Path, chunk: Sequence[Cell]) -> Iterator[None]:
 
 def _compile(
     env: Any, program: Train, group: list[Cell], choices: list[tuple[str, str, str]], settings: _Settings
-) -> tuple[Compiled, int]:
-    """The program for as many lanes as there may be and memory holds, and how many they are."""
+) -> tuple[Compiled, Evaluate, int]:
+    """The program for as many lanes as there may be and memory holds, its last evaluation, and how many lanes they are."""
+    import jax
+
     from mjx_dher import memory, trainer
+
+    @jax.jit
+    @jax.vmap
+    def evaluate(state: TrainState, key: PRNGKey) -> Metrics:
+        return trainer.evaluate_state(env, program.networks, state, key, settings.final_episodes)
 
     name = group[0].config.env
     size = min(len(group), settings.lanes or len(group))
@@ -228,12 +234,17 @@ def _compile(
         together = f"{size} runs side by side" if size > 1 else "one run at a time"
         settings.on_program(f"{name}: compiling for {together}, of {len(group)} ...")
         started = time.perf_counter()
-        compiled = trainer.compile_program(program, *_stack(group, choices, size))
+        keys, hparams = _stack(group, choices, size)
+        lowered = evaluate.lower(jax.eval_shape(jax.vmap(program.init), keys, hparams), keys)
+        with concurrent.futures.ThreadPoolExecutor(1) as pool:  # beside the other: there are cores for both
+            compiling = pool.submit(lowered.compile)
+            compiled = trainer.compile_program(program, keys, hparams)
+            last = compiling.result()
         trainer.check_steps(env)
         needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
         settings.on_program(f"{name}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
         if available is None or compiled.nbytes <= available or size == 1:
-            return compiled, size
+            return compiled, last, size
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
 
 

@@ -14,7 +14,7 @@ import optax
 from flax import struct
 
 from mjx_dher import config as config_lib
-from mjx_dher import ddpg, evaluate, memory, replay, samplers
+from mjx_dher import ddpg, evaluate, fused, memory, replay, samplers
 from mjx_dher.config import Config, HParams
 from mjx_dher.ddpg import DDPGState, Losses, Networks
 from mjx_dher.networks import Actor, Critic
@@ -65,17 +65,17 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
     all parameters at the end; discarded_episodes, of which the physics blew up and which were not learned from.
 
     Raises:
-      ValueError: a Config that cannot run, or an observation that is not one vector.
+      ValueError: a Config that cannot run, here or at all, or an observation that is not one vector.
     """
     config_lib.validate(config, HParams(), env.episode_length)
     chosen = samplers.make(config.sampler, config.weight_kernel, config.metric) if sampler is None else sampler
     networks, learning = (_networks(env.action_size, config.hidden_sizes, dtype) for dtype in ("float32", config.learner_dtype))
     template = episode_template(env)
+    gradients = _gradients(config, template, env.action_size)
     num_episodes = config_lib.episodes_capacity(config, env.episode_length)
-    updates_per_target = config.target_period
-    targets_per_cycle = config.updates_per_cycle // updates_per_target
+    targets_per_cycle = config.updates_per_cycle // config.target_period
     # Batches are drawn many at once: on a GPU, drawing one takes twice as long as learning from it, and 40 hardly longer.
-    targets_at_once = _largest_divisor(targets_per_cycle, DRAWN_AT_ONCE // (updates_per_target * config.batch_size))
+    targets_at_once = _largest_divisor(targets_per_cycle, DRAWN_AT_ONCE // (config.target_period * config.batch_size))
     num_cycles = config_lib.num_epochs(config, env.episode_length) * config.cycles_per_epoch
 
     def init(key: PRNGKey, hparams: HParams) -> TrainState:
@@ -109,14 +109,14 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         hparams = anneal(hparams, learner.num_updates / (num_cycles * config.updates_per_cycle))
 
         def update(learner: DDPGState, batch: Batch) -> tuple[DDPGState, Losses]:
-            return ddpg.update(learning, learner, batch, hparams)
+            return ddpg.update(learning, learner, batch, hparams, gradients)
 
         def update_with_target(learner: DDPGState, batches: Batch) -> tuple[DDPGState, Losses]:
             learner, losses = jax.lax.scan(update, learner, batches)
             return ddpg.update_target(learner, hparams), losses
 
         def draw_and_update(learner: DDPGState, key: PRNGKey) -> tuple[DDPGState, Losses]:
-            shape = (targets_at_once, updates_per_target, config.batch_size)
+            shape = (targets_at_once, config.target_period, config.batch_size)
             batches = draw_batches(ring, key, shape, chosen, env.compute_reward, hparams, counts)
             return jax.lax.scan(update_with_target, learner, batches)
 
@@ -170,6 +170,20 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
 def _networks(action_size: int, hidden_sizes: tuple[int, ...], dtype: str) -> Networks:
     """Both networks; those of another dtype have the same parameters."""
     return Networks(actor=Actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=Critic(hidden_sizes, jnp.dtype(dtype)))
+
+
+def _gradients(config: Config, template: Episode, action_size: int) -> ddpg.Gradients:
+    """What computes an update's gradients, as `learner_kernels` says.
+
+    Raises:
+      ValueError: kernels that cannot compute this run's.
+    """
+    if config.learner_kernels == "xla":
+        return ddpg.gradients
+    problem = fused.problem(config, template.observation.shape[-1] + template.desired_goal.shape[-1], action_size)
+    if config.learner_kernels == "hopper" and problem is not None:
+        raise ValueError(f"learner_kernels hopper needs {problem}")
+    return fused.gradients if problem is None else ddpg.gradients
 
 
 def _moved(goal: Array, hindsight: Array) -> Metrics:
@@ -318,14 +332,17 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
     init, epoch = (jax.vmap(program.init), jax.vmap(program.epoch)) if key.ndim else (program.init, program.epoch)
     hparams = _arrays(hparams)
     state = jax.eval_shape(init, key, hparams)
-    compiled = jax.jit(epoch, donate_argnums=0).lower(state).compile()
+    lowered_init = jax.jit(init).lower(key, hparams)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        compiling = pool.submit(lowered_init.compile)
+        compiled = jax.jit(epoch, donate_argnums=0).lower(state).compile()
+        compiled_init = compiling.result()
     sizes = compiled.memory_analysis()
     nbytes = 0
     if sizes is not None:
         nbytes = (
             sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
         )
-    compiled_init = jax.jit(init).lower(key, hparams).compile()
     memory.release()
     return Compiled(init=lambda key, hparams: compiled_init(key, _arrays(hparams)), epoch=compiled, nbytes=nbytes)
 

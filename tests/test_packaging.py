@@ -11,11 +11,11 @@ import mjx_dher
 
 # The layers of the algorithm, lowest first: a module imports from the layers below its own only.
 LAYERS = [
-    {"config", "types"},
+    {"config", "types", "warp_setup"},
     {"normalizer", "networks", "replay", "samplers", "stats", "memory"},
     {"relabel", "ddpg", "rollout"},
-    {"evaluate"},
-    {"trainer"},
+    {"evaluate", "fused"},
+    {"trainer", "fused_kernels"},
 ]
 
 
@@ -74,4 +74,4 @@ def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
     expected |= {f"mjx_dher/envs/{path.relative_to(ROOT / 'envs')}" for path in (ROOT / "envs").rglob("*.py")}
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
-    assert {name for name in names if name.startswith("mjx_dher/")} == expected | {"mjx_dher/py.typed"}
+    assert {name for name in names if name.startswith("mjx_dher/")} == expected | {"mjx_dher/py.typed", "mjx_dher/fused_kernels.cu"}

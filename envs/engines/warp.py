@@ -19,16 +19,13 @@ import numpy as np
 
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.types import Array
+from mjx_dher.warp_setup import prepare, wp
 
 with contextlib.redirect_stdout(io.StringIO()):
-    import warp as wp
-
     # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.
     from mujoco.mjx.third_party import mujoco_warp
 
     from mjx_dher.envs.engines.warp_substep import make_substep
-
-wp.config.log_level = wp.LOG_WARNING  # not a line for each of a hundred kernels
 
 # Contacts between two geoms, at most.
 _MAX_CONTACTS = {
@@ -147,6 +144,7 @@ class WarpEngine:
             pool.shutdown(wait=False)
 
     def _load(self) -> None:
+        prepare()
         _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
         wp.synchronize()
 

@@ -1,0 +1,244 @@
+"""The kernels for Hopper GPUs. Without such a GPU stand-ins read and write what they do."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher import HParams, config, ddpg, envs, fused
+from mjx_dher.networks import Actor, Critic
+from mjx_dher.trainer import make_train
+from mjx_dher.types import Batch
+
+OBSERVATION, GOAL, SIZE = 25, 3, 256
+HPARAMS = HParams(action_l2=0.7)
+HOPPER = getattr(jax.devices()[0], "compute_capability", None) == "9.0"
+
+
+def networks(dtype, action_size):
+    return ddpg.Networks(Actor(action_size, dtype=dtype), Critic(dtype=dtype))
+
+
+def case(action_size, seed=0):
+    """Parameters and targets whose biases are not zero, and a normalized batch."""
+    keys = jax.random.split(jax.random.key(seed), 7)
+
+    def params(key):
+        fresh = ddpg.init(key, networks(jnp.float32, action_size), OBSERVATION, GOAL, action_size).params
+        return jax.tree.map(lambda x: x + 0.05 * jax.random.normal(jax.random.fold_in(key, x.size), x.shape), fresh)
+
+    batch = Batch(
+        observation=jax.random.normal(keys[0], (SIZE, OBSERVATION)),
+        next_observation=jax.random.normal(keys[1], (SIZE, OBSERVATION)),
+        desired_goal=jax.random.normal(keys[2], (SIZE, GOAL)),
+        action=jax.random.uniform(keys[3], (SIZE, action_size), minval=-1.0),
+        reward=-jax.random.bernoulli(keys[4], 0.7, (SIZE,)).astype(jnp.float32),
+    )
+    return params(keys[5]), params(keys[6]), batch
+
+
+def number(unit):
+    """Where a kernel has a unit of a hidden layer: see `fused.blocks`."""
+    q, t, i, b = unit // 32, unit // 8 % 4, unit // 2 % 4, unit % 2
+    return 32 * q + 8 * i + 2 * t + b
+
+
+def read(blocks, rows):
+    """Weights [rows, 256] of what `fused.blocks` has made of them, one by one."""
+    row, column = np.meshgrid(np.arange(rows), np.arange(256), indexing="ij")
+    k, n = (number(row) if rows == 256 else row), number(column)
+    return blocks.astype(jnp.float32)[64 * (32 * (k // 8) + n // 8) + 8 * (n % 8) + k % 8]
+
+
+def rounded(x):
+    return x.astype(jnp.bfloat16).astype(jnp.float32)
+
+
+class Net:
+    """A network as a kernel is given it."""
+
+    def __init__(self, arguments, backward):
+        *weights, b1, b2, b3, last, b4 = arguments
+        self.weights = [read(w, 64 if k == 0 else 256) for k, w in enumerate(weights)]
+        assert len(weights) == (5 if backward else 3)
+        self.biases, self.last, self.last_bias = (b1, b2, b3), last.reshape(256, -1), b4
+
+    def forward(self, x):
+        hidden = []
+        for weights, bias in zip(self.weights, self.biases):
+            x = rounded(jnp.maximum(x @ weights + bias, 0.0))
+            hidden.append(x)
+        return hidden, x @ self.last + self.last_bias
+
+    def backward(self, d, hidden):
+        d3 = jnp.where(hidden[2] > 0, d, 0.0)
+        d2 = jnp.where(hidden[1] > 0, rounded(d3) @ self.weights[3], 0.0)
+        return [jnp.where(hidden[0] > 0, rounded(d2) @ self.weights[4], 0.0), d2, d3]
+
+
+def with_action(x, action):
+    return x.at[:, 56 : 56 + action.shape[1]].set(rounded(action))
+
+
+def flat(parts):
+    return [part.astype(jnp.bfloat16).reshape(-1) for part in parts]
+
+
+def sums(parts):
+    """Over the 16 rows of each warp."""
+    return [part.reshape(-1, 16, 256).sum(axis=1).reshape(-1) for part in parts]
+
+
+def critic_pass(x, next_x, reward, gamma, *arguments, launch_dims, output_dims):
+    *arguments, tiles, _ = arguments
+    size = 128 * tiles
+    assert launch_dims == tiles * fused.THREADS
+    x, next_x = (array.reshape(size, 64).astype(jnp.float32) for array in (x, next_x))
+    target_actor, target_critic = Net(arguments[:8], False), Net(arguments[8:16], False)
+    critic = Net(arguments[16:], True)
+    next_action = jnp.tanh(target_actor.forward(next_x)[1])
+    next_q = target_critic.forward(with_action(next_x, next_action))[1][:, 0]
+    value = jnp.clip(reward + gamma * next_q, -1.0 / (1.0 - gamma), 0.0)
+    hidden, q = critic.forward(x)
+    slope = 2.0 / size * (q - value[:, None])
+    d = critic.backward(slope * critic.last[:, 0], hidden)
+    found = [*flat(hidden[:2]), *flat(d), *sums([*d, hidden[2] * slope]), q[:, 0], value]
+    assert [len(part) for part in found] == list(output_dims.values())
+    return found
+
+
+def actor_pass(x, action_l2, *arguments, launch_dims, output_dims):
+    *arguments, critic_action, tiles, action_size = arguments
+    size = 128 * tiles
+    x = x.reshape(size, 64).astype(jnp.float32)
+    actor, critic = Net(arguments[:10], True), Net(arguments[10:], True)
+    hidden, z = actor.forward(x)
+    action = jnp.tanh(z)
+    of_critic, q = critic.forward(with_action(x, action))
+    d = rounded(critic.backward(jnp.full((size, 1), -1.0 / size) * critic.last[:, 0], of_critic)[0])
+    slope = d @ critic_action.reshape(action_size, 256).T
+    slope = (slope + 2.0 * action_l2 / (size * action_size) * action) * (1.0 - action**2)
+    d = actor.backward(slope @ actor.last.T, hidden)
+    four = lambda array: jnp.pad(array, ((0, 0), (0, 4 - action_size))).reshape(-1)  # noqa: E731
+    found = [*flat(hidden), *flat(d), *sums(d), q[:, 0], four(action), four(slope)]
+    assert [len(part) for part in found] == list(output_dims.values())
+    return found
+
+
+def errors(found, exact):
+    """By leaf, the norm of the difference relative to that of the exact gradient."""
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True)
+    return np.array([float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b)) for a, b in pairs])
+
+
+def assert_as_good_as_xla(found, action_size, params, target, batch):
+    """Gradients and losses are as near to those in float32 as XLA's in bfloat16 are."""
+
+    def of_xla(dtype):
+        gradients = lambda *x: ddpg.gradients(networks(dtype, action_size), *x, HPARAMS)  # noqa: E731
+        return jax.jit(gradients)(params, target, batch)
+
+    with jax.default_matmul_precision("highest"):
+        exact = of_xla(jnp.float32)
+    low = of_xla(jnp.bfloat16)
+    jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), found, exact)
+    mine, theirs = errors(found, exact), errors(low, exact)
+    assert np.all(mine <= 1.5 * theirs + 2e-3)
+    assert mine.max() < 0.1
+
+
+@pytest.mark.parametrize("action_size", [4, 2])
+def test_gradients_are_put_together(action_size, monkeypatch):
+    monkeypatch.setattr(fused, "_calls", lambda: (critic_pass, actor_pass))
+    params, target, batch = case(action_size)
+    gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    found = jax.jit(gradients)(params, target, batch)
+    assert_as_good_as_xla(found, action_size, params, target, batch)
+
+
+@pytest.mark.skipif(not HOPPER, reason="needs an NVIDIA H100 or H200")
+@pytest.mark.parametrize("action_size", [4, 2])
+def test_kernels_compute_gradients(action_size):
+    cases = [case(action_size, seed) for seed in range(3)]
+    together = jax.tree.map(lambda *x: jnp.stack(x), *cases)
+    gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    found = jax.jit(jax.vmap(gradients))(*together)
+    for lane, one in enumerate(cases):
+        assert_as_good_as_xla(jax.tree.map(lambda x, lane=lane: x[lane], found), action_size, *one)
+
+
+def test_kernels_compile(tmp_path):
+    """To a Hopper GPU's instructions, which takes no GPU; in a process of its own, because it sets what all kernels get."""
+    program = f"""
+import warp as wp
+from mjx_dher import fused_kernels
+wp.config.cuda_arch_suffix = "a"
+for kernel in (fused_kernels.critic_pass, fused_kernels.actor_pass):
+    kernel.module.options["block_dim"] = 384
+    wp.compile_aot_module(kernel.module, arch=90, module_dir={str(tmp_path)!r}, use_ptx=True)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    for path in tmp_path.glob("*.ptx"):
+        code = path.read_text()
+        assert ".target sm_90a" in code
+        assert len(re.findall(r"wgmma\.mma_async\.sync\.aligned\.m64n256k16", code)) == 36
+        assert code.count("setmaxnreg") == 2
+    assert len(list(tmp_path.glob("*.ptx"))) == 2
+
+
+STATIC = dataclasses.replace(config.preset("paper", "push")[0], learner_dtype="bfloat16", learner_kernels="hopper")
+
+
+class Device:
+    def __init__(self, capability):
+        self.compute_capability, self.device_kind = capability, "NVIDIA of " + capability
+
+
+@pytest.mark.parametrize(
+    ("changes", "sizes", "capability", "message"),
+    [
+        ({}, (28, 4), "9.0", None),
+        ({"learner_dtype": "float32"}, (28, 4), "9.0", "learner_dtype bfloat16; it is float32"),
+        ({"hidden_sizes": (256, 256)}, (28, 4), "9.0", "hidden_sizes (256, 256, 256); they are (256, 256)"),
+        ({"batch_size": 1000}, (28, 4), "9.0", "a batch_size that 256 divides; it is 1000"),
+        ({}, (57, 4), "9.0", "at most 56 numbers of observation and goal and 4 of an action; this environment has 57 and 4"),
+        ({}, (28, 5), "9.0", "at most 56 numbers of observation and goal and 4 of an action; this environment has 28 and 5"),
+        ({}, (28, 4), "8.0", "an NVIDIA H100 or H200; JAX runs on NVIDIA of 8.0 here"),
+    ],
+)
+def test_problem(changes, sizes, capability, message, monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [Device(capability)])
+    assert fused.problem(dataclasses.replace(STATIC, **changes), *sizes) == message
+
+
+@pytest.mark.skipif(HOPPER, reason="can use them")
+def test_kernels_that_cannot_be_used_are_refused_at_once():
+    env = envs.make("push", engine="native")
+    with pytest.raises(ValueError, match="learner_kernels hopper needs an NVIDIA H100 or H200; JAX runs on cpu here"):
+        make_train(env, STATIC)
+    make_train(env, dataclasses.replace(STATIC, learner_kernels="auto"))
+
+
+def test_the_learner_uses_them(monkeypatch):
+    """`auto` takes them where they can be used, and `xla` never does."""
+    asked = []
+
+    def gradients(*args):
+        asked.append(args)
+        return ddpg.gradients(*args)
+
+    monkeypatch.setattr(fused, "problem", lambda *args: None)
+    monkeypatch.setattr(fused, "gradients", gradients)
+    env = envs.make("reach", engine="native")
+    small = dataclasses.replace(STATIC, env="reach", num_envs=2, cycles_per_epoch=1, batch_size=256, replay_size=1000)
+    for kernels, uses in (("xla", False), ("auto", True), ("hopper", True)):
+        program = make_train(env, dataclasses.replace(small, learner_kernels=kernels))
+        state = jax.eval_shape(program.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams()))
+        jax.eval_shape(program.epoch, state)
+        assert bool(asked) is uses
+        asked.clear()
