@@ -74,4 +74,5 @@ def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
     expected |= {f"mjx_dher/envs/{path.relative_to(ROOT / 'envs')}" for path in (ROOT / "envs").rglob("*.py")}
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
-    assert {name for name in names if name.startswith("mjx_dher/")} == expected | {"mjx_dher/py.typed", "mjx_dher/fused_kernels.cu"}
+    expected |= {"mjx_dher/py.typed", "mjx_dher/fused_kernels.cu"}
+    assert {name for name in names if name.startswith("mjx_dher/")} == expected
