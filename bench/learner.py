@@ -62,6 +62,9 @@ def main() -> None:
     parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
     args = parser.parse_args()
     gradients = fused.gradients if args.kernels == "hopper" else ddpg.gradients
+    for batch_size in args.batch_sizes if args.kernels == "hopper" else ():
+        if problem := fused.problem(Config(learner_dtype=args.dtype, batch_size=batch_size), num_inputs=28, action_size=4):
+            parser.error(f"--kernels hopper needs {problem}")
     hidden_sizes, dtype = Config().hidden_sizes, jnp.dtype(args.dtype)
     networks = Networks(actor=Actor(4, hidden_sizes, dtype), critic=Critic(hidden_sizes, dtype))
     hparams = jax.tree.map(jnp.float32, HParams(eventful_share=0.5))

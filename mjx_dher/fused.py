@@ -123,11 +123,11 @@ def _calls() -> tuple[Any, Any]:
 
 
 def gradients(networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams) -> tuple[Params, Losses]:
-    """`ddpg.gradients`, hidden layers in bfloat16, for what `check` lets pass.
+    """`ddpg.gradients`, hidden layers in bfloat16, for runs of which `problem` says None.
 
     Rounds less often than XLA does: a layer's bias is added in float32.
     """
-    del networks  # known: see `check`
+    del networks  # known: see `problem`
     size, action_size = batch.action.shape
     num_inputs = batch.observation.shape[1] + batch.desired_goal.shape[1]
 

@@ -12,9 +12,9 @@
 
 //// streams
 
-    const int of_lane = blockIdx.x / tiles;
+    const int lane = blockIdx.x / tiles;
     auto of = [&](const wp::array_t<wp::bfloat16>& weights, int chunks, int chunk) {
-        return weights.data + (static_cast<size_t>(of_lane) * chunks + chunk) * CHUNK;
+        return weights.data + (static_cast<size_t>(lane) * chunks + chunk) * CHUNK;
     };
     auto part = [&](int chunk, const wp::array_t<wp::bfloat16>& first, const wp::array_t<wp::bfloat16>& second,
                     const wp::array_t<wp::bfloat16>& third) {
@@ -57,7 +57,6 @@
     const int tid = threadIdx.x;
     const int t = tid & 3;
     const int batch = tiles * ROWS;
-    const int lane = blockIdx.x / tiles;
     const int tile = blockIdx.x % tiles;
     const int row = tile * ROWS + (tid / 32) * 16 + (tid & 31) / 4;  // and row + 8
     using Pair = float[2];
