@@ -146,6 +146,9 @@ class FetchEnv(GoalEnv):
             failed=failed,
         )
 
+    def prepare(self) -> None:
+        self.engine.prepare()
+
     def check(self) -> None:
         self.engine.check()
 
@@ -199,13 +202,11 @@ class FetchEnv(GoalEnv):
     def _sample_goal(self, key: PRNGKey) -> Array:
         """[3] uniform around the gripper plus the task's offset; with an object, at its height, or (half of them) above."""
         task = self.task
-        offset_key, lift_key, coin_key = jax.random.split(key, 3)
-        offset = jax.random.uniform(offset_key, (3,), minval=-task.target_range, maxval=task.target_range)
-        goal = jnp.array(task.initial_grip_pos) + offset + jnp.array(task.target_offset)
+        *offset, lift = jax.random.uniform(key, (4,), minval=-1.0, maxval=1.0)
+        goal = jnp.array(task.initial_grip_pos) + task.target_range * jnp.stack(offset) + jnp.array(task.target_offset)
         if task.object_height is None:
             return goal
-        lift = jax.random.uniform(lift_key) * task.max_goal_lift
-        return goal.at[2].set(task.object_height + jnp.where(jax.random.bernoulli(coin_key), lift, 0.0))
+        return goal.at[2].set(task.object_height + task.max_goal_lift * jnp.maximum(lift, 0.0))
 
     def _seen(self, physics: Physics) -> Physics:
         """What the observation is made from after a step.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-import jax
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -23,7 +25,7 @@ class Chain:
     """
 
     def __init__(self, model: mujoco.MjModel, body: str, site: str):
-        self._links: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = []
+        links: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = []
         joints: list[int] = []
         index = int(model.body(body).id)
         while index:
@@ -34,42 +36,95 @@ class Chain:
                     raise ValueError(f"body {model.body(index).name!r} must have one hinge through its origin, or no joint")
                 joints.insert(0, joint)
                 axis = model.jnt_axis[joint]
-            self._links.insert(0, (model.body_pos[index], model.body_quat[index], axis))
+            links.insert(0, (model.body_pos[index], model.body_quat[index], axis))
             index = int(model.body_parentid[index])
-        self._site = model.site_pos[model.site(site).id]
         # The joints sit next to one another, because a body's only child with a hinge comes right after it.
         self.qpos = slice(int(model.jnt_qposadr[joints[0]]), int(model.jnt_qposadr[joints[0]]) + len(joints))
         self.qvel = slice(int(model.jnt_dofadr[joints[0]]), int(model.jnt_dofadr[joints[0]]) + len(joints))
 
+        # What no joint divides is a segment: S = J + 1 of them, each in the frame that the joint before it has turned.
+        unit = np.array([1.0, 0.0, 0.0, 0.0])
+        quat, offset = unit, np.zeros(3)
+        offsets: list[np.ndarray] = []
+        axes: list[np.ndarray] = []
+        still: list[np.ndarray] = []
+        turned: list[np.ndarray] = []
+        for link_pos, link_quat, axis in links:
+            offset = offset + _rotated(quat, link_pos)
+            quat = _right(link_quat) @ quat
+            if axis is not None:
+                offsets.append(offset)
+                axes.append(_rotated(quat, axis))
+                still.append(_right(quat))
+                turned.append(_right(_right(np.array([0.0, *axis])) @ quat))
+                quat, offset = unit, np.zeros(3)
+        at_site = offset + _rotated(quat, model.site_pos[model.site(site).id])
+        # The orientation [4] of the next segment is cos(half the angle) `still` + sin(half the angle) `turned`, times that of
+        # the one before.
+        self._still, self._turned = _float32(still), _float32(turned)  # [J, 4, 4]
+        self._axes = _float32(axes)  # [J, 3] of the joints, each in the frame of the segment before
+        self._to_body = _float32([*offsets, offset])  # [S, 3] from a segment's start to its end; and
+        self._to_site = _float32([*offsets, at_site])  # the same, where the last one ends at the site
+        self._at_body = _float32(_right(quat))  # [4, 4] from the last segment's orientation to the body's
+        self._before = np.tri(len(joints) + 1, len(joints), -1, dtype=np.float32)  # [S, J] 1 where the joint turns the segment
+
     def pose(self, angles: Array) -> tuple[Array, Array]:
         """Position [3], m, and orientation [4] (w, x, y, z) of the body at joint angles [J], rad."""
-        pos, quat, _, _ = self._walk(angles)
-        return pos, quat
+        quats = self._orientations(angles)
+        pos = [jnp.sum(x) for x in _rotate(quats, self._to_body)]
+        return jnp.stack(pos), jnp.sum(self._at_body * quats[-1], axis=-1)
 
     def site_motion(self, angles: Array, rates: Array) -> tuple[Array, Array]:
         """Position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and their rates [J], rad/s."""
-        pos, quat, anchors, axes = self._walk(angles)
-        site = pos + rotate(quat, jnp.asarray(self._site, jnp.float32))
-        return site, jnp.sum(rates[:, None] * jnp.cross(axes, site[None] - anchors), axis=0)
+        quats = self._orientations(angles)
+        segments = _rotate(quats, self._to_site)
+        axes = _rotate(quats[:-1], self._axes)
+        angular = [jnp.sum(self._before * (rates * x), axis=-1) for x in axes]  # [S] each: of the segments
+        return jnp.stack([jnp.sum(x) for x in segments]), jnp.stack([jnp.sum(x) for x in _cross(angular, segments)])
 
-    def _walk(self, angles: Array) -> tuple[Array, Array, Array, Array]:
-        """Position [3] and orientation [4] of the body; places and axes [J, 3] of the joints; all in the world's frame."""
-        pos, quat = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-        anchors: list[Array] = []
-        axes: list[Array] = []
-        for link_pos, link_quat, axis in self._links:
-            pos = pos + rotate(quat, jnp.asarray(link_pos, jnp.float32))
-            if (link_quat != (1, 0, 0, 0)).any():
-                quat = quat_multiply(quat, jnp.asarray(link_quat, jnp.float32))
-            if axis is not None:
-                half = 0.5 * angles[len(axes)]
-                anchors.append(pos)
-                axes.append(rotate(quat, jnp.asarray(axis, jnp.float32)))
-                turn = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * jnp.asarray(axis, jnp.float32)])
-                quat = quat_multiply(quat, turn)
-            # Left to itself, XLA on a CPU fuses the whole walk into one loop that computes every link anew for each use.
-            pos, quat = jax.lax.optimization_barrier((pos, quat))
-        return pos, quat, jnp.stack(anchors), jnp.stack(axes)
+    def _orientations(self, angles: Array) -> Array:
+        """[S, 4] of the segments, in the world's frame.
+
+        Sums, not dot products, here and elsewhere: on a GPU these would have the learner's precision.
+        """
+        half = 0.5 * angles[:, None, None]
+        steps = jnp.cos(half) * self._still + jnp.sin(half) * self._turned  # [J, 4, 4]
+        quats = [jnp.array([1.0, 0.0, 0.0, 0.0])]
+        for index in range(steps.shape[0]):
+            quats.append(jnp.sum(steps[index] * quats[-1], axis=-1))
+        return jnp.stack(quats)
+
+
+# Vectors coordinate by coordinate: a compiler has less work with these than with arrays that are taken apart and put together.
+_Vectors = Sequence[Array]  # x, y and z, each [S]
+
+
+def _rotate(quats: Array, vectors: np.ndarray) -> _Vectors:
+    """`vectors` [S, 3] turned by the unit quaternions `quats` [S, 4] (w, x, y, z)."""
+    w, *axis = (quats[:, index] for index in range(4))
+    vector = list(vectors.T)
+    twice = [2 * x for x in _cross(axis, vector)]
+    return [x + w * y + z for x, y, z in zip(vector, twice, _cross(axis, twice))]
+
+
+def _cross(a: _Vectors, b: _Vectors) -> _Vectors:
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def _rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """`vector` [3] turned by the unit quaternion `quat` [4] (w, x, y, z): q v q*."""
+    conjugate = quat * np.array([1.0, -1.0, -1.0, -1.0])
+    return (_right(conjugate) @ _right(np.array([0.0, *vector])) @ quat)[1:]
+
+
+def _right(quat: np.ndarray) -> np.ndarray:
+    """[4, 4] such that `_right(q) @ p` is the product p q of quaternions (w, x, y, z)."""
+    w, x, y, z = quat
+    return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
+
+
+def _float32(values: Any) -> np.ndarray:
+    return np.array(values, np.float32)
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
@@ -77,9 +132,3 @@ def quat_multiply(a: Array, b: Array) -> Array:
     # A sum, not a dot product, whose precision on a GPU would be the learner's.
     w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
-
-
-def rotate(quat: Array, vector: Array) -> Array:
-    """`vector` [3] turned by the unit quaternion `quat` [4] (w, x, y, z)."""
-    twice = 2 * jnp.cross(quat[1:], vector)
-    return vector + quat[0] * twice + jnp.cross(quat[1:], twice)

@@ -91,12 +91,13 @@ class Noise(NamedTuple):
 
 def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
     """Noise for `num_envs` episodes of `num_steps` steps: a share `random_eps` of the actions is uniformly random."""
-    gaussian_key, uniform_key, coin_key = jax.random.split(key, 3)
+    gaussian_key, uniform_key = jax.random.split(key)
     shape = (num_steps, num_envs)
+    uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1))
     return Noise(
         gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size)),
-        is_random=jax.random.uniform(coin_key, shape) < hparams.random_eps,
-        uniform=jax.random.uniform(uniform_key, (*shape, action_size), minval=-1.0, maxval=1.0),
+        is_random=uniform[..., -1] < hparams.random_eps,
+        uniform=2.0 * uniform[..., :-1] - 1.0,
     )
 
 

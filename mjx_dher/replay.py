@@ -115,13 +115,13 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, eventful_share:
 
     While there is no eventful episode, any. `counts` is `count_eventful(state)`. The ring must not be empty.
     """
-    any_key, rank_key, coin_key = jax.random.split(key, 3)
+    coin_key, bits_key = jax.random.split(key)
     total = counts[-1]
-    rank = jax.random.randint(rank_key, (batch_size,), 1, jnp.maximum(total, 1) + 1)
+    any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size))
+    rank = 1 + below(rank_bits, total)
     eventful = jnp.searchsorted(counts, rank).astype(jnp.int32)
-    anyone = jax.random.randint(any_key, (batch_size,), 0, state.size)
     coin = jax.random.uniform(coin_key, (batch_size,)) < eventful_share
-    return jnp.where(coin & (total > 0), eventful, anyone)
+    return jnp.where(coin & (total > 0), eventful, below(any_bits, state.size))
 
 
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
@@ -129,11 +129,10 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
     Without `rows`, uniform over all transitions in the ring, which must not be empty.
     """
-    row_key, step_key = jax.random.split(key)
+    row_bits, step_bits = jax.random.bits(key, (2, batch_size))
     if rows is None:
-        rows = jax.random.randint(row_key, (batch_size,), 0, state.size)
-    num_steps = state.episodes.action.shape[1]
-    steps = jax.random.randint(step_key, (batch_size,), 0, num_steps)
+        rows = below(row_bits, state.size)
+    steps = below(step_bits, state.episodes.action.shape[1])
     episodes = state.episodes
     return Sample(
         observation=jax.tree.map(lambda x: x[rows, steps], episodes.observation),
@@ -147,5 +146,17 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
 def sample_episode_goals(state: ReplayState, key: PRNGKey, batch_size: int) -> Array:
     """[B, T+1, G] the achieved goals of `batch_size` episodes, drawn uniformly. The ring must not be empty."""
-    rows = jax.random.randint(key, (batch_size,), 0, state.size)
-    return state.episodes.achieved_goal[rows]
+    return state.episodes.achieved_goal[below(jax.random.bits(key, (batch_size,)), state.size)]
+
+
+def below(bits: Array, number: Array | int) -> Array:
+    """Random integers 0 ... `number` - 1, int32, from random `bits`, uint32 of any shape: the upper 32 of the product's 64.
+
+    One is likelier than another by `number` / 2^32 of its probability at most. `jax.random.randint` needs three times as many
+    bits, and what draws them takes a compiler longer than all else in a learner's loop. 0 where `number` is 0.
+    """
+    number = jnp.asarray(number, jnp.uint32)
+    high, low, number_high, number_low = bits >> 16, bits & 0xFFFF, number >> 16, number & 0xFFFF
+    middle = high * number_low + (low * number_low >> 16)
+    carried = low * number_high + (middle & 0xFFFF)
+    return (high * number_high + (middle >> 16) + (carried >> 16)).astype(jnp.int32)

@@ -50,6 +50,7 @@ class Train(NamedTuple):
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
     networks: Networks
     replay_bytes: int  # of one run's ring
+    prepare: Callable[[], None]  # the environment's, for when the epoch has been traced; nothing where it has none
 
 
 def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Train:
@@ -164,7 +165,13 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         metrics = found | jax.tree.map(jnp.mean, cycles) | _norms(state.learner) | {"discarded_episodes": discarded}
         return dataclasses.replace(state, key=key), metrics
 
-    return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
+    return Train(
+        init=init,
+        epoch=epoch,
+        networks=networks,
+        replay_bytes=replay.nbytes(template, num_episodes),
+        prepare=getattr(env, "prepare", lambda: None),
+    )
 
 
 def _networks(action_size: int, hidden_sizes: tuple[int, ...], dtype: str) -> Networks:
@@ -335,7 +342,9 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
     lowered_init = jax.jit(init).lower(key, hparams)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         compiling = pool.submit(lowered_init.compile)
-        compiled = jax.jit(epoch, donate_argnums=0).lower(state).compile()
+        lowered = jax.jit(epoch, donate_argnums=0).lower(state)
+        program.prepare()
+        compiled = lowered.compile()
         compiled_init = compiling.result()
     sizes = compiled.memory_analysis()
     nbytes = 0

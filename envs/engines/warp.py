@@ -35,6 +35,7 @@ _MAX_CONTACTS = {
     frozenset(("BOX",)): 8,
 }
 _OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # of which contacts or constraints are lost
+TRACING_SECONDS = 10.0  # that a program's tracing may take, at most, before kernels are compiled beside it
 
 
 class WarpEngine:
@@ -84,6 +85,7 @@ class WarpEngine:
         self._simulations: dict[tuple[str, int], _Simulation] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
+        self._is_traced = threading.Event()
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -106,7 +108,7 @@ class WarpEngine:
             graph_mode=wp.JaxCallableGraphMode.NONE,  # `_Simulation` captures its own, whatever the buffers
             vmap_method="broadcast_all",
             output_dims=shapes,
-            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it, and two at once would clash
+            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_load` does it, and two at once would clash
         )
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
@@ -136,19 +138,29 @@ class WarpEngine:
                 f" constraints={self.most_constraints} are always enough"
             )
 
+    def prepare(self) -> None:
+        """Has the kernels compiled now, in a thread, if a step has been traced; see `_begin_loading`."""
+        self._is_traced.set()
+
     def _begin_loading(self) -> None:
-        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest."""
+        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest.
+
+        It waits for `prepare`, or some seconds: what is still to be traced would take three times as long beside it, because
+        both are Python.
+        """
         if self._loading is None:
             pool = concurrent.futures.ThreadPoolExecutor(1)
             self._loading = pool.submit(self._load)
             pool.shutdown(wait=False)
 
     def _load(self) -> None:
+        self._is_traced.wait(TRACING_SECONDS)
         prepare()
         _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
         wp.synchronize()
 
     def _wait(self) -> None:
+        self.prepare()
         if self._loading is not None:
             self._loading.result()
 
