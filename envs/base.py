@@ -55,9 +55,6 @@ class GoalEnv(abc.ABC):
         To be called on the host once they are done, not while tracing.
         """
 
-    def prepare(self) -> None:  # noqa: B027 - most have nothing to prepare
-        """Begins, in the background, with what steps need beside their compiled program. To be called once they are traced."""
-
     def check_action(self, action: Array) -> Array:
         """`action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
         shape = jnp.shape(action)

@@ -146,9 +146,6 @@ class FetchEnv(GoalEnv):
             failed=failed,
         )
 
-    def prepare(self) -> None:
-        self.engine.prepare()
-
     def check(self) -> None:
         self.engine.check()
 

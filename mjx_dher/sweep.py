@@ -214,7 +214,10 @@ def _locked(folder: Path, chunk: Sequence[Cell]) -> Iterator[None]:
 def _compile(
     env: Any, program: Train, group: list[Cell], choices: list[tuple[str, str, str]], settings: _Settings
 ) -> tuple[Compiled, Evaluate, int]:
-    """The program for as many lanes as there may be and memory holds, its last evaluation, and how many lanes they are."""
+    """The program for as many lanes as there may be and memory holds, its last evaluation, and how many lanes they are.
+
+    The last evaluation is compiled in a thread, while the runs are trained.
+    """
     import jax
 
     from mjx_dher import memory, trainer
@@ -235,16 +238,16 @@ def _compile(
         settings.on_program(f"{name}: compiling for {together}, of {len(group)} ...")
         started = time.perf_counter()
         keys, hparams = _stack(group, choices, size)
-        lowered = evaluate.lower(jax.eval_shape(jax.vmap(program.init), keys, hparams), keys)
-        with concurrent.futures.ThreadPoolExecutor(1) as pool:  # beside the other: there are cores for both
-            compiling = pool.submit(lowered.compile)
-            compiled = trainer.compile_program(program, keys, hparams)
-            last = compiling.result()
+        compiled = trainer.compile_program(program, keys, hparams)
         trainer.check_steps(env)
         needed = f"{memory.format_bytes(compiled.nbytes)} of memory"
         settings.on_program(f"{name}: compiled in {time.perf_counter() - started:.1f} s; {needed}")
         if available is None or compiled.nbytes <= available or size == 1:
-            return compiled, last, size
+            lowered = evaluate.lower(jax.eval_shape(jax.vmap(program.init), keys, hparams), keys)
+            pool = concurrent.futures.ThreadPoolExecutor(1)
+            last = pool.submit(trainer.compile_lowered, lowered)  # it is not needed before the runs have ended
+            pool.shutdown(wait=False)
+            return compiled, lambda state, key: last.result()(state, key), size
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
 
 

@@ -50,7 +50,6 @@ class Train(NamedTuple):
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
     networks: Networks
     replay_bytes: int  # of one run's ring
-    prepare: Callable[[], None]  # the environment's, for when the epoch has been traced; nothing where it has none
 
 
 def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Train:
@@ -165,13 +164,7 @@ def make_train(env: Env, config: Config, sampler: Sampler | None = None) -> Trai
         metrics = found | jax.tree.map(jnp.mean, cycles) | _norms(state.learner) | {"discarded_episodes": discarded}
         return dataclasses.replace(state, key=key), metrics
 
-    return Train(
-        init=init,
-        epoch=epoch,
-        networks=networks,
-        replay_bytes=replay.nbytes(template, num_episodes),
-        prepare=getattr(env, "prepare", lambda: None),
-    )
+    return Train(init=init, epoch=epoch, networks=networks, replay_bytes=replay.nbytes(template, num_episodes))
 
 
 def _networks(action_size: int, hidden_sizes: tuple[int, ...], dtype: str) -> Networks:
@@ -341,10 +334,9 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
     state = jax.eval_shape(init, key, hparams)
     lowered_init = jax.jit(init).lower(key, hparams)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        compiling = pool.submit(lowered_init.compile)
+        compiling = pool.submit(compile_lowered, lowered_init)
         lowered = jax.jit(epoch, donate_argnums=0).lower(state)
-        program.prepare()
-        compiled = lowered.compile()
+        compiled = compile_lowered(lowered)
         compiled_init = compiling.result()
     sizes = compiled.memory_analysis()
     nbytes = 0
@@ -354,6 +346,16 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
         )
     memory.release()
     return Compiled(init=lambda key, hparams: compiled_init(key, _arrays(hparams)), epoch=compiled, nbytes=nbytes)
+
+
+def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compiles what `jax.jit(...).lower` gave, on a GPU without a pass that takes half the time and gains a learner nothing.
+
+    It makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with hundreds of
+    tilings each, what else could go into them.
+    """
+    options = {"xla_disable_hlo_passes": "triton-softmax-rewriter"} if jax.default_backend() == "gpu" else None
+    return lowered.compile(compiler_options=options)
 
 
 def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:

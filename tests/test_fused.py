@@ -136,29 +136,34 @@ def errors(found, exact):
     return np.array([float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b)) for a, b in pairs])
 
 
-def assert_as_good_as_xla(found, action_size, params, target, batch):
-    """Gradients and losses are as near to those in float32 as XLA's in bfloat16 are."""
+def assert_as_good_as_xla(found, action_size, cases):
+    """Gradients and losses, of several cases, are as near to those in float32 as XLA's in bfloat16 are.
 
-    def of_xla(dtype):
+    In the mean over the cases: how far off the mean of four numbers is, such as the gradient of the policy's last bias, is
+    luck in any one.
+    """
+
+    def of_xla(dtype, case):
         gradients = lambda *x: ddpg.gradients(networks(dtype, action_size), *x, HPARAMS)  # noqa: E731
-        return jax.jit(gradients)(params, target, batch)
+        return jax.jit(gradients)(*case)
 
-    with jax.default_matmul_precision("highest"):
-        exact = of_xla(jnp.float32)
-    low = of_xla(jnp.bfloat16)
-    jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), found, exact)
-    mine, theirs = errors(found, exact), errors(low, exact)
-    assert np.all(mine <= 1.5 * theirs + 2e-3)
-    assert mine.max() < 0.1
+    mine, theirs = [], []
+    for one, case_ in zip(found, cases, strict=True):
+        with jax.default_matmul_precision("highest"):
+            exact = of_xla(jnp.float32, case_)
+        jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), one, exact)
+        mine.append(errors(one, exact))
+        theirs.append(errors(of_xla(jnp.bfloat16, case_), exact))
+    assert np.all(np.mean(mine, axis=0) <= 1.5 * np.mean(theirs, axis=0) + 2e-3)
+    assert np.max(mine) < 0.1
 
 
 @pytest.mark.parametrize("action_size", [4, 2])
 def test_gradients_are_put_together(action_size, monkeypatch):
     monkeypatch.setattr(fused, "_calls", lambda: (critic_pass, actor_pass))
-    params, target, batch = case(action_size)
+    cases = [case(action_size, seed) for seed in range(3)]
     gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
-    found = jax.jit(gradients)(params, target, batch)
-    assert_as_good_as_xla(found, action_size, params, target, batch)
+    assert_as_good_as_xla([jax.jit(gradients)(*one) for one in cases], action_size, cases)
 
 
 @pytest.mark.skipif(not HOPPER, reason="needs an NVIDIA H100 or H200")
@@ -168,8 +173,8 @@ def test_kernels_compute_gradients(action_size):
     together = jax.tree.map(lambda *x: jnp.stack(x), *cases)
     gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
     found = jax.jit(jax.vmap(gradients))(*together)
-    for lane, one in enumerate(cases):
-        assert_as_good_as_xla(jax.tree.map(lambda x, lane=lane: x[lane], found), action_size, *one)
+    lanes = [jax.tree.map(lambda x, lane=lane: x[lane], found) for lane in range(len(cases))]
+    assert_as_good_as_xla(lanes, action_size, cases)
 
 
 def test_kernels_compile(tmp_path):

@@ -35,6 +35,46 @@ def test_the_settled_arm_holds_the_gripper_where_the_task_says():
         np.testing.assert_allclose(grip, env.task.initial_grip_pos, atol=2e-4)
 
 
+def test_a_batch_is_what_its_rows_are():
+    """As one program of any size: XLA on a CPU (JAX 0.10) has turned some ways to write such sums into wrong ones from 512 on."""
+    env = envs.make("push", engine="native")
+    angles, rates = jax.random.normal(jax.random.key(0), (2, 1024, 7))
+
+    def everything(angles, rates):
+        return env.arm.pose(angles), env.arm.site_motion(angles, rates)
+
+    together = jax.jit(jax.vmap(everything))(angles, rates)
+    few = jax.jit(everything)
+    for row in range(0, 1024, 64):
+        alone = few(angles[row], rates[row])
+        jax.tree.map(lambda x, y, row=row: np.testing.assert_allclose(x[row], y, atol=3e-6), together, alone)
+
+
+def test_links_with_orientations_of_their_own():
+    """The Fetch arm's are all the identity: a chain whose are not, joints in a row and a last body without one."""
+    body = '<body pos="{}" quat="{}">{}<geom size=".1"/>'
+    hinge = '<joint type="hinge" axis="{}"/>'
+    parts = [
+        body.format(".1 .2 .3", ".9 .1 -.3 .2", hinge.format("0 1 0")),
+        body.format("-.2 .1 .4", "1 0 0 0", ""),
+        body.format("0 .3 .1", ".2 .8 .1 -.4", hinge.format("1 2 -1")),
+        body.format(".3 0 -.2", ".5 -.5 .6 .1", hinge.format("0 0 1")),
+        body.format(".1 .1 .1", ".7 0 .7 .3", "").replace("<body", '<body name="end"') + '<site name="tip" pos=".2 -.1 .3"/>',
+    ]
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{''.join(parts)}{'</body>' * 5}</worldbody></mujoco>")
+    chain, data = Chain(model, body="end", site="tip"), mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = [0.4, -1.2, 2.0], [1.5, -0.7, 0.3]
+    mujoco.mj_forward(model, data)
+    pos, quat = chain.pose(jnp.asarray(data.qpos, jnp.float32))
+    np.testing.assert_allclose(pos, data.body("end").xpos, atol=1e-6)
+    np.testing.assert_allclose(quat, data.body("end").xquat, atol=1e-6)
+    site_pos, site_vel = chain.site_motion(jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32))
+    twist = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, 0, twist, 0)
+    np.testing.assert_allclose(site_pos, data.site("tip").xpos, atol=1e-6)
+    np.testing.assert_allclose(site_vel, twist[3:], atol=3e-6)
+
+
 def test_a_body_that_slides_is_refused():
     env = envs.make("pick_and_place", engine="native")
     with pytest.raises(ValueError, match="body 'finger_r' must have one hinge"):

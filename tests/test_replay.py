@@ -126,3 +126,13 @@ def test_only_valid_episodes_are_written():
 
 def ring_of_two():
     return replay.add(make_ring(4), make_episodes([1, 2]), jnp.array([True, False]))
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 50, 20_000, 65_535, 65_536, 65_537, 1_000_000_007, 2**31 - 1])
+def test_below_is_the_upper_half_of_the_product(number):
+    """Exactly, at the ends and on random bits; against 64-bit integers."""
+    edges = [0, 1, 0xFFFF, 0x10000, 2**31 - 1, 2**31, 2**32 - 1]
+    bits = np.concatenate([edges, np.random.default_rng(0).integers(0, 2**32, 10_000)]).astype(np.uint32)
+    expected = (bits.astype(np.uint64) * np.uint64(number)) >> np.uint64(32)
+    np.testing.assert_array_equal(replay.below(jnp.asarray(bits), number), expected)
+    np.testing.assert_array_equal(jax.jit(replay.below)(jnp.asarray(bits), jnp.int32(number)), expected)

@@ -54,8 +54,5 @@ class Engine(Protocol):
         """One environment step later; meanwhile the mocap body is held at `target` [7] (position, m, and w, x, y, z)."""
         ...
 
-    def prepare(self) -> None:
-        """Begins, in the background, with what `advance` needs beside its compiled program. To be called once it is traced."""
-
     def check(self) -> None:
         """Raises ValueError where the steps so far were not what they should be and their results do not show it."""

@@ -138,9 +138,6 @@ class MjxEngine:
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
             return jax.lax.fori_loop(0, self._substeps, substep, physics)
 
-    def prepare(self) -> None:
-        pass  # XLA compiles all of it
-
     def check(self) -> None:
         pass  # nothing is lost unseen: all contacts have their place
 

@@ -53,9 +53,6 @@ class NativeEngine:
         qpos, qvel, warmstart = jnp.split(state, self._ends[:2].tolist())
         return Physics(qpos=qpos, qvel=qvel, warmstart=warmstart)
 
-    def prepare(self) -> None:
-        pass  # MuJoCo is compiled
-
     def check(self) -> None:
         pass  # nothing is lost unseen
 

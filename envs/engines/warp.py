@@ -35,7 +35,6 @@ _MAX_CONTACTS = {
     frozenset(("BOX",)): 8,
 }
 _OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # of which contacts or constraints are lost
-TRACING_SECONDS = 10.0  # that a program's tracing may take, at most, before kernels are compiled beside it
 
 
 class WarpEngine:
@@ -85,7 +84,6 @@ class WarpEngine:
         self._simulations: dict[tuple[str, int], _Simulation] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
-        self._is_traced = threading.Event()
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -138,29 +136,19 @@ class WarpEngine:
                 f" constraints={self.most_constraints} are always enough"
             )
 
-    def prepare(self) -> None:
-        """Has the kernels compiled now, in a thread, if a step has been traced; see `_begin_loading`."""
-        self._is_traced.set()
-
     def _begin_loading(self) -> None:
-        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest.
-
-        It waits for `prepare`, or some seconds: what is still to be traced would take three times as long beside it, because
-        both are Python.
-        """
+        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest."""
         if self._loading is None:
             pool = concurrent.futures.ThreadPoolExecutor(1)
             self._loading = pool.submit(self._load)
             pool.shutdown(wait=False)
 
     def _load(self) -> None:
-        self._is_traced.wait(TRACING_SECONDS)
         prepare()
         _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
         wp.synchronize()
 
     def _wait(self) -> None:
-        self.prepare()
         if self._loading is not None:
             self._loading.result()
 

@@ -25,6 +25,27 @@ from mujoco.mjx.third_party.mujoco_warp._src.types import vec10
 _DISABLED = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # of the options that can be disabled, the ones that make no difference
 
 
+# The library's kernels that are used here, by module. Warp compiles a module whole, and these are less than a third of theirs.
+_USED = {
+    forward: "_actuator_force _actuator_velocity _next_activation _next_position _next_velocity _qfrc_actuator"
+    " _qfrc_actuator_gravcomp_limits",
+    smooth: "_M _cacc_branch _cacc_world _cdof _cfrc _cinert _compute_body_inertial_frames _compute_body_matrices"
+    " _comvel_branch _comvel_root _geom_local_to_global _kinematics_branch _site_local_to_global _transmission",
+    solver: "_inertia_scale _qfrc_constraint_from_grad _solve_init_efc _update_gradient_h_incremental _zero_change_counters",
+}
+
+
+@functools.cache
+def _set_apart() -> None:
+    """Puts the kernels of each of these modules into a new one. What is not on the list stays where it is, and works."""
+    for module, names in _USED.items():
+        new = f"{__name__}.{module.__name__.rpartition('.')[2]}"
+        for name in names.split():
+            kernel = getattr(module, name)
+            wp.get_module(new).options.update(kernel.module.options)
+            setattr(module, name, wp.kernel(kernel.func, module=new, **kernel.options))
+
+
 def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
     """What advances `d` by a timestep: the fewer kernels where the model is one for them, else MuJoCo Warp's own step.
 
@@ -32,6 +53,7 @@ def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
       model: the compiled MJCF.
       m, d: Model and Data of MuJoCo Warp, made from it.
     """
+    _set_apart()
     if needs(model, m):
         return functools.partial(_library_substep, m, d)
     last: Any = wp.array(last_below(model), dtype=int)
