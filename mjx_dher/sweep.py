@@ -22,7 +22,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from mjx_dher import config as config_lib
 from mjx_dher import run_folder
@@ -193,7 +193,7 @@ def _run_group(env: Any, group: list[Cell], settings: _Settings) -> None:
         with _locked(settings.folder, chunk):
             progress = _train(env, chunk, size, compiled, functools.partial(compiled.init, keys, hparams), settings)
             final_keys = jax.vmap(lambda key: jax.random.fold_in(key, 1))(keys)
-            final = jax.device_get(evaluate(progress.state, final_keys))
+            final = jax.device_get(evaluate.result()(progress.state, final_keys))
             trainer.check_steps(env)
             _end(chunk, progress, final, settings)
         settings.on_epoch(chunk, progress)
@@ -213,10 +213,10 @@ def _locked(folder: Path, chunk: Sequence[Cell]) -> Iterator[None]:
 
 def _compile(
     env: Any, program: Train, group: list[Cell], choices: list[tuple[str, str, str]], settings: _Settings
-) -> tuple[Compiled, Evaluate, int]:
+) -> tuple[Compiled, concurrent.futures.Future[Evaluate], int]:
     """The program for as many lanes as there may be and memory holds, its last evaluation, and how many lanes they are.
 
-    The last evaluation is compiled in a thread, while the runs are trained.
+    The last evaluation may still be compiling, in a thread, while the runs are trained.
     """
     import jax
 
@@ -245,9 +245,10 @@ def _compile(
         if available is None or compiled.nbytes <= available or size == 1:
             lowered = evaluate.lower(jax.eval_shape(jax.vmap(program.init), keys, hparams), keys)
             pool = concurrent.futures.ThreadPoolExecutor(1)
-            last = pool.submit(trainer.compile_lowered, lowered)  # it is not needed before the runs have ended
-            pool.shutdown(wait=False)
-            return compiled, lambda state, key: last.result()(state, key), size
+            last = cast("concurrent.futures.Future[Evaluate]", pool.submit(trainer.compile_lowered, lowered))
+            # It is not needed before the runs have ended; but compiling takes memory, too, to try kernels in.
+            pool.shutdown(wait=available is None or compiled.nbytes > available / 2)
+            return compiled, last, size
         size = min(size - 1, max(1, int(0.95 * size * available / compiled.nbytes)))
 
 

@@ -354,7 +354,9 @@ def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     It makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with hundreds of
     tilings each, what else could go into them.
     """
-    options = {"xla_disable_hlo_passes": "triton-softmax-rewriter"} if jax.default_backend() == "gpu" else None
+    options: dict[str, str | bool] = {}
+    if jax.default_backend() == "gpu":
+        options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
     return lowered.compile(compiler_options=options)
 
 

@@ -36,7 +36,7 @@ def test_the_settled_arm_holds_the_gripper_where_the_task_says():
 
 
 def test_a_batch_is_what_its_rows_are():
-    """As one program of any size: XLA on a CPU (JAX 0.10) has turned some ways to write such sums into wrong ones from 512 on."""
+    """In batches of any size: XLA on a CPU (JAX 0.10) makes wrong sums, from 512 on, of some ways to write them."""
     env = envs.make("push", engine="native")
     angles, rates = jax.random.normal(jax.random.key(0), (2, 1024, 7))
 
