@@ -152,8 +152,8 @@ def sample_episode_goals(state: ReplayState, key: PRNGKey, batch_size: int) -> A
 def below(bits: Array, number: Array | int) -> Array:
     """Random integers 0 ... `number` - 1, int32, from random `bits`, uint32 of any shape: the upper 32 of the product's 64.
 
-    One is likelier than another by `number` / 2^32 of its probability at most. `jax.random.randint` needs three times as many
-    bits, and what draws them takes a compiler longer than all else in a learner's loop. 0 where `number` is 0.
+    One is likelier than another by `number` / 2^32 of its probability at most. `jax.random.randint` makes three draws, each of
+    them more than a hundred operations to a compiler. 0 where `number` is 0.
     """
     number = jnp.asarray(number, jnp.uint32)
     high, low, number_high, number_low = bits >> 16, bits & 0xFFFF, number >> 16, number & 0xFFFF
