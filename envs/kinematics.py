@@ -72,14 +72,14 @@ class Chain:
         """Position [3], m, and orientation [4] (w, x, y, z) of the body at joint angles [J], rad."""
         quats = self._orientations(angles)
         pos = [jnp.sum(x) for x in _rotate(quats, self._to_body)]
-        return jnp.stack(pos), jnp.sum(self._at_body * quats[-1], axis=-1)
+        return jnp.stack(pos), jnp.sum(self._at_body * quats[-1][None], axis=-1)
 
     def site_motion(self, angles: Array, rates: Array) -> tuple[Array, Array]:
         """Position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and their rates [J], rad/s."""
         quats = self._orientations(angles)
         segments = _rotate(quats, self._to_site)
         axes = _rotate(quats[:-1], self._axes)
-        angular = [jnp.sum(self._before * (rates * x), axis=-1) for x in axes]  # [S] each: of the segments
+        angular = [jnp.sum(self._before * (rates * x)[None], axis=-1) for x in axes]  # [S] each: of the segments
         return jnp.stack([jnp.sum(x) for x in segments]), jnp.stack([jnp.sum(x) for x in _cross(angular, segments)])
 
     def _orientations(self, angles: Array) -> Array:
@@ -91,7 +91,7 @@ class Chain:
         steps = jnp.cos(half) * self._still + jnp.sin(half) * self._turned  # [J, 4, 4]
         quats = [jnp.array([1.0, 0.0, 0.0, 0.0])]
         for index in range(steps.shape[0]):
-            quats.append(jnp.sum(steps[index] * quats[-1], axis=-1))
+            quats.append(jnp.sum(steps[index] * quats[-1][None], axis=-1))
         return jnp.stack(quats)
 
 
