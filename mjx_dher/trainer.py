@@ -351,8 +351,8 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
 def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compiles what `jax.jit(...).lower` gave, on a GPU without a pass that can take half the time and gains a learner nothing.
 
-    It makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many tilings
-    each, what else could go into them.
+    It makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many
+    tilings each, what else could go into them.
     """
     options: dict[str, str | bool] = {}
     if jax.default_backend() == "gpu":
