@@ -199,11 +199,13 @@ class FetchEnv(GoalEnv):
     def _sample_goal(self, key: PRNGKey) -> Array:
         """[3] uniform around the gripper plus the task's offset; with an object, at its height, or (half of them) above."""
         task = self.task
-        *offset, lift = jax.random.uniform(key, (4,), minval=-1.0, maxval=1.0)
-        goal = jnp.array(task.initial_grip_pos) + task.target_range * jnp.stack(offset) + jnp.array(task.target_offset)
+        # Scaled by `uniform`, whose result XLA rounds alike wherever it computes it: reset and first step give the same goal.
+        largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift])
+        drawn = jax.random.uniform(key, (4,), minval=-largest, maxval=largest)
+        goal = jnp.array(task.initial_grip_pos) + drawn[:3] + jnp.array(task.target_offset)
         if task.object_height is None:
             return goal
-        return goal.at[2].set(task.object_height + task.max_goal_lift * jnp.maximum(lift, 0.0))
+        return goal.at[2].set(task.object_height + jnp.maximum(drawn[3], 0.0))
 
     def _seen(self, physics: Physics) -> Physics:
         """What the observation is made from after a step.

@@ -78,7 +78,7 @@ def test_a_sweep_trains_them(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert cli.main(["sweep", *OWN, "--total-steps", "20", "--seeds", "1", "--lanes", "1", "--out", "sweep"]) == 0
     assert "my_tasks:soon" in capsys.readouterr().out
-    assert len(list((folder / "sweep" / "cells").iterdir())) == 1
+    assert len(list((folder / "sweep" / "cells").glob("*/result.json"))) == 1
 
 
 def test_what_has_no_model_is_not_rendered():
