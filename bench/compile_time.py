@@ -14,17 +14,19 @@ import time
 
 import apart
 
+from mjx_dher import presets
+
 
 def measure(env: str, engine: str, preset: str) -> dict[str, float]:
     start = time.perf_counter()
     import dataclasses
 
-    from mjx_dher import config, envs
-    from mjx_dher.cli import keep_compiled_programs
+    from mjx_dher import envs
+    from mjx_dher.host.caches import keep_compiled_programs
     from mjx_dher.trainer import train
 
     keep_compiled_programs()
-    settings, hparams = config.preset(preset, env)
+    settings, hparams = presets.preset(preset, env)
     settings = dataclasses.replace(settings, sampler="weighted", total_steps=10**9)
     compiled: list[float] = []
     environment = envs.make(env, engine=engine)
@@ -43,12 +45,10 @@ def measure(env: str, engine: str, preset: str) -> dict[str, float]:
 def main() -> None:
     from timing import print_table
 
-    from mjx_dher import config
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--preset", default=config.machine_preset())
+    parser.add_argument("--preset", default=presets.machine_preset())
     args = parser.parse_args()
     rows = []
     for env in args.env:

@@ -248,7 +248,7 @@ def yardstick():
     import gymnasium as gym
     import gymnasium_robotics
 
-    from mjx_dher.originals import ORIGINALS
+    from mjx_dher.tools.originals import ORIGINALS
 
     warnings.filterwarnings("ignore")
     gym.register_envs(gymnasium_robotics)

@@ -16,8 +16,10 @@ import jax
 import jax.numpy as jnp
 from timing import median_seconds, print_table
 
-from mjx_dher import Config, HParams, ddpg, fused, replay, samplers
-from mjx_dher.ddpg import Networks
+from mjx_dher import Config, HParams, replay, samplers
+from mjx_dher.hopper import gradients as hopper
+from mjx_dher.learners import ddpg
+from mjx_dher.learners.ddpg import Networks
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.relabel import draw_batches
 from mjx_dher.trainer import DRAWN_AT_ONCE
@@ -61,9 +63,11 @@ def main() -> None:
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
     parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
     args = parser.parse_args()
-    gradients = fused.gradients if args.kernels == "hopper" else ddpg.gradients
+    compute_gradients = (hopper if args.kernels == "hopper" else ddpg).compute_gradients
     for batch_size in args.batch_sizes if args.kernels == "hopper" else ():
-        if problem := fused.problem(Config(learner_dtype=args.dtype, batch_size=batch_size), num_inputs=28, action_size=4):
+        if problem := hopper.unsupported_reason(
+            Config(learner_dtype=args.dtype, batch_size=batch_size), num_inputs=28, action_size=4
+        ):
             parser.error(f"--kernels hopper needs {problem}")
     hidden_sizes, dtype = Config().hidden_sizes, jnp.dtype(args.dtype)
     networks = Networks(actor=Actor(4, hidden_sizes, dtype), critic=Critic(hidden_sizes, dtype))
@@ -84,7 +88,7 @@ def main() -> None:
             return jax.lax.scan(add_up, None, jax.random.split(key, draws))[1]
 
         def update(learner, batch):
-            learner, losses = ddpg.update(networks, learner, batch, hparams, gradients)
+            learner, losses = ddpg.update(networks, learner, batch, hparams, compute_gradients)
             return ddpg.update_target(learner, hparams), losses
 
         def updates_only(learner, batches, update=update, draws=draws):

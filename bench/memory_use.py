@@ -13,16 +13,18 @@ import resource
 
 import apart
 
+from mjx_dher import presets
+
 
 def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
     import dataclasses
 
     import jax
 
-    from mjx_dher import config, envs, trainer
-    from mjx_dher.memory import format_bytes
+    from mjx_dher import envs, trainer
+    from mjx_dher.host.memory import format_bytes
 
-    settings, hparams = config.preset(preset, env)
+    settings, hparams = presets.preset(preset, env)
     settings = dataclasses.replace(
         settings, num_envs=int(num_envs), sampler="weighted", cycles_per_epoch=1, updates_per_cycle=100, target_period=1
     )
@@ -44,12 +46,10 @@ def main() -> None:
     import jax
     from timing import print_table
 
-    from mjx_dher import config
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--preset", default=config.machine_preset())
+    parser.add_argument("--preset", default=presets.machine_preset())
     parser.add_argument("--num-envs", type=int, nargs="+", default=[512, 2048, 8192])
     args = parser.parse_args()
     rows = []

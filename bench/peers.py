@@ -25,6 +25,8 @@ from pathlib import Path
 import apart
 import numpy as np
 
+from mjx_dher import presets
+
 REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0", "stable-baselines3==2.9.2", "torch==2.13.0")
 TASK = "FetchPush-v4"
 NUM_ENVS, BATCH_SIZE, UPDATES = 32, 1024, 40  # of the preset `cpu`
@@ -192,10 +194,10 @@ def our_train():
     """(seconds, env steps) to SUCCESS of the preset `cpu`, evaluations included and compilation apart; success there."""
     import dataclasses
 
-    from mjx_dher import config, envs
+    from mjx_dher import envs
     from mjx_dher.trainer import train
 
-    settings, hparams = config.preset("cpu", "push")
+    settings, hparams = presets.preset("cpu", "push")
     settings = dataclasses.replace(settings, sampler="weighted")
     for progress in train(envs.make("push", engine="native"), settings, hparams, seed=0):
         if progress.metrics["success_rate"] >= SUCCESS:
@@ -246,8 +248,8 @@ def main() -> None:
     parser.add_argument("--set-up", action="store_true")
     parser.add_argument("--python", type=Path)
     args = parser.parse_args()
-    from mjx_dher import originals
-    from mjx_dher.run_folder import user_cache
+    from mjx_dher.host.caches import user_cache
+    from mjx_dher.tools import originals
 
     environment = user_cache() / "peers"
     if args.set_up:

@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 from timing import print_table
 
-from mjx_dher import config, envs
+from mjx_dher import envs, presets
 from mjx_dher.trainer import make_train
 
 
@@ -50,13 +50,13 @@ def busy(events) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="push")
-    parser.add_argument("--preset", default=config.machine_preset())
+    parser.add_argument("--preset", default=presets.machine_preset())
     parser.add_argument("--top", type=int, default=25)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     if jax.default_backend() == "cpu":
         parser.error("this reads a GPU's profile, and JAX runs on a CPU here")
-    settings, hparams = config.preset(args.preset, args.env)
+    settings, hparams = presets.preset(args.preset, args.env)
     settings = dataclasses.replace(settings, cycles_per_epoch=1, updates_per_cycle=200, sampler="weighted")
     program = make_train(envs.make(args.env), settings)
     state = jax.jit(program.init)(jax.random.key(0), hparams)

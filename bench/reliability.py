@@ -26,7 +26,8 @@ import jax
 import numpy as np
 from timing import print_table
 
-from mjx_dher import Config, HParams, checkpoint, envs, run_folder, trainer
+from mjx_dher import Config, HParams, envs, trainer
+from mjx_dher.runs import checkpoint, run_folder
 
 ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.

@@ -28,7 +28,9 @@ import numpy as np
 import scipy.stats
 from timing import print_table
 
-from mjx_dher import cli, envs, memory, metrics, rollout
+from mjx_dher import cli, envs, rollout
+from mjx_dher.host import memory
+from mjx_dher.runs import sinks
 
 BLOCKS = 10
 REFERENCE_EPISODES = 24  # some 0.1 s on two cores
@@ -124,11 +126,11 @@ def main() -> int:
     if args.reference:
         tell_speed()
         return 0
-    open_sinks = metrics.open_sinks
+    open_sinks = sinks.open_sinks
     with tempfile.TemporaryDirectory() as parent:
         out = args.out or Path(parent) / "soak.csv"
         watch = Watch(out, args.minutes * 60)
-        metrics.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
+        sinks.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
         command = ["--env", args.env, "--total-steps", "1000000000", "--checkpoint-every", "20", "--log", "jsonl"]
         status = cli.main([*command, "--out", str(Path(parent) / "run"), *args.options])
         if status != 128 + signal.SIGTERM:

@@ -14,8 +14,9 @@ import time
 import jax
 from timing import median_seconds, print_table
 
-from mjx_dher import HParams, ddpg, envs
-from mjx_dher.ddpg import Networks
+from mjx_dher import HParams, envs
+from mjx_dher.learners import ddpg
+from mjx_dher.learners.ddpg import Networks
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.rollout import rollout
 

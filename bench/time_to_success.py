@@ -17,8 +17,9 @@ from pathlib import Path
 
 from timing import print_table
 
-from mjx_dher import config, envs, policy, stats
-from mjx_dher.cli import keep_compiled_programs, play
+from mjx_dher import config, envs, policy, presets, stats
+from mjx_dher.cli import play
+from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.trainer import train
 
 
@@ -26,14 +27,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="push")
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--preset", default=config.machine_preset())
+    parser.add_argument("--preset", default=presets.machine_preset())
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--threshold", type=float, default=0.9)
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="what to change in the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
-    static, hparams = config.preset(args.preset, args.env)
+    static, hparams = presets.preset(args.preset, args.env)
     static = dataclasses.replace(static, sampler=args.sampler)
     for name, _, value in (change.partition("=") for change in args.set):
         if name in config.HParams._fields:

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.config import check_name, load_own
+from mjx_dher.names import check_name, load_own
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State

@@ -19,9 +19,12 @@ if not os.path.isdir(os.path.join(_checkout, "mjx_dher", "envs")) and os.path.is
     __path__.append(_checkout)
 
 if TYPE_CHECKING:
-    from mjx_dher import config, ddpg, envs, normalizer, relabel, replay, rollout, samplers, stats, testing, trainer
-    from mjx_dher.config import Config, HParams, preset
-    from mjx_dher.policy import Policy, load_policy
+    from mjx_dher import config, envs, normalizer, presets, relabel, replay, rollout, samplers, stats, testing, trainer
+    from mjx_dher.config import Config, HParams
+    from mjx_dher.learners import ddpg
+    from mjx_dher.policy import Policy
+    from mjx_dher.presets import preset
+    from mjx_dher.runs.load import load_policy
     from mjx_dher.trainer import TrainState, make_train, train
 
 __all__ = [
@@ -36,6 +39,7 @@ __all__ = [
     "make_train",
     "normalizer",
     "preset",
+    "presets",
     "relabel",
     "replay",
     "rollout",
@@ -46,21 +50,24 @@ __all__ = [
     "trainer",
 ]
 
+# Names that are no modules of this package's own, and where each one is.
 _HOME = {
     "Config": "config",
     "HParams": "config",
-    "preset": "config",
     "Policy": "policy",
-    "load_policy": "policy",
     "TrainState": "trainer",
+    "ddpg": "learners.ddpg",
+    "load_policy": "runs.load",
     "make_train": "trainer",
+    "preset": "presets",
     "train": "trainer",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        return getattr(importlib.import_module(f"mjx_dher.{_HOME[name]}"), name)
+        module = importlib.import_module(f"mjx_dher.{_HOME[name]}")
+        return module if module.__name__.endswith(f".{name}") else getattr(module, name)
     if name in __all__:
         return importlib.import_module(f"mjx_dher.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,13 +7,12 @@ either has been loaded.
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import importlib.util
 import math
-import pkgutil
 import sys
 from collections.abc import Iterable
 from typing import Any, NamedTuple
+
+from mjx_dher.names import check_name, is_own
 
 ENGINES = ("auto", "native", "jax", "warp")
 SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
@@ -21,7 +20,6 @@ WEIGHT_KERNELS = ("linear", "inverse", "softmax")
 METRICS = ("position",)
 DTYPES = ("float32", "bfloat16")
 LEARNER_KERNELS = ("auto", "xla", "hopper")
-PRESETS = ("cpu", "gpu", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,15 +105,6 @@ class HParams(NamedTuple):
     """Least standard deviation that the normalizers divide by."""
 
 
-def machine_preset() -> str:
-    """The preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin for one."""
-    if importlib.util.find_spec("jax_plugins") is None:
-        return "cpu"
-    import jax
-
-    return "cpu" if jax.default_backend() == "cpu" else "gpu"
-
-
 def episodes_capacity(config: Config, episode_length: int) -> int:
     """Whole episodes that the replay ring holds."""
     return config.replay_size // episode_length
@@ -153,147 +142,6 @@ def check_every(field: str, value: int) -> None:
 
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 1
-
-
-def preset(name: str, env: str) -> tuple[Config, HParams]:
-    """The Config and HParams of a preset for an environment.
-
-    `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
-    warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
-    Replay": its workers' episodes are rolled out side by side, and their averaged gradients are one gradient of the joint
-    batch.
-
-    Raises:
-      ValueError: no such preset.
-    """
-    check_name("preset", name, PRESETS)
-    if name == "paper":
-        return _paper(env)
-    return _cpu(env) if name == "cpu" else _gpu(env)
-
-
-_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
-
-
-def _cpu(env: str) -> tuple[Config, HParams]:
-    config = Config(env=env, num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
-    if env == "reach":
-        config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
-    elif env == "pick_and_place":
-        config = dataclasses.replace(config, total_steps=1_000_000)
-        return config, _TUNED._replace(noise_std=0.2, lr_end=0.05)
-    elif env == "slide":
-        config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
-        return config, _TUNED._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
-    return config, _TUNED
-
-
-def _gpu(env: str) -> tuple[Config, HParams]:
-    config = Config(
-        env=env,
-        num_envs=2048,
-        cycles_per_epoch=3,
-        updates_per_cycle=1000,
-        target_period=1,
-        batch_size=1024,
-        total_steps=1_500_000,
-        replay_size=2_000_000,
-    )
-    if env == "reach":
-        config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
-    elif env in ("pick_and_place", "slide"):
-        total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
-        config = dataclasses.replace(
-            config, cycles_per_epoch=5, updates_per_cycle=500, total_steps=total_steps, replay_size=4_000_000
-        )
-        hparams = _TUNED._replace(noise_std=0.1, random_eps=0.2, lr_end=0.05)
-        return config, hparams if env == "pick_and_place" else hparams._replace(gamma=0.97, her_k=8.0)
-    return config, _TUNED
-
-
-def _paper(env: str) -> tuple[Config, HParams]:
-    workers = 16 if env == "pick_and_place" else 8
-    epochs = 200 if env == "slide" else 50
-    config = Config(
-        env=env,
-        num_envs=2 * workers,
-        cycles_per_epoch=50,
-        updates_per_cycle=40,
-        target_period=40,
-        batch_size=256 * workers,
-        total_steps=epochs * 50 * 2 * workers * 50,
-    )
-    return config, HParams()
-
-
-def check_name(field: str, value: str, allowed: Iterable[str], own: bool = False) -> None:
-    """Refuses what is not one of `allowed`.
-
-    With `own`, "module:attribute" is allowed, too, where a module of that name can be found. It is not imported.
-
-    Raises:
-      ValueError: says what is allowed, and names the nearest.
-    """
-    allowed = tuple(allowed)
-    if value in allowed:
-        return
-    if own and is_own(value):
-        _check_own(field, value)
-        return
-    rest = ", or module:attribute" if own else ""
-    raise ValueError(f"{field} must be one of {', '.join(allowed)}{rest}; got {value!r}{_hint(str(value), allowed)}")
-
-
-def is_own(name: str) -> bool:
-    """Whether a name is "module:attribute", and not one that this library knows."""
-    return ":" in str(name)
-
-
-def load_own(field: str, value: str) -> Any:
-    """What "module:attribute" names. What the module itself raises when it is imported is raised as it is.
-
-    Raises:
-      ValueError: there is no such module, or no such attribute in it; the message names the nearest.
-    """
-    _check_own(field, value)
-    name, attribute = value.split(":")
-    try:
-        module = importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-            raise  # the module is there, and lacks another
-        raise _no_module(field, value, error.name) from None
-    if not hasattr(module, attribute):
-        hint = _hint(attribute, [name for name in dir(module) if not name.startswith("_")])
-        raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{hint}")
-    return getattr(module, attribute)
-
-
-def _check_own(field: str, value: str) -> None:
-    name, _, attribute = value.partition(":")
-    if not all(part.isidentifier() for part in (*name.split("."), attribute)):
-        raise ValueError(f"{field} must be module:attribute, the module's name as `import` takes it; got {value!r}")
-    top = name.partition(".")[0]
-    if top not in sys.modules and importlib.util.find_spec(top) is None:
-        raise _no_module(field, value, top)
-
-
-def _no_module(field: str, value: str, missing: str) -> ValueError:
-    """`missing` is the first part of the module's name that cannot be found; what it would be in has been imported."""
-    parent = missing.rpartition(".")[0]
-    if not parent:
-        there = [module.name for module in pkgutil.iter_modules()]
-    elif hasattr(sys.modules[parent], "__path__"):
-        there = [f"{parent}.{module.name}" for module in pkgutil.iter_modules(sys.modules[parent].__path__)]
-    else:
-        there = [parent]
-    where = f"in {parent}" if parent else "in the current folder or on Python's path"
-    return ValueError(f"{field} {value!r}: there is no module {missing!r} {where}{_hint(missing, there, cutoff=0.75)}")
-
-
-def _hint(value: str, there: Iterable[str], cutoff: float = 0.5) -> str:
-    nearest = difflib.get_close_matches(value, there, n=2, cutoff=cutoff)
-    return f" (did you mean {' or '.join(map(repr, nearest))}?)" if nearest else ""
 
 
 def validate(config: Config, hparams: HParams, episode_length: int | None = None) -> None:

@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_dher import envs, render
-from mjx_dher.config import check_count, check_name
+from mjx_dher import envs
+from mjx_dher.config import check_count
+from mjx_dher.names import check_name
+from mjx_dher.tools import render
 
 try:
     import gymnasium

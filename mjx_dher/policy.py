@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjx_dher import run_folder
-from mjx_dher.run_folder import POLICY_FILE, RunFolderError, read_config
+from mjx_dher.host import files
 
 _VECTORS = ("observation_mean", "observation_std", "goal_mean", "goal_std")
 _SCALARS = ("norm_clip", "obs_clip")
@@ -82,7 +80,7 @@ class Policy:
     def save(self, path: Path) -> None:
         """Writes the policy to `path`; what was there stays whole until the new file is."""
         arrays: dict[str, Any] = self.arrays()
-        with run_folder.whole(path) as partial, partial.open("wb") as file:
+        with files.atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
 
 
@@ -119,21 +117,3 @@ def from_learner(learner: Any, hparams: Any) -> Policy:
         norm_clip=float(hparams.norm_clip),
         obs_clip=float(hparams.obs_clip),
     )
-
-
-def load_policy(run_dir: str | Path) -> Policy:
-    """The policy of a run folder. Imports NumPy only: no JAX, no MuJoCo, no environment.
-
-    Raises:
-      RunFolderError: `run_dir` is no run folder of this program, or its policy is missing or damaged.
-    """
-    run_dir = Path(run_dir)
-    read_config(run_dir)
-    path = run_dir / POLICY_FILE
-    if not path.is_file():
-        raise RunFolderError(f"{path} is missing: the run was stopped before its first epoch ended")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return from_arrays({name: file[name] for name in file.files})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise RunFolderError(f"{path} is damaged or not a policy of this program ({error})") from error

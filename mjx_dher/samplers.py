@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mjx_dher import config as config_lib
+from mjx_dher import names
 from mjx_dher.config import HParams
 from mjx_dher.types import Array, PRNGKey
 
@@ -191,12 +192,12 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
       ValueError: no such sampler, module, attribute, kernel or metric (the message names the nearest), or something that is no
         sampler.
     """
-    config_lib.check_name("sampler", name, list_samplers(), own=True)
+    names.check_name("sampler", name, list_samplers(), own=True)
     if isinstance(kernel, str):
-        config_lib.check_name("weight_kernel", kernel, KERNELS)
+        names.check_name("weight_kernel", kernel, KERNELS)
         kernel = KERNELS[kernel]
     if isinstance(metric, str):
-        config_lib.check_name("metric", metric, METRICS)
+        names.check_name("metric", metric, METRICS)
         metric = METRICS[metric]
     by_distance: dict[str, LogWeightsFn] = {
         "closest": functools.partial(closest, metric=metric),
@@ -205,11 +206,11 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
     }
     if name in by_distance:
         return Sampler(by_distance[name])
-    return _own(name) if config_lib.is_own(name) else _PLAIN[name]
+    return _own(name) if names.is_own(name) else _PLAIN[name]
 
 
 def _own(name: str) -> Sampler:
-    found = config_lib.load_own("sampler", name)
+    found = names.load_own("sampler", name)
     if isinstance(found, Sampler):
         return found
     try:

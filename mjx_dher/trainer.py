@@ -14,9 +14,12 @@ import optax
 from flax import struct
 
 from mjx_dher import config as config_lib
-from mjx_dher import ddpg, evaluate, fused, memory, replay, samplers
+from mjx_dher import evaluate, replay, samplers
 from mjx_dher.config import Config, HParams
-from mjx_dher.ddpg import DDPGState, Losses, Networks
+from mjx_dher.hopper import gradients as hopper
+from mjx_dher.host import memory
+from mjx_dher.learners import ddpg
+from mjx_dher.learners.ddpg import DDPGState, Losses, Networks
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.relabel import draw_batches, is_eventful, relabel
 from mjx_dher.replay import ReplayState
@@ -172,18 +175,18 @@ def _networks(action_size: int, hidden_sizes: tuple[int, ...], dtype: str) -> Ne
     return Networks(actor=Actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=Critic(hidden_sizes, jnp.dtype(dtype)))
 
 
-def _gradients(config: Config, template: Episode, action_size: int) -> ddpg.Gradients:
+def _gradients(config: Config, template: Episode, action_size: int) -> ddpg.GradientFn:
     """What computes an update's gradients, as `learner_kernels` says.
 
     Raises:
       ValueError: kernels that cannot compute this run's.
     """
     if config.learner_kernels == "xla":
-        return ddpg.gradients
-    problem = fused.problem(config, template.observation.shape[-1] + template.desired_goal.shape[-1], action_size)
+        return ddpg.compute_gradients
+    problem = hopper.unsupported_reason(config, template.observation.shape[-1] + template.desired_goal.shape[-1], action_size)
     if config.learner_kernels == "hopper" and problem is not None:
         raise ValueError(f"learner_kernels hopper needs {problem}")
-    return fused.gradients if problem is None else ddpg.gradients
+    return hopper.compute_gradients if problem is None else ddpg.compute_gradients
 
 
 def _moved(goal: Array, hindsight: Array) -> Metrics:

@@ -16,8 +16,11 @@ import pytest
 from conftest import ROOT
 from test_trainer import SMALL
 
-from mjx_dher import HParams, checkpoint, cli, ddpg, run_folder, trainer
-from mjx_dher.checkpoint import CheckpointError
+from mjx_dher import HParams, cli, trainer
+from mjx_dher.host.files import write_json
+from mjx_dher.learners import ddpg
+from mjx_dher.runs import checkpoint, run_folder
+from mjx_dher.runs.checkpoint import CheckpointError
 from probes import PointMass
 
 CONFIG = dataclasses.replace(SMALL, total_steps=480)  # 4 epochs
@@ -96,7 +99,7 @@ def test_only_the_newest_are_kept_and_what_a_kill_has_left_goes(program, copy):
     assert [path.name for path in (copy / "checkpoints").iterdir()] == ["epoch-000004"]
 
 
-def files(folder):
+def files_of(folder):
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
@@ -108,7 +111,7 @@ def test_a_flipped_bit_is_never_restored_as_it_is(program, copy):
     rng = random.Random(0)
     refused = 0
     for _ in range(30):
-        path = rng.choice(files(newest))
+        path = rng.choice(files_of(newest))
         whole = path.read_bytes()
         if not whole:
             continue
@@ -125,7 +128,7 @@ def test_a_flipped_bit_is_never_restored_as_it_is(program, copy):
 
 
 def cut(path):
-    biggest = max(files(path / "state"), key=lambda file: file.stat().st_size)
+    biggest = max(files_of(path / "state"), key=lambda file: file.stat().st_size)
     biggest.write_bytes(biggest.read_bytes()[:-1])
 
 
@@ -296,7 +299,7 @@ def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "keep must be" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")
     assert "checkpoint_every must be" in refusal(capsys, "resume", tmp_path / "run", "--checkpoint-every", "-1")
     assert "checkpoint_every must be" in refusal(capsys, "--env", "push", "--checkpoint-every", "-1")
-    run_folder.write_json(tmp_path / "run" / "result.json", {})
+    write_json(tmp_path / "run" / "result.json", {})
     assert "has ended" in refusal(capsys, "resume", tmp_path / "run")
 
 

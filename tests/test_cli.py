@@ -13,7 +13,9 @@ from conftest import ROOT
 from rich.console import Console
 
 import mjx_dher
-from mjx_dher import cli, config, metrics, run_folder
+from mjx_dher import cli, config, presets
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import run_folder, sinks
 
 TINY = """
     --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200
@@ -150,10 +152,10 @@ assert not {{"jax", "mujoco"}} & set(sys.modules)
 
 def test_presets_are_the_base_that_options_override():
     args = cli.parse_train_args(["--preset=paper", "--env", "push", "--num-envs", "4", "--gamma", "0.9"])
-    base, hparams = config.preset("paper", "push")
+    base, hparams = presets.preset("paper", "push")
     assert args.config == config.dataclasses.replace(base, num_envs=4)
     assert args.hparams == hparams._replace(gamma=0.9)
-    assert cli.parse_train_args([]).config == config.preset("cpu", "push")[0]
+    assert cli.parse_train_args([]).config == presets.preset("cpu", "push")[0]
 
 
 def test_help_names_every_option(capsys):
@@ -169,7 +171,7 @@ def test_help_names_every_option(capsys):
 @pytest.mark.parametrize("chosen", [True, False])
 def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(tmp_path, chosen):
     code = (
-        "from mjx_dher import cli; cli.keep_compiled_programs(); import jax;"
+        "from mjx_dher.host import caches; caches.keep_compiled_programs(); import jax;"
         "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0); jax.jit(lambda x: x + 1)(1.0)"
     )
     clean = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
@@ -183,7 +185,7 @@ def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(t
 
 def test_a_terminal_gets_a_live_line():
     screen = io.StringIO()
-    sink = metrics.ConsoleSink(Console(file=screen, force_terminal=True, width=200), num_epochs=4)
+    sink = sinks.ConsoleSink(Console(file=screen, force_terminal=True, width=200), num_epochs=4)
     row = {"epoch": 1, "env_steps": 1000, "wall_seconds": 30.0, "success_rate": 0.5, "return_mean": -20.0}
     sink.write({**row, "steps_per_second": 500.0, "updates_per_second": 50.0})
     sink.close()
@@ -234,7 +236,7 @@ def test_an_unwritable_out_is_refused(tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("")
     run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
-    with pytest.raises(run_folder.RunFolderError, match="out: cannot create"):
+    with pytest.raises(FolderError, match="out: cannot create"):
         run_folder.create(blocker / "run", run, {})
 
 

@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from mjx_dher import HParams, comparison, stats
+from mjx_dher import HParams, stats
 from mjx_dher.config import Config
+from mjx_dher.sweeps import comparison
 
 
 def cell(sampler, seed, success, env="push", final=None, **numbers):

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 
-from mjx_dher import config
+from mjx_dher import config, presets
 from mjx_dher.config import Config, HParams
 
 
@@ -10,7 +10,7 @@ from mjx_dher.config import Config, HParams
     ("env", "workers", "epochs"), [("push", 8, 50), ("pick_and_place", 16, 50), ("slide", 8, 200), ("reach", 8, 50)]
 )
 def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
-    c, h = config.preset("paper", env)
+    c, h = presets.preset("paper", env)
     assert (c.env, c.num_envs, c.batch_size) == (env, 2 * workers, 256 * workers)
     assert (c.cycles_per_epoch, c.updates_per_cycle, c.target_period) == (50, 40, 40)
     assert config.num_epochs(c, 50) == epochs
@@ -22,10 +22,10 @@ def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
     assert (h.obs_clip, h.norm_clip, h.norm_eps) == (200.0, 5.0, 0.01)
 
 
-@pytest.mark.parametrize("name", config.PRESETS)
+@pytest.mark.parametrize("name", presets.PRESETS)
 @pytest.mark.parametrize("env", ["push", "pick_and_place", "slide", "reach"])
 def test_presets_are_valid(name, env):
-    config.validate(*config.preset(name, env))
+    config.validate(*presets.preset(name, env))
 
 
 def test_sizes_that_follow():
@@ -94,4 +94,4 @@ def test_all_problems_are_named_at_once():
 
 def test_unknown_preset():
     with pytest.raises(ValueError, match=r"preset must be one of cpu, gpu, paper; got .papper. .did you mean .paper."):
-        config.preset("papper", "push")
+        presets.preset("papper", "push")

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from mjx_dher import ddpg
 from mjx_dher.config import HParams
-from mjx_dher.ddpg import Networks, Params
+from mjx_dher.learners import ddpg
+from mjx_dher.learners.ddpg import Networks, Params
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.types import Batch
 

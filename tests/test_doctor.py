@@ -12,9 +12,10 @@ import pytest
 from conftest import ROOT
 
 import mjx_dher
-from mjx_dher import cli, config, doctor, render
+from mjx_dher import cli, presets
 from mjx_dher.envs import engines
 from mjx_dher.envs.engines.native import usable_cores
+from mjx_dher.tools import doctor, render
 
 ON_CPU = jax.default_backend() == "cpu"
 
@@ -44,7 +45,7 @@ def test_it_names_versions_and_the_machine(found):
     machine = report["machine"]
     assert machine["cores"] == usable_cores()
     assert machine["devices"][0]["kind"] == jax.devices()[0].device_kind
-    assert (machine["auto"], machine["preset"]) == (engines.resolve_engine("auto"), config.machine_preset())
+    assert (machine["auto"], machine["preset"]) == (engines.resolve_engine("auto"), presets.machine_preset())
     assert machine["memory"] is None or machine["memory"] > 10**8
 
 
@@ -86,7 +87,9 @@ def test_it_leaves_nothing_behind(found):
 def test_what_fails_leaves_the_rest(monkeypatch):
     """JAX without a backend."""
     monkeypatch.setenv("JAX_PLATFORMS", "nonsense")
-    machine, native = (doctor.ask([sys.executable, "-m", "mjx_dher.doctor", topic], 60) for topic in ("machine", "native"))
+    machine, native = (
+        doctor.ask([sys.executable, "-m", "mjx_dher.tools.doctor", topic], 60) for topic in ("machine", "native")
+    )
     assert machine["cores"] == usable_cores()
     for name in ("devices", "memory", "auto"):
         assert re.match(r"RuntimeError: .*nonsense.* \(xla_bridge\.py, line \d+\)$", machine[name]["error"]), name

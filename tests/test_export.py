@@ -12,9 +12,11 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import mjx_dher
-from mjx_dher import cli, export, run_folder
+from mjx_dher import cli
 from mjx_dher.config import Config, HParams
 from mjx_dher.policy import Policy
+from mjx_dher.runs import run_folder
+from mjx_dher.tools import export
 
 D, G, A = 7, 3, 4
 FORMATS = ("onnx", "safetensors")

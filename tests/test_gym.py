@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import mjx_dher.gym
-import mjx_dher.render
+import mjx_dher.tools.render
 from mjx_dher import envs
 from mjx_dher.envs.base import GoalEnv
 from mjx_dher.envs.engines import resolve_engine
@@ -200,7 +200,7 @@ REFUSED = [
     (lambda: gymnasium.make(REACH, reward_type="sprase"), "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
     (lambda: gymnasium.make(REACH, episode_length=20), "episode_length is called max_episode_steps in gymnasium.make"),
     (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), "render_mode must be one of rgb_array; got 'ansi'"),
-    (lambda: mjx_dher.render.check_drawable(Probe("auto")), "probe cannot be rendered: it needs a MuJoCo model"),
+    (lambda: mjx_dher.tools.render.check_drawable(Probe("auto")), "probe cannot be rendered: it needs a MuJoCo model"),
     (lambda: mjx_dher.gym.GymEnv("pusch"), r"env must be one of .*did you mean 'push'"),
     (lambda: gymnasium.make_vec(REACH, num_envs=0), "num_envs must be an integer of at least 1; got 0"),
     (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), "max_episode_steps must be an integer of at least 1; got 0"),

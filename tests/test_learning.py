@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 
-from mjx_dher import cli, config, envs, policy, trainer
+from mjx_dher import cli, envs, policy, presets, trainer
 
 
 def test_reach_is_learned():
     """The preset `cpu`, physics included: at least 0.99 of 300 fresh episodes; an untrained policy reaches hardly any."""
-    settings, hparams = config.preset("cpu", "reach")
+    settings, hparams = presets.preset("cpu", "reach")
     env = envs.make("reach")
     learner = None
     for progress in trainer.train(env, dataclasses.replace(settings, sampler="weighted"), hparams, seed=0):

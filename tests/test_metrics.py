@@ -6,7 +6,10 @@ import struct
 import jax.numpy as jnp
 import pytest
 
-from mjx_dher import Config, HParams, memory, metrics, run_folder, trainer
+from mjx_dher import Config, HParams, trainer
+from mjx_dher.host import memory
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import run_folder, sinks
 
 
 def row(epoch, **more):
@@ -22,9 +25,9 @@ def write(sink, epochs):
 
 def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
     path = tmp_path / "metrics.csv"
-    write(metrics.CsvSink(path), [1, 2, 3, 4])
+    write(sinks.CsvSink(path), [1, 2, 3, 4])
     in_one_go = path.read_bytes()
-    write(metrics.CsvSink(path, epochs=2), [3, 4])
+    write(sinks.CsvSink(path, epochs=2), [3, 4])
     assert path.read_bytes() == in_one_go
     with path.open() as file:
         assert [r["epoch"] for r in csv.DictReader(file)] == ["1", "2", "3", "4"]
@@ -33,17 +36,17 @@ def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
 @pytest.mark.parametrize("damage", [lambda b: b[:-20], lambda b: b.replace(b"\n2,", b"\n7,"), lambda b: b""])
 def test_csv_without_the_epochs_that_had_ended_is_refused(tmp_path, damage):
     path = tmp_path / "metrics.csv"
-    write(metrics.CsvSink(path), [1, 2, 3])
+    write(sinks.CsvSink(path), [1, 2, 3])
     path.write_bytes(damaged := damage(path.read_bytes()))
-    with pytest.raises(run_folder.RunFolderError, match=r"metrics.csv is damaged"):
-        metrics.CsvSink(path, epochs=3)
+    with pytest.raises(FolderError, match=r"metrics.csv is damaged"):
+        sinks.CsvSink(path, epochs=3)
     assert path.read_bytes() == damaged
 
 
 def test_jsonl_has_an_object_a_line_and_goes_on(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    write(metrics.JsonlSink(path), [1, 2, 3])
-    write(metrics.JsonlSink(path, epochs=2), [3, 4])
+    write(sinks.JsonlSink(path), [1, 2, 3])
+    write(sinks.JsonlSink(path, epochs=2), [3, 4])
     found = [json.loads(line) for line in path.read_text().splitlines()]
     assert found == [row(epoch, q_mean=None) for epoch in (1, 2, 3, 4)]
 
@@ -64,17 +67,17 @@ def events(folder):
 
 
 def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
-    write(metrics.TensorBoardSink(tmp_path / "tb"), [1, 2])
+    write(sinks.TensorBoardSink(tmp_path / "tb"), [1, 2])
     found = events(tmp_path / "tb")
     assert (200, "success_rate", pytest.approx(0.2)) in found
     assert (100, "return_mean", -49.0) in found
-    assert {name for _, name, _ in found} == set(row(1)) - set(metrics.COUNTS)
+    assert {name for _, name, _ in found} == set(row(1)) - set(sinks.COUNTS)
 
 
 def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     run_folder.create(tmp_path / "run", run_folder.RunConfig(Config(), HParams(), 3, "native"), {})
-    sink = metrics.open_sinks(tmp_path / "run", ["wandb"])[1]
+    sink = sinks.open_sinks(tmp_path / "run", ["wandb"])[1]
     run = sink._run
     sink.write(row(1))
     sink.write(row(2))
@@ -84,23 +87,23 @@ def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_pa
     (kept,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
     assert kept.name.endswith(run.id)
     assert any(kept.glob("*.wandb"))
-    again = metrics.open_sinks(tmp_path / "run", ["wandb"])[1]
+    again = sinks.open_sinks(tmp_path / "run", ["wandb"])[1]
     assert again._run.id == run.id
     again.close()
 
 
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
     with pytest.raises(ValueError, match=r"log must be one of jsonl, tensorboard, wandb; got 'tensorbord' \(did you mean"):
-        metrics.check(["jsonl", "tensorbord"])
-    monkeypatch.setitem(metrics.EXTRAS, "wandb", "no_such_package")
+        sinks.check(["jsonl", "tensorbord"])
+    monkeypatch.setitem(sinks.EXTRAS, "wandb", "no_such_package")
     with pytest.raises(ValueError, match=r'log wandb needs no_such_package, .*pip install -e "\.\[wandb\]"'):
-        metrics.check(["wandb"])
-    metrics.check(["jsonl"])
+        sinks.check(["wandb"])
+    sinks.check(["jsonl"])
 
 
 def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):
-    sinks = metrics.open_sinks(tmp_path, ["jsonl", "jsonl"])
-    assert [type(sink) for sink in sinks] == [metrics.CsvSink, metrics.JsonlSink]
+    opened = sinks.open_sinks(tmp_path, ["jsonl", "jsonl"])
+    assert [type(sink) for sink in opened] == [sinks.CsvSink, sinks.JsonlSink]
 
 
 def test_what_was_relabelled_by_hand():
@@ -121,5 +124,5 @@ def test_every_metric_is_documented():
     program = trainer.make_train(ENV, SMALL)
     found = trainer.jax.eval_shape(lambda state: program.epoch(state)[1], trainer.state_template(program))
     text = (run_folder.Path(__file__).parent.parent / "docs" / "logs.md").read_text()
-    for name in (*metrics.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
+    for name in (*sinks.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
         assert f"| `{name}` |" in text, name

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjx_dher import cli, originals
+from mjx_dher import cli
+from mjx_dher.tools import originals
 
 
 @pytest.fixture(scope="module")

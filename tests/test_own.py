@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import mjx_dher
-from mjx_dher import cli, cli_sweep, config, envs, samplers
+from mjx_dher import cli, config, envs, samplers
+from mjx_dher.cli import sweep as cli_sweep
 from point_mass import PointMass, soon
 
 TINY = """
@@ -82,14 +83,14 @@ def test_a_sweep_trains_them(folder, monkeypatch, capsys):
 
 
 def test_what_has_no_model_is_not_rendered():
-    from mjx_dher import render
+    from mjx_dher.tools import render
 
     with pytest.raises(ValueError, match=r"point_mass cannot be rendered: it needs a MuJoCo model \(attribute `model`\)"):
         render.play(PointMass(), lambda obs, key: jnp.zeros((2, 2)), seed=0, num_episodes=2)
 
 
 def test_a_fresh_run_folder_s_name_is_one_of_a_file(monkeypatch, tmp_path):
-    from mjx_dher import run_folder
+    from mjx_dher.runs import run_folder
 
     monkeypatch.chdir(tmp_path)
     path = run_folder.choose(None, config.Config(env="my.Tasks:Mine", sampler="my.tasks:soon"), seed=3)

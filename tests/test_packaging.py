@@ -9,36 +9,72 @@ from conftest import ROOT
 
 import mjx_dher
 
-# The layers of the algorithm, lowest first: a module imports from the layers below its own only.
+# All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
-    {"config", "types", "warp_setup"},
-    {"normalizer", "networks", "replay", "samplers", "stats", "memory"},
-    {"relabel", "ddpg", "rollout"},
-    {"evaluate", "fused"},
-    {"trainer", "fused_kernels"},
+    "types names stats host.files host.memory host.warp_setup hopper.layout runs.stopping",
+    "config normalizer networks replay rollout policy hopper.kernels host.caches envs.base envs.kinematics envs.engines.base",
+    "presets samplers evaluate learners.ddpg runs.run_folder envs.engines.warp_substep tools.render",
+    "relabel hopper.gradients runs.sinks runs.load runs.checkpoint envs.engines.native envs.engines.mjx envs.engines.warp",
+    "trainer envs.engines tools.originals tools.export",
+    "testing envs.fetch sweeps.sweep",
+    "envs.push envs.pick_and_place envs.slide envs.reach sweeps.comparison",
+    "envs sweeps.plotting",
+    "gym tools.doctor",
+    "cli.sweep cli.export cli.doctor",
+    "cli",
 ]
+EMPTY = "hopper host learners runs sweeps tools"  # folders: they hold a docstring
 
 
-def imports_of(path):
-    """The modules of this library that a file imports when it is loaded."""
-    found = set()
-    for node in ast.parse(path.read_text()).body:
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mjx_dher"):
-            inner = node.module.split(".")[1:]
-            found |= {inner[0]} if inner else {alias.name for alias in node.names}
+def modules():
+    """Every module of the library by name, `mjx_dher.` left off, and its file."""
+    found = {}
+    for root, prefix in ((ROOT / "mjx_dher", ()), (ROOT / "envs", ("envs",))):
+        for path in root.rglob("*.py"):
+            parts = (*prefix, *path.relative_to(root).with_suffix("").parts)
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
 
 
-@pytest.mark.parametrize(("layer", "name"), [(i, name) for i, layer in enumerate(LAYERS) for name in sorted(layer)])
-def test_modules_depend_downward_only(layer, name):
-    allowed = set().union(*LAYERS[:layer])
-    assert imports_of(ROOT / "mjx_dher" / f"{name}.py") <= allowed
+MODULES = modules()
+
+
+def imports_of(path):
+    """The modules of this library that a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "mjx_dher":
+            module = node.module.partition(".")[2]
+            inner = [f"{module}.{alias.name}".lstrip(".") for alias in node.names]
+            found |= {name if name in MODULES else module for name in inner}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[2] for alias in node.names if alias.name.startswith("mjx_dher.")}
+    return found - {""}
+
+
+def test_every_module_has_a_layer():
+    listed = [name for layer in (*LAYERS, EMPTY) for name in layer.split()]
+    assert sorted(listed) == sorted(set(MODULES) - {""})
+
+
+@pytest.mark.parametrize("layer", range(len(LAYERS)))
+def test_modules_depend_downward_only(layer):
+    allowed = {name for below in LAYERS[:layer] for name in below.split()}
+    for name in LAYERS[layer].split():
+        assert imports_of(MODULES[name]) <= allowed, name
+
+
+@pytest.mark.parametrize("name", EMPTY.split())
+def test_folders_are_empty(name):
+    """So that what is in them can be imported where only NumPy is."""
+    (statement,) = ast.parse(MODULES[name].read_text()).body
+    assert isinstance(statement, ast.Expr)
 
 
 def test_an_environment_is_a_value_handed_in():
-    """Only the command line and the gymnasium views import the environments (the package itself names them, for users)."""
-    importers = {path.stem for path in (ROOT / "mjx_dher").glob("*.py") if "envs" in imports_of(path)}
-    assert importers == {"cli", "cli_sweep", "gym"}
+    """Only the command line and tools for people import the environments (the package itself names them, for users)."""
+    importers = {name for name, path in MODULES.items() if name and "envs" in imports_of(path)}
+    assert importers == {"cli", "cli.sweep", "gym", "tools.doctor"}
 
 
 def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
@@ -50,7 +86,7 @@ def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
 def test_loading_everything_prints_nothing():
     code = (
         "import mjx_dher; [getattr(mjx_dher, n) for n in mjx_dher.__all__];"
-        "import mjx_dher.envs.engines.mjx, mjx_dher.envs.engines.native, mjx_dher.cli, mjx_dher.metrics"
+        "import mjx_dher.envs.engines.mjx, mjx_dher.envs.engines.native, mjx_dher.cli, mjx_dher.runs.sinks"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert (run.stdout, run.stderr) == ("", "")
@@ -64,7 +100,11 @@ def test_public_names_are_there():
 
 def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
     source = tmp_path / "source"  # building leaves files behind
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".*", "runs", "build", "dist", "*.egg-info", "__pycache__"))
+    ignored = shutil.ignore_patterns("__pycache__")
+    for name in ("mjx_dher", "envs"):
+        shutil.copytree(ROOT / name, source / name, ignore=ignored)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, source]
     built = subprocess.run(command, check=False, capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr
@@ -74,5 +114,5 @@ def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
     expected |= {f"mjx_dher/envs/{path.relative_to(ROOT / 'envs')}" for path in (ROOT / "envs").rglob("*.py")}
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
-    expected |= {"mjx_dher/py.typed", "mjx_dher/fused_kernels.cu"}
+    expected |= {"mjx_dher/py.typed", "mjx_dher/hopper/kernels.cu"}
     assert {name for name in names if name.startswith("mjx_dher/")} == expected

@@ -9,11 +9,14 @@ import pytest
 from conftest import ROOT
 
 import mjx_dher
-from mjx_dher import ddpg, policy, run_folder
+from mjx_dher import policy
 from mjx_dher.config import Config, HParams
-from mjx_dher.ddpg import Networks
+from mjx_dher.host.files import FolderError
+from mjx_dher.learners import ddpg
+from mjx_dher.learners.ddpg import Networks
 from mjx_dher.networks import Actor, Critic
-from mjx_dher.run_folder import RunConfig, RunFolderError
+from mjx_dher.runs import run_folder
+from mjx_dher.runs.run_folder import RunConfig
 
 HP = HParams(norm_clip=3.0)
 NETWORKS = Networks(actor=Actor(4), critic=Critic())
@@ -134,17 +137,17 @@ def damage(run_dir, how):
 )
 def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, message):
     damage(run_dir, how)
-    with pytest.raises(RunFolderError, match=message):
+    with pytest.raises(FolderError, match=message):
         mjx_dher.load_policy(run_dir)
 
 
 def test_no_folder(tmp_path):
-    with pytest.raises(RunFolderError, match="nowhere is not a run folder: no such folder"):
+    with pytest.raises(FolderError, match="nowhere is not a run folder: no such folder"):
         mjx_dher.load_policy(tmp_path / "nowhere")
 
 
 def test_a_folder_in_use_is_never_chosen(run_dir, tmp_path, monkeypatch):
-    with pytest.raises(RunFolderError, match=r"out: .* is there already and is never overwritten"):
+    with pytest.raises(FolderError, match=r"out: .* is there already and is never overwritten"):
         run_folder.choose(run_dir, Config(), 0)
     empty = tmp_path / "empty"
     empty.mkdir()

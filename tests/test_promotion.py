@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import config, ddpg, envs, make_train, replay, samplers, sweep, trainer
+from mjx_dher import config, envs, make_train, replay, samplers, trainer
+from mjx_dher.learners import ddpg
+from mjx_dher.sweeps import sweep
 from point_mass import PointMass
 from probes import Explodes
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher import cli, config, envs, policy, render, run_folder
+from mjx_dher import cli, config, envs, policy
+from mjx_dher.runs import run_folder
+from mjx_dher.tools import render
 
 NO_GL = 77  # exit status of SCRIPT where nothing can draw
 
@@ -17,7 +19,8 @@ SCRIPT = """
 import sys
 from pathlib import Path
 import numpy as np
-from mjx_dher import cli, envs, render
+from mjx_dher import cli, envs
+from mjx_dher.tools import render
 
 folder = Path(sys.argv[1])
 try:

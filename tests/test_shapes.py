@@ -13,7 +13,8 @@ from beartype import beartype
 from jax import Array
 from jaxtyping import Bool, Float, Int, Key, TypeCheckError, jaxtyped
 
-from mjx_dher import HParams, config, ddpg, relabel, replay, samplers
+from mjx_dher import HParams, config, relabel, replay, samplers
+from mjx_dher.learners import ddpg
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.types import Batch, Episode
 

@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import HParams, cli, cli_sweep, config, envs, memory, policy, run_folder, sweep, trainer
-from mjx_dher.run_folder import RunFolderError
-from mjx_dher.sweep import Cell
+import mjx_dher
+from mjx_dher import HParams, cli, config, envs, trainer
+from mjx_dher.cli import sweep as cli_sweep
+from mjx_dher.host import files, memory
+from mjx_dher.host.files import FolderError
+from mjx_dher.sweeps import sweep
+from mjx_dher.sweeps.sweep import Cell
 from probes import PointMass
 
 CONFIG = dataclasses.replace(SMALL, num_envs=8, updates_per_cycle=8, hidden_sizes=(16,))  # an epoch of 240 steps
@@ -102,14 +106,14 @@ def test_a_run_that_another_program_trains_is_refused(tmp_path, monkeypatch):
     cells = grid(seeds=(0, 1))
     path = tmp_path / "cells" / cells[3].name
     path.mkdir(parents=True)
-    with run_folder.lock(path, "lock"), pytest.raises(RunFolderError, match=f"{cells[3].name} is being trained by another"):
+    with files.lock(path, "lock"), pytest.raises(FolderError, match=f"{cells[3].name} is being trained by another"):
         run(tmp_path, cells, lanes=2)
     assert [sweep.is_done(tmp_path, cell) for cell in cells] == [True, True, False, False]
     held, end = [], sweep._end
 
     def look(chunk, *rest):
         for cell in chunk:
-            with pytest.raises(RunFolderError), run_folder.lock(tmp_path / "cells" / cell.name, "lock"):
+            with pytest.raises(FolderError), files.lock(tmp_path / "cells" / cell.name, "lock"):
                 pass
             held.append(cell)
         end(chunk, *rest)
@@ -301,7 +305,7 @@ def test_the_tables_hold_every_epoch_and_every_setting(tmp_path):
     assert all(len(row[name]) <= 8 for row in finals for name in ("success_rate", "reset_success_rate", "return_mean"))
     assert all(row["env_steps"] == "480" for row in finals)
     for cell in (tmp_path / sweep.CELLS).iterdir():
-        learned = policy.load_policy(cell)
+        learned = mjx_dher.load_policy(cell)
         assert learned({"observation": np.zeros(2), "achieved_goal": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
 
 
@@ -320,7 +324,7 @@ def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, m
 
 
 def test_what_is_no_sweep_is_named(tmp_path):
-    with pytest.raises(RunFolderError, match="holds no finished run of a sweep"):
+    with pytest.raises(FolderError, match="holds no finished run of a sweep"):
         sweep.read(tmp_path)
     cells = grid(("future",), (0,))
     run(tmp_path, cells)
@@ -331,7 +335,7 @@ def test_what_is_no_sweep_is_named(tmp_path):
         ("config.json", json.dumps({"schema": 0}), "is not of this program's schema 1"),
     ):
         (cell / name).write_text(content)
-        with pytest.raises(RunFolderError, match=message):
+        with pytest.raises(FolderError, match=message):
             sweep.read(tmp_path)
     (cell / "result.json").unlink()  # as if the write had been cut short
     assert not sweep.is_done(tmp_path, cells[0])

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, config, ddpg, make_train, relabel, replay, trainer
+from mjx_dher import Config, HParams, config, make_train, relabel, replay, trainer
+from mjx_dher.learners import ddpg
 from mjx_dher.rollout import rollout
 from probes import Explodes, PointMass
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import mujoco
 
-from mjx_dher.config import ENGINES, check_name
+from mjx_dher.config import ENGINES
 from mjx_dher.envs.engines.base import Engine, Physics
+from mjx_dher.names import check_name
 
 __all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]
 

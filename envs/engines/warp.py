@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
+from mjx_dher.host.warp_setup import prepare, wp
 from mjx_dher.types import Array
-from mjx_dher.warp_setup import prepare, wp
 
 with contextlib.redirect_stdout(io.StringIO()):
     # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.

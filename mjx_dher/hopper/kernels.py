@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type,var-annotated"
-"""The kernels of `fused`, which `fused_kernels.cu` describes, as Warp takes them."""
+"""The kernels that `kernels.cu` describes, as Warp takes them."""
 
 from pathlib import Path
 
-from mjx_dher.fused import BLOCKS, INPUTS, ROWS, THREADS, WIDTH
-from mjx_dher.warp_setup import wp
+from mjx_dher.hopper.layout import BLOCKS, INPUTS, ROWS, THREADS, WIDTH
+from mjx_dher.host.warp_setup import wp
 
 _CONSUMERS = THREADS - 128  # threads that multiply: two warpgroups; a third one copies
 _CHUNK = 64 * WIDTH  # numbers of a chunk of weights: 64 of its rows

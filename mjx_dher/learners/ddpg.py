@@ -55,8 +55,8 @@ class Losses(NamedTuple):
     q_mean: Array  # mean Q value of the critic on the batch
 
 
-# What `gradients` is: networks, parameters, target parameters, a normalized batch and numbers to gradients and losses.
-Gradients = Callable[[Networks, Params, Params, Batch, HParams], tuple[Params, Losses]]
+# What `compute_gradients` is: networks, parameters, target parameters, a normalized batch and numbers to gradients and losses.
+GradientFn = Callable[[Networks, Params, Params, Batch, HParams], tuple[Params, Losses]]
 
 
 def init(key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int) -> DDPGState:
@@ -144,7 +144,9 @@ def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, 
     return -jnp.mean(q) + hparams.action_l2 * jnp.mean(jnp.square(action))
 
 
-def gradients(networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams) -> tuple[Params, Losses]:
+def compute_gradients(
+    networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams
+) -> tuple[Params, Losses]:
     """The gradients of both losses, each by its own network's parameters. `batch` is normalized."""
     value = target_value(networks, target, batch, hparams)
     (c_loss, q_mean), c_grad = jax.value_and_grad(lambda critic: critic_loss(networks, critic, batch, value), has_aux=True)(
@@ -155,11 +157,11 @@ def gradients(networks: Networks, params: Params, target: Params, batch: Batch, 
 
 
 def update(
-    networks: Networks, state: DDPGState, batch: Batch, hparams: HParams, gradients: Gradients = gradients
+    networks: Networks, state: DDPGState, batch: Batch, hparams: HParams, compute_gradients: GradientFn = compute_gradients
 ) -> tuple[DDPGState, Losses]:
     """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`.
 
-    `gradients` computes both: those above, or `fused.gradients`.
+    `compute_gradients` computes both: the function above, or `hopper.gradients.compute_gradients`.
     """
     batch = dataclasses.replace(
         batch,
@@ -168,8 +170,8 @@ def update(
         desired_goal=_normalize(state.goal_norm, batch.desired_goal, hparams),
     )
     params = state.params
-    found, losses = gradients(networks, params, state.target, batch, hparams)
-    direction, opt_state = _ADAM.update(found, state.opt_state)
+    grads, losses = compute_gradients(networks, params, state.target, batch, hparams)
+    direction, opt_state = _ADAM.update(grads, state.opt_state)
     params = Params(
         actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
         critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import run_folder, stats
-from mjx_dher.comparison import Group, Row
+from mjx_dher import stats
+from mjx_dher.runs import run_folder
+from mjx_dher.sweeps.comparison import Group, Row
 
 # Okabe and Ito's colours, which colour-blind readers tell apart, from dark to light; each with a line and a marker of its own.
 _STYLES = (

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import config as config_lib
-from mjx_dher import run_folder, stats
-from mjx_dher.sweep import reads
+from mjx_dher import stats
+from mjx_dher.host import files
+from mjx_dher.sweeps.sweep import reads
 
 COMPARISON = "comparison.csv"
 
@@ -200,7 +201,7 @@ def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
 
 def write(folder: Path, rows: list[Row]) -> None:
     """Writes comparison.csv."""
-    with run_folder.whole(folder / COMPARISON) as partial, partial.open("w", newline="") as file:
+    with files.atomic_write(folder / COMPARISON) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(Row._fields)
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)

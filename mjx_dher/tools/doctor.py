@@ -3,7 +3,7 @@
 Whatever loads JAX or MuJoCo runs in a process of its own, for a limited time: a driver that hangs or crashes costs one line.
 Such a process is this file, run as a program:
 
-    python -m mjx_dher.doctor machine|native|jax|warp
+    python -m mjx_dher.tools.doctor machine|native|jax|warp
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import __version__, config, memory, originals, render, run_folder
+from mjx_dher import __version__, config, presets
+from mjx_dher.host import caches, memory
+from mjx_dher.tools import originals, render
 
 LONGEST_SECONDS = 3600.0  # that one process can be given
 ENGINES = tuple(name for name in config.ENGINES if name != "auto")
@@ -241,7 +243,7 @@ def _answer(machine: concurrent.futures.Future[dict[str, Any]], name: str) -> An
 
 def _command(topic: str) -> list[str]:
     # -P: no file of the folder that it is called from takes a library's place.
-    return [sys.executable, "-P", "-m", "mjx_dher.doctor", topic]
+    return [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]
 
 
 def _cores() -> int:
@@ -274,12 +276,12 @@ _PARTS: dict[str, Callable[[], Any]] = {
     "devices": _devices,
     "memory": memory.available_bytes,
     "auto": _auto,
-    "preset": config.machine_preset,
+    "preset": presets.machine_preset,
 }
 
 
 def _cache() -> dict[str, Any]:
-    folder = run_folder.user_cache()
+    folder = caches.user_cache()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
     return {"path": _brief(folder), "bytes": sum(path.stat().st_size for path in files) if folder.is_dir() else None}
 

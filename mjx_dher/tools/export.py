@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_dher import __version__, config, run_folder
+from mjx_dher import __version__, names
+from mjx_dher.host import files
 from mjx_dher.policy import Policy, from_arrays
-from mjx_dher.run_folder import RunConfig
+from mjx_dher.runs.run_folder import RunConfig
 
 FORMAT_VERSION = 1  # of both files: names, shapes and meanings
 OPSET = 17  # of ONNX: later ones have nothing that this graph needs, and fewer programs read them
@@ -36,8 +37,8 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
     Raises:
       ValueError: no such format, its package is not installed, or `out` cannot or must not be written.
     """
-    config.check_name("format", file_format, FORMATS)
-    run_folder.check_file(out, [f".{file_format}"], overwrite)
+    names.check_name("format", file_format, FORMATS)
+    files.check_file(out, [f".{file_format}"], overwrite)
     try:
         importlib.import_module(file_format)
     except ImportError as error:
@@ -87,7 +88,7 @@ def write(policy: Policy, run: RunConfig, file_format: str, out: Path) -> float:
     to_bytes, read = FORMATS[file_format]
     about = metadata(policy, run)
     try:
-        with run_folder.whole(out) as partial:
+        with files.atomic_write(out) as partial:
             partial.write_bytes(to_bytes(policy, about))
             return _compare(policy, about, read(partial))
     except OSError as error:

@@ -15,8 +15,9 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
-from mjx_dher.config import check_name
-from mjx_dher.run_folder import METRICS_FILE, RunFolderError, read_content, whole
+from mjx_dher.host.files import FolderError, atomic_write
+from mjx_dher.names import check_name
+from mjx_dher.runs.run_folder import METRICS_FILE, read_content
 
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
 COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
@@ -40,14 +41,14 @@ class CsvSink:
       epochs: of a run that is resumed, those that had ended; their lines stay, and later ones go.
 
     Raises:
-      RunFolderError: the file has not the lines of all these epochs.
+      FolderError: the file has not the lines of all these epochs.
     """
 
     def __init__(self, path: Path, epochs: int = 0):
         self._writer: csv.DictWriter[str] | None = None
         kept = _keep_lines(path, 1 + epochs if epochs else 0)
         if kept and [line.split(",")[0] for line in kept] != ["epoch", *map(str, range(1, 1 + epochs))]:
-            raise RunFolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
+            raise FolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
         self._file = path.open("a", newline="")
         if kept:
             self._writer = csv.DictWriter(self._file, kept[0].strip().split(","))
@@ -83,8 +84,8 @@ def _keep_lines(path: Path, count: int) -> list[str]:
     """Cuts a file after `count` lines, or makes it, and returns them."""
     lines = path.read_bytes().decode().splitlines(keepends=True)[:count] if count and path.exists() else []
     if len(lines) < count or not all(line.endswith("\n") for line in lines):
-        raise RunFolderError(f"{path} is damaged: it has {len(lines)} whole lines, not {count}")
-    with whole(path) as partial:
+        raise FolderError(f"{path} is damaged: it has {len(lines)} whole lines, not {count}")
+    with atomic_write(path) as partial:
         partial.write_bytes("".join(lines).encode())
     return lines
 

@@ -3,7 +3,7 @@
 Run as a program in that environment, this file plays episodes and prints their outcomes; it needs gymnasium-robotics and
 NumPy, but neither JAX nor this library's MuJoCo:
 
-    python -m mjx_dher.originals RUN EPISODES FIRST_SEED
+    python -m mjx_dher.tools.originals RUN EPISODES FIRST_SEED
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.policy import load_policy
-from mjx_dher.run_folder import read_config, user_cache
+from mjx_dher.host.caches import user_cache
+from mjx_dher.runs.load import load_policy
+from mjx_dher.runs.run_folder import read_config
 
 ORIGINALS = {
     "push": "FetchPush-v4",
@@ -96,7 +97,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
         processes = []
         for first, end in itertools.pairwise(bounds):
             arguments = [str(run.resolve()), str(end - first), str(seed + first)]
-            command = [str(python), "-m", "mjx_dher.originals", *arguments]
+            command = [str(python), "-m", "mjx_dher.tools.originals", *arguments]
             process = subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             stack.callback(process.kill)
             processes.append(process)

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import HParams, config, ddpg, envs, fused
+from mjx_dher import HParams, envs, presets
+from mjx_dher.hopper import gradients as hopper
+from mjx_dher.learners import ddpg
 from mjx_dher.networks import Actor, Critic
 from mjx_dher.trainer import make_train
 from mjx_dher.types import Batch
@@ -43,13 +45,13 @@ def case(action_size, seed=0):
 
 
 def number(unit):
-    """Where a kernel has a unit of a hidden layer: see `fused.blocks`."""
+    """Where a kernel has a unit of a hidden layer: see `hopper.blocks`."""
     q, t, i, b = unit // 32, unit // 8 % 4, unit // 2 % 4, unit % 2
     return 32 * q + 8 * i + 2 * t + b
 
 
 def read(blocks, rows):
-    """Weights [rows, 256] of what `fused.blocks` has made of them, one by one."""
+    """Weights [rows, 256] of what `hopper.blocks` has made of them, one by one."""
     row, column = np.meshgrid(np.arange(rows), np.arange(256), indexing="ij")
     k, n = (number(row) if rows == 256 else row), number(column)
     return blocks.astype(jnp.float32)[64 * (32 * (k // 8) + n // 8) + 8 * (n % 8) + k % 8]
@@ -97,7 +99,7 @@ def sums(parts):
 def critic_pass(x, next_x, reward, gamma, *arguments, launch_dims, output_dims):
     *arguments, tiles, _ = arguments
     size = 128 * tiles
-    assert launch_dims == tiles * fused.THREADS
+    assert launch_dims == tiles * hopper.THREADS
     x, next_x = (array.reshape(size, 64).astype(jnp.float32) for array in (x, next_x))
     target_actor, target_critic = Net(arguments[:8], False), Net(arguments[8:16], False)
     critic = Net(arguments[16:], True)
@@ -144,7 +146,7 @@ def assert_as_good_as_xla(found, action_size, cases):
     """
 
     def of_xla(dtype, case):
-        gradients = lambda *x: ddpg.gradients(networks(dtype, action_size), *x, HPARAMS)  # noqa: E731
+        gradients = lambda *x: ddpg.compute_gradients(networks(dtype, action_size), *x, HPARAMS)  # noqa: E731
         return jax.jit(gradients)(*case)
 
     mine, theirs = [], []
@@ -160,9 +162,9 @@ def assert_as_good_as_xla(found, action_size, cases):
 
 @pytest.mark.parametrize("action_size", [4, 2])
 def test_gradients_are_put_together(action_size, monkeypatch):
-    monkeypatch.setattr(fused, "_calls", lambda: (critic_pass, actor_pass))
+    monkeypatch.setattr(hopper, "_calls", lambda: (critic_pass, actor_pass))
     cases = [case(action_size, seed) for seed in range(3)]
-    gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
     assert_as_good_as_xla([jax.jit(gradients)(*one) for one in cases], action_size, cases)
 
 
@@ -171,7 +173,7 @@ def test_gradients_are_put_together(action_size, monkeypatch):
 def test_kernels_compute_gradients(action_size):
     cases = [case(action_size, seed) for seed in range(3)]
     together = jax.tree.map(lambda *x: jnp.stack(x), *cases)
-    gradients = lambda *x: fused.gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
     found = jax.jit(jax.vmap(gradients))(*together)
     lanes = [jax.tree.map(lambda x, lane=lane: x[lane], found) for lane in range(len(cases))]
     assert_as_good_as_xla(lanes, action_size, cases)
@@ -181,9 +183,9 @@ def test_kernels_compile(tmp_path):
     """To a Hopper GPU's instructions, which takes no GPU; in a process of its own, because it sets what all kernels get."""
     program = f"""
 import warp as wp
-from mjx_dher import fused_kernels
+from mjx_dher.hopper import kernels
 wp.config.cuda_arch_suffix = "a"
-for kernel in (fused_kernels.critic_pass, fused_kernels.actor_pass):
+for kernel in (kernels.critic_pass, kernels.actor_pass):
     kernel.module.options["block_dim"] = 384
     wp.compile_aot_module(kernel.module, arch=90, module_dir={str(tmp_path)!r}, use_ptx=True)
 """
@@ -196,7 +198,7 @@ for kernel in (fused_kernels.critic_pass, fused_kernels.actor_pass):
     assert len(list(tmp_path.glob("*.ptx"))) == 2
 
 
-STATIC = dataclasses.replace(config.preset("paper", "push")[0], learner_dtype="bfloat16", learner_kernels="hopper")
+STATIC = dataclasses.replace(presets.preset("paper", "push")[0], learner_dtype="bfloat16", learner_kernels="hopper")
 
 
 class Device:
@@ -218,7 +220,7 @@ class Device:
 )
 def test_problem(changes, sizes, capability, message, monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [Device(capability)])
-    assert fused.problem(dataclasses.replace(STATIC, **changes), *sizes) == message
+    assert hopper.unsupported_reason(dataclasses.replace(STATIC, **changes), *sizes) == message
 
 
 @pytest.mark.skipif(HOPPER, reason="can use them")
@@ -235,10 +237,10 @@ def test_the_learner_uses_them(monkeypatch):
 
     def gradients(*args):
         asked.append(args)
-        return ddpg.gradients(*args)
+        return ddpg.compute_gradients(*args)
 
-    monkeypatch.setattr(fused, "problem", lambda *args: None)
-    monkeypatch.setattr(fused, "gradients", gradients)
+    monkeypatch.setattr(hopper, "unsupported_reason", lambda *args: None)
+    monkeypatch.setattr(hopper, "compute_gradients", gradients)
     env = envs.make("reach", engine="native")
     small = dataclasses.replace(STATIC, env="reach", num_envs=2, cycles_per_epoch=1, batch_size=256, replay_size=1000)
     for kernels, uses in (("xla", False), ("auto", True), ("hopper", True)):

@@ -25,12 +25,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from mjx_dher import config as config_lib
-from mjx_dher import run_folder
 from mjx_dher.config import Config, HParams
-from mjx_dher.run_folder import RunConfig, RunFolderError
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import run_folder
+from mjx_dher.runs.run_folder import RunConfig
 
 if TYPE_CHECKING:
-    from mjx_dher.metrics import Sink
+    from mjx_dher.runs.sinks import Sink
     from mjx_dher.trainer import Compiled, Metrics, Progress, Start, Train, TrainState
     from mjx_dher.types import PRNGKey
 
@@ -205,7 +207,7 @@ def _locked(folder: Path, chunk: Sequence[Cell]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         for cell in chunk:
             _path(folder, cell).mkdir(exist_ok=True)
-            stack.enter_context(run_folder.lock(_path(folder, cell), LOCK))
+            stack.enter_context(files.lock(_path(folder, cell), LOCK))
         yield
         for cell in chunk:
             (_path(folder, cell) / LOCK).unlink(missing_ok=True)
@@ -220,7 +222,8 @@ def _compile(
     """
     import jax
 
-    from mjx_dher import memory, trainer
+    from mjx_dher import trainer
+    from mjx_dher.host import memory
 
     @jax.jit
     @jax.vmap
@@ -256,16 +259,17 @@ def _train(
     env: Any, chunk: Sequence[Cell], size: int, compiled: Compiled, init: Callable[[], TrainState], settings: _Settings
 ) -> Progress:
     """Trains cells side by side, from their start or the checkpoint that they were left with, to their end."""
-    from mjx_dher import metrics, trainer
+    from mjx_dher import trainer
+    from mjx_dher.runs import sinks
 
     folder = settings.folder
     unfinished = _Unfinished(folder, chunk, size, settings.on_program)
     with contextlib.ExitStack() as stack:
         begin = unfinished.restore(init)
-        sinks = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size, begin.epoch)) for cell in chunk]
+        opened = [stack.enter_context(_begin(folder, cell, run_folder.engine_name(env), size, begin.epoch)) for cell in chunk]
         for progress in trainer.run(env, chunk[0].config, compiled, begin):
-            counts = {name: getattr(progress, name) for name in metrics.COUNTS}
-            for lane, sink in enumerate(sinks):
+            counts = {name: getattr(progress, name) for name in sinks.COUNTS}
+            for lane, sink in enumerate(opened):
                 sink.write({**counts, **{name: float(values[lane]) for name, values in progress.metrics.items()}})
             if progress.epoch == progress.num_epochs:
                 continue  # what they leave comes first
@@ -293,7 +297,7 @@ def _end(chunk: Sequence[Cell], progress: Progress, final: dict[str, Any], setti
         policy.from_learner(learner, cell.hparams).save(path / run_folder.POLICY_FILE)
         result = {name: trainer.to_float(values[lane]) for name, values in final.items()}
         # Last of all: the cell is done when this is there.
-        run_folder.write_json(path / run_folder.RESULT_FILE, {**last, **result, "episodes": settings.final_episodes})
+        files.write_json(path / run_folder.RESULT_FILE, {**last, **result, "episodes": settings.final_episodes})
     _clear(settings.folder)
 
 
@@ -316,7 +320,8 @@ class _Unfinished:
         """Where these cells go on from: what `init` makes, if there is no checkpoint that can be used."""
         import jax
 
-        from mjx_dher import checkpoint, trainer
+        from mjx_dher import trainer
+        from mjx_dher.runs import checkpoint
 
         state = init()
         if not run_folder.checkpoints(self.folder):
@@ -325,7 +330,7 @@ class _Unfinished:
         del state  # there may be no memory for two
         try:
             found = checkpoint.restore(self.folder, template)
-        except RunFolderError as error:
+        except FolderError as error:
             self.say(f"{error}; training these runs from their start")
             return trainer.Start(init())
         self.say(f"going on after epoch {found.epoch}")
@@ -334,11 +339,11 @@ class _Unfinished:
 
     def save(self, progress: Progress) -> None:
         """A checkpoint in place of the one before. One that cannot be written is said to be so, and costs nothing else."""
-        from mjx_dher import checkpoint
+        from mjx_dher.runs import checkpoint
 
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            run_folder.write_json(self.folder / _NAMES, {"cells": self.names})
+            files.write_json(self.folder / _NAMES, {"cells": self.names})
             checkpoint.save(self.folder, progress.state, progress.epoch, progress.wall_seconds, keep=1)
         except (OSError, checkpoint.CheckpointError) as error:
             self.say(str(error))
@@ -371,22 +376,22 @@ def _path(folder: Path, cell: Cell) -> Path:
 
 def _begin(folder: Path, cell: Cell, engine: str, lanes: int, epochs: int) -> contextlib.closing[Sink]:
     """Writes the cell's config.json, and makes the sink for its curve, of which `epochs` are there already."""
-    from mjx_dher import metrics
+    from mjx_dher.runs import sinks
 
     path = _path(folder, cell)
     run_folder.create(path, RunConfig(cell.config, cell.hparams, cell.seed, engine), {"lanes": lanes})
-    return contextlib.closing(metrics.CsvSink(path / run_folder.METRICS_FILE, epochs))
+    return contextlib.closing(sinks.CsvSink(path / run_folder.METRICS_FILE, epochs))
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
     """The finished cells of a sweep: config, hparams, seed, engine, lanes; curve, lists by column; final, the last evaluation.
 
     Raises:
-      RunFolderError: no sweep, none finished, or a folder that cannot be read.
+      FolderError: no sweep, none finished, or a folder that cannot be read.
     """
     paths = sorted(path.parent for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}"))
     if not paths:
-        raise RunFolderError(f"{folder} holds no finished run of a sweep")
+        raise FolderError(f"{folder} holds no finished run of a sweep")
     found = [_read_cell(path) for path in paths]
     key = lambda c: (c["config"]["env"], c["config"]["sampler"], str(c["config"]), str(c["hparams"]), c["seed"])  # noqa: E731
     return sorted(found, key=key)
@@ -410,7 +415,7 @@ def _read_cell(path: Path) -> dict[str, Any]:
             "curve": curve,
         }
     except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise RunFolderError(f"{path} is not a finished run of a sweep ({type(error).__name__}: {error})") from error
+        raise FolderError(f"{path} is not a finished run of a sweep ({type(error).__name__}: {error})") from error
 
 
 def _number(text: str) -> int | float:
@@ -435,12 +440,12 @@ def write_tables(folder: Path, cells: Sequence[dict[str, Any]]) -> None:
     _write_csv(folder / RESULTS, results)
     _write_csv(folder / FINALS, finals)
     columns = {name: np.array([row[name] for row in results]) for name in results[0]}
-    with run_folder.whole(folder / "results.npz") as partial, partial.open("wb") as file:
+    with files.atomic_write(folder / "results.npz") as partial, partial.open("wb") as file:
         np.savez_compressed(file, **columns)  # type: ignore[arg-type]
 
 
 def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    with run_folder.whole(path) as partial, partial.open("w", newline="") as file:
+    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), restval="")
         writer.writeheader()
         writer.writerows(rows)

@@ -8,7 +8,8 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import config, run_folder
+from mjx_dher import names
+from mjx_dher.runs import run_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,11 +31,11 @@ class ExportArgs:
 
 def export_command(argv: list[str], console: Console) -> int:
     """`export RUN`: writes the policy of a run folder for other programs."""
-    from mjx_dher import export
-    from mjx_dher.policy import load_policy
+    from mjx_dher.runs.load import load_policy
+    from mjx_dher.tools import export
 
     args = tyro.cli(ExportArgs, prog="train.py export", args=argv)
-    config.check_name("format", args.format, export.FORMATS)
+    names.check_name("format", args.format, export.FORMATS)
     run = run_folder.read_config(args.run)
     out = args.out or args.run / f"policy.{args.format}"
     export.check(args.format, out, args.overwrite)

@@ -17,11 +17,14 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from mjx_dher import comparison, config, envs, run_folder, sweep
+from mjx_dher import config, envs, names, presets
 from mjx_dher.config import Config, HParams
-from mjx_dher.run_folder import RunFolderError
-from mjx_dher.stopping import Stop
-from mjx_dher.sweep import Cell
+from mjx_dher.host import files
+from mjx_dher.host.caches import prepare
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs.stopping import Stop
+from mjx_dher.sweeps import comparison, sweep
+from mjx_dher.sweeps.sweep import Cell
 
 _GRID = ("env", "sampler", "weight_kernel", "metric")
 SECONDS_A_LINE = 10.0  # between lines of progress, where there is no terminal
@@ -123,8 +126,8 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
         ("metric", config.metric_names()),
     ):
         for value in getattr(args, field) or ("",):
-            config.check_name(field, value, allowed, own=field in ("env", "sampler"))
-    config.check_name("preset", args.preset, ("auto", *config.PRESETS))
+            names.check_name(field, value, allowed, own=field in ("env", "sampler"))
+    names.check_name("preset", args.preset, ("auto", *presets.PRESETS))
     for field in ("seeds", "final_episodes", *(("lanes",) if args.lanes is not None else ())):
         config.check_count(field, getattr(args, field))
     config.check_every("checkpoint_every", args.checkpoint_every)
@@ -133,13 +136,13 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[Cell]]:
     _check_threshold(args.threshold)
     share = _share(args.share)
     if args.out.exists() and not args.out.is_dir():
-        raise RunFolderError(f"out: {args.out} is there already and is no folder")
+        raise FolderError(f"out: {args.out} is there already and is no folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / sweep.CELLS).is_dir():
-        raise RunFolderError(f"out: {args.out} holds something else than a sweep; name a new or empty folder")
+        raise FolderError(f"out: {args.out} holds something else than a sweep; name a new or empty folder")
     statics, numbers = [], []
-    preset = config.machine_preset() if args.preset == "auto" else args.preset
+    preset = presets.machine_preset() if args.preset == "auto" else args.preset
     for env in dict.fromkeys(args.env):
-        base, hparams = config.preset(preset, env)
+        base, hparams = presets.preset(preset, env)
         base = dataclasses.replace(base, **{k: v for k, v in vars(args.changes).items() if v is not None})
         axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
         points = [hparams._replace(**dict(zip(axes, point))) for point in itertools.product(*axes.values())]
@@ -166,8 +169,6 @@ def _share(text: str) -> tuple[int, int]:
 
 def sweep_command(argv: list[str], console: Console) -> int:
     """`sweep`: trains a grid of runs."""
-    from mjx_dher.cli import prepare
-
     args, cells = parse_sweep_args(argv)
     todo = [cell for cell in cells if not sweep.is_done(args.out, cell)]
     done = f"; {len(cells) - len(todo)} of them are done already" if len(todo) < len(cells) else ""
@@ -189,7 +190,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
                 return 128 + (stop.asked or signal.SIGINT)
         finally:
             screen.close()
-    with run_folder.lock(args.out / sweep.CELLS, sweep.LOCK, wait=True):  # another share's program may be writing them
+    with files.lock(args.out / sweep.CELLS, sweep.LOCK, wait=True):  # another share's program may be writing them
         found = sweep.read(args.out)
         sweep.write_tables(args.out, found)
         _compare(args.out, comparison.groups(found), args.baseline, args.threshold, console)
@@ -199,7 +200,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
 
 def plot_command(argv: list[str], console: Console) -> int:
     """`plot DIR`: draws a sweep."""
-    from mjx_dher import plotting
+    from mjx_dher.sweeps import plotting
 
     args = tyro.cli(PlotArgs, prog="train.py plot", args=argv)
     _check_threshold(args.threshold)
@@ -258,7 +259,7 @@ class _Screen:
 
     def show(self, cells: Sequence[Cell], progress: Any) -> None:
         """After each epoch of those side by side; raises KeyboardInterrupt where a stop was asked for."""
-        from mjx_dher.metrics import clock
+        from mjx_dher.runs.sinks import clock
 
         if self._stop.asked is not None:
             raise KeyboardInterrupt

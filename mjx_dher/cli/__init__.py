@@ -19,16 +19,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import cli_doctor, cli_export, cli_sweep, config, envs, metrics, run_folder
+from mjx_dher import config, envs, names, presets
+from mjx_dher.cli import doctor as cli_doctor
+from mjx_dher.cli import export as cli_export
+from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.config import Config, HParams
-from mjx_dher.run_folder import RunConfig
-from mjx_dher.stopping import Stop
+from mjx_dher.host import files
+from mjx_dher.host.caches import keep_compiled_programs, prepare
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import run_folder, sinks
+from mjx_dher.runs.run_folder import RunConfig
+from mjx_dher.runs.stopping import Stop
 
 if TYPE_CHECKING:
     from mjx_dher.envs import GoalEnv
-    from mjx_dher.metrics import Sink
     from mjx_dher.policy import Policy
     from mjx_dher.rollout import Outcome
+    from mjx_dher.runs.sinks import Sink
     from mjx_dher.trainer import Progress, Start, TrainState
 
 FINAL_EPISODES = 500
@@ -165,7 +172,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.path.append("")
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
-            config.check_name("command", argv[0], commands)
+            names.check_name("command", argv[0], commands)
         return commands[name](argv, Console(highlight=False, markup=False))
     except ValueError as error:
         for line in str(error).splitlines():
@@ -202,7 +209,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     options = {name: started.get(name, defaults[name]) if value is None else value for name, value in options.items()}
     _check_options(**options)
     if (args.run / run_folder.RESULT_FILE).exists():
-        raise run_folder.RunFolderError(f"{args.run} has ended; there is nothing to go on with")
+        raise FolderError(f"{args.run} has ended; there is nothing to go on with")
     run_folder.checkpoints_to_resume(args.run)
     prepare()
     ran = run.engine if run.engine in config.ENGINES else run.config.engine  # "none": the environment has none
@@ -212,7 +219,7 @@ def resume_command(argv: list[str], console: Console) -> int:
 
 def _check_engine(engine: str | None) -> None:
     if engine is not None:
-        config.check_name("engine", engine, config.ENGINES)
+        names.check_name("engine", engine, config.ENGINES)
 
 
 _OPTIONS = ("final_episodes", "checkpoint_every", "keep", "log")
@@ -220,7 +227,7 @@ _OPTIONS = ("final_episodes", "checkpoint_every", "keep", "log")
 
 def _check_options(final_episodes: int, checkpoint_every: int, keep: int, log: Sequence[str]) -> None:
     """Raises ValueError where one of _OPTIONS cannot be used."""
-    metrics.check(log)
+    sinks.check(log)
     config.check_count("final_episodes", final_episodes)
     config.check_count("keep", keep)
     config.check_every("checkpoint_every", checkpoint_every)
@@ -236,13 +243,13 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
     chosen, _ = early.parse_known_args(argv)
-    config.check_name("preset", chosen.preset, ("auto", *config.PRESETS))
-    preset = config.machine_preset() if chosen.preset == "auto" else chosen.preset
-    base, hparams = config.preset(preset, chosen.env)
+    names.check_name("preset", chosen.preset, ("auto", *presets.PRESETS))
+    preset = presets.machine_preset() if chosen.preset == "auto" else chosen.preset
+    base, hparams = presets.preset(preset, chosen.env)
     args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=TrainArgs(config=base, hparams=hparams))
     args = dataclasses.replace(args, preset=preset)
     checks = (
-        lambda: config.check_name("env", args.config.env, envs.list_envs(), own=True),
+        lambda: names.check_name("env", args.config.env, envs.list_envs(), own=True),
         lambda: config.validate(args.config, args.hparams),
         lambda: _check_options(**{name: getattr(args, name) for name in _OPTIONS}),
     )
@@ -271,14 +278,15 @@ class _Training:
         """Trains; `create` makes the folder of a new run, and without it the one that is there is resumed."""
         import jax
 
-        from mjx_dher import memory, trainer
+        from mjx_dher import trainer
+        from mjx_dher.host import memory
 
         run, console = self.run, self.console
         program = trainer.make_train(self.env, run.config)
         trainer.check_memory(program.replay_bytes, run.config)
         if create is not None:
             create()
-        with run_folder.lock(self.folder):
+        with files.lock(self.folder, run_folder.CONFIG_FILE):
             start = None if create is not None else self._restore(trainer.state_template(program))
             console.print(
                 f"{run.config.env}, sampler {run.config.sampler}, seed {run.seed}; physics {run_folder.engine_name(self.env)},"
@@ -290,7 +298,7 @@ class _Training:
                 with self.stop:
                     last, learned = self._train(start)
             except OSError as error:
-                raise run_folder.RunFolderError(f"{self.folder} cannot be written to ({error}); {self._last()}") from error
+                raise FolderError(f"{self.folder} cannot be written to ({error}); {self._last()}") from error
             if last.epoch < last.num_epochs:
                 console.print(
                     f"stopped after epoch {last.epoch} of {last.num_epochs}; the policy so far is in {self.folder}, and"
@@ -301,13 +309,14 @@ class _Training:
             outcome = play(self.env, learned, self.options["final_episodes"], run.seed + 1)
             result = report(outcome.success, outcome.reset_success, outcome.ret, console)
             ended = {"epochs": last.epoch, "env_steps": last.env_steps, "wall_seconds": last.wall_seconds, **result}
-            run_folder.write_json(self.folder / run_folder.RESULT_FILE, ended)
+            files.write_json(self.folder / run_folder.RESULT_FILE, ended)
             shutil.rmtree(self.folder / run_folder.CHECKPOINTS, ignore_errors=True)
         console.print(f"run folder: {self.folder}", soft_wrap=True)
         return 0
 
     def _restore(self, template: TrainState) -> Start:
-        from mjx_dher import checkpoint, trainer
+        from mjx_dher import trainer
+        from mjx_dher.runs import checkpoint
 
         found = checkpoint.restore(self.folder, template)
         for why in found.refused:
@@ -317,10 +326,11 @@ class _Training:
 
     def _train(self, start: Start | None) -> tuple[Progress, Policy]:
         """Trains to the end or until a stop is asked for, writing metrics, policies and checkpoints; the last of each."""
-        from mjx_dher import checkpoint, policy, trainer
+        from mjx_dher import policy, trainer
+        from mjx_dher.runs import checkpoint
 
         run, every = self.run, self.options["checkpoint_every"]
-        sinks: list[Sink] = []
+        opened: list[Sink] = []
         try:
             for progress in trainer.train(self.env, run.config, run.hparams, run.seed, self._on_compile, start):
                 if not trainer.is_finite(progress.state.learner):
@@ -328,16 +338,16 @@ class _Training:
                         f"epoch {progress.epoch}: the networks or normalizers hold numbers that are not finite, so training"
                         f" was stopped (smaller actor_lr and critic_lr may help); {self._last()}"
                     )
-                if not sinks:
+                if not opened:
                     ended = start.epoch if start else 0
                     steps = ended * (progress.env_steps // progress.epoch)
-                    sinks = [
-                        *metrics.open_sinks(self.folder, self.options["log"], ended, steps),
-                        metrics.ConsoleSink(self.console, progress.num_epochs),
+                    opened = [
+                        *sinks.open_sinks(self.folder, self.options["log"], ended, steps),
+                        sinks.ConsoleSink(self.console, progress.num_epochs),
                     ]
                 learned = policy.from_learner(progress.state.learner, run.hparams)
                 learned.save(self.folder / run_folder.POLICY_FILE)
-                for sink in sinks:
+                for sink in opened:
                     sink.write(_row(progress))
                 stop = self.stop.asked is not None
                 if progress.epoch < progress.num_epochs and (stop or (every and progress.epoch % every == 0)):
@@ -348,7 +358,7 @@ class _Training:
                 if stop:
                     break
         finally:
-            for sink in sinks:
+            for sink in opened:
                 sink.close()
         return progress, learned
 
@@ -370,7 +380,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     config.check_count("episodes", args.episodes)
     _check_engine(args.engine)
     run = run_folder.read_config(args.run)
-    from mjx_dher.policy import load_policy
+    from mjx_dher.runs.load import load_policy
 
     policy = load_policy(args.run)
     env = envs.make(run.config.env, engine=args.engine or run.config.engine)
@@ -382,18 +392,18 @@ def eval_command(argv: list[str], console: Console) -> int:
 
 def render_command(argv: list[str], console: Console) -> int:
     """`render`: draws episodes of a run's policy, or of random actions."""
-    from mjx_dher import render
+    from mjx_dher.tools import render
 
     args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     config.check_count("episodes", args.episodes)
     _check_engine(args.engine)
     if args.run is not None and args.env is None:
-        from mjx_dher.policy import load_policy
+        from mjx_dher.runs.load import load_policy
 
         played, policy = run_folder.read_config(args.run).config, load_policy(args.run)
     elif args.env is not None and args.run is None:
-        config.check_name("env", args.env, envs.list_envs(), own=True)
+        names.check_name("env", args.env, envs.list_envs(), own=True)
         played, policy = Config(env=args.env), None
     else:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
@@ -425,10 +435,10 @@ def transfer_command(argv: list[str], console: Console) -> int:
     _check_engine(args.engine)
     config.check_count("episodes", args.episodes)
     run = run_folder.read_config(args.run)
-    from mjx_dher import originals
     from mjx_dher.envs.engines.native import usable_cores
-    from mjx_dher.policy import load_policy
+    from mjx_dher.runs.load import load_policy
     from mjx_dher.stats import difference_interval
+    from mjx_dher.tools import originals
 
     policy = load_policy(args.run)
     environment = originals.default_environment()
@@ -496,28 +506,9 @@ def report(success: Any, reset_success: Any, ret: Any, console: Console) -> dict
     return result
 
 
-def keep_compiled_programs() -> None:
-    """Has JAX keep what it compiles in the user's cache folder, unless the user has chosen one.
-
-    A program that calls back to Python, as every one with native physics, cannot be kept.
-    """
-    import jax
-
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(run_folder.user_cache() / "xla"))
-
-
-def prepare() -> None:
-    """What a program that trains for hours needs: compiled programs are kept, and memory is not."""
-    from mjx_dher import memory
-
-    memory.keep_heap_small()  # before JAX starts threads
-    keep_compiled_programs()
-
-
 def _row(progress: Progress) -> dict[str, Any]:
     """What the sinks take, in the order of metrics.csv."""
-    from mjx_dher import memory
+    from mjx_dher.host import memory
 
     steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
     found = dict(progress.metrics)

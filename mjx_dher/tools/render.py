@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import run_folder
+from mjx_dher.host import files
 
 FPS = 25  # an action lasts 40 ms: pictures in real time
 HOLD = 10  # frames that the end of an episode stays, so that the eye can compare object and goal
@@ -47,7 +47,7 @@ def check(out: Path, width: int, height: int, overwrite: bool) -> None:
     """
     problems = []
     try:
-        run_folder.check_file(out, FORMATS, overwrite)
+        files.check_file(out, FORMATS, overwrite)
     except ValueError as error:
         problems.append(str(error))
     for field, value in (("width", width), ("height", height)):

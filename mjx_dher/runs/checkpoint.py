@@ -19,8 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher import memory
-from mjx_dher.run_folder import CHECKPOINTS, RunFolderError, checkpoints, checkpoints_to_resume, read_versioned
+from mjx_dher.host import memory
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs.run_folder import CHECKPOINTS, checkpoints, checkpoints_to_resume, read_versioned
 
 SCHEMA = 1
 MANIFEST = "manifest.json"
@@ -28,7 +29,7 @@ _STATE = "state"
 _PARTIAL = ".partial-"
 
 
-class CheckpointError(RunFolderError):
+class CheckpointError(FolderError):
     """A checkpoint that cannot be written, or must not be used."""
 
 
@@ -101,7 +102,7 @@ def restore(folder: Path, template: Any) -> Restored:
       template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
 
     Raises:
-      RunFolderError: there is none.
+      FolderError: there is none.
       CheckpointError: says why each that is there cannot be used.
     """
     refused: list[str] = []
@@ -109,7 +110,7 @@ def restore(folder: Path, template: Any) -> Restored:
         try:
             manifest, state = _load(path, template)
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, tuple(refused))
-        except RunFolderError as error:
+        except FolderError as error:
             refused.append(str(error))
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused))
 

@@ -1,7 +1,7 @@
-"""An update's gradients by kernels of its own, for NVIDIA's Hopper GPUs (H100, H200): `ddpg.gradients` in half the time.
+"""An update's gradients by kernels of its own, for NVIDIA's Hopper GPUs (H100, H200): in half of XLA's time.
 
 XLA computes a layer after another and writes each one's activations to memory and reads them again, which takes longer than
-the products. Here they stay in registers (`fused_kernels`); XLA is left with the products that are weights' gradients.
+the products. Here they stay in registers (`kernels`); XLA is left with the products that are weights' gradients.
 """
 
 from __future__ import annotations
@@ -15,23 +15,17 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import Config, HParams
-from mjx_dher.ddpg import Losses, Networks, Params
+from mjx_dher.hopper.layout import ACTION, BLOCKS, INPUTS, MAX_ACTION, ROWS, THREADS, WIDTH
+from mjx_dher.learners.ddpg import Losses, Networks, Params
 from mjx_dher.types import Array, Batch, PyTree
 
-WIDTH = 256  # units of a hidden layer
-ROWS = 128  # of a batch, a block of threads
-THREADS = 384  # of a block
-BLOCKS = 2  # that share what they read
-INPUTS = 64  # columns of a first layer's inputs: observation, goal, zeros and, from ACTION on, the action
-ACTION = 56
-MAX_ACTION = 4
 _CAPABILITY = "9.0"  # of Hopper GPUs
 
 _BF16, _F32 = jnp.bfloat16, jnp.float32
 _ORDER = (8, 4, 4, 2)  # q, t, i, b of a unit: see `blocks`
 
 
-def problem(config: Config, num_inputs: int, action_size: int) -> str | None:
+def unsupported_reason(config: Config, num_inputs: int, action_size: int) -> str | None:
     """What these kernels would need for a run's gradients and do not find, or None.
 
     Args:
@@ -110,8 +104,8 @@ def _gradients(first: Array, h: tuple[Array, Array], d: tuple[Array, Array], las
 @functools.cache
 def _calls() -> tuple[Any, Any]:
     """The two kernels as functions of JAX, compiled: XLA may ask for them while it records, when nothing can be compiled."""
-    from mjx_dher.fused_kernels import actor_pass, critic_pass
-    from mjx_dher.warp_setup import prepare, wp
+    from mjx_dher.hopper.kernels import actor_pass, critic_pass
+    from mjx_dher.host.warp_setup import prepare, wp
 
     prepare()
     device = wp.get_device()
@@ -122,12 +116,14 @@ def _calls() -> tuple[Any, Any]:
     return make(critic_pass, num_outputs=11), make(actor_pass, num_outputs=12)
 
 
-def gradients(networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams) -> tuple[Params, Losses]:
-    """`ddpg.gradients`, hidden layers in bfloat16, for runs of which `problem` says None.
+def compute_gradients(
+    networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams
+) -> tuple[Params, Losses]:
+    """`ddpg.compute_gradients`, hidden layers in bfloat16, for runs of which `unsupported_reason` says None.
 
     Rounds less often than XLA does: a layer's bias is added in float32.
     """
-    del networks  # known: see `problem`
+    del networks  # known: see `unsupported_reason`
     size, action_size = batch.action.shape
     num_inputs = batch.observation.shape[1] + batch.desired_goal.shape[1]
 

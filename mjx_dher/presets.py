@@ -1,0 +1,91 @@
+"""Presets: the tuned settings, and those of the paper. Loads neither JAX nor MuJoCo, but for `machine_preset`."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+
+from mjx_dher.config import Config, HParams
+from mjx_dher.names import check_name
+
+PRESETS = ("cpu", "gpu", "paper")
+
+
+def machine_preset() -> str:
+    """The preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin for one."""
+    if importlib.util.find_spec("jax_plugins") is None:
+        return "cpu"
+    import jax
+
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
+def preset(name: str, env: str) -> tuple[Config, HParams]:
+    """The Config and HParams of a preset for an environment.
+
+    `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
+    warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
+    Replay": its workers' episodes are rolled out side by side, and their averaged gradients are one gradient of the joint
+    batch.
+
+    Raises:
+      ValueError: no such preset.
+    """
+    check_name("preset", name, PRESETS)
+    if name == "paper":
+        return _paper(env)
+    return _cpu(env) if name == "cpu" else _gpu(env)
+
+
+_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
+
+
+def _cpu(env: str) -> tuple[Config, HParams]:
+    config = Config(env=env, num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
+    if env == "reach":
+        config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
+    elif env == "pick_and_place":
+        config = dataclasses.replace(config, total_steps=1_000_000)
+        return config, _TUNED._replace(noise_std=0.2, lr_end=0.05)
+    elif env == "slide":
+        config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
+        return config, _TUNED._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
+    return config, _TUNED
+
+
+def _gpu(env: str) -> tuple[Config, HParams]:
+    config = Config(
+        env=env,
+        num_envs=2048,
+        cycles_per_epoch=3,
+        updates_per_cycle=1000,
+        target_period=1,
+        batch_size=1024,
+        total_steps=1_500_000,
+        replay_size=2_000_000,
+    )
+    if env == "reach":
+        config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
+    elif env in ("pick_and_place", "slide"):
+        total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
+        config = dataclasses.replace(
+            config, cycles_per_epoch=5, updates_per_cycle=500, total_steps=total_steps, replay_size=4_000_000
+        )
+        hparams = _TUNED._replace(noise_std=0.1, random_eps=0.2, lr_end=0.05)
+        return config, hparams if env == "pick_and_place" else hparams._replace(gamma=0.97, her_k=8.0)
+    return config, _TUNED
+
+
+def _paper(env: str) -> tuple[Config, HParams]:
+    workers = 16 if env == "pick_and_place" else 8
+    epochs = 200 if env == "slide" else 50
+    config = Config(
+        env=env,
+        num_envs=2 * workers,
+        cycles_per_epoch=50,
+        updates_per_cycle=40,
+        target_period=40,
+        batch_size=256 * workers,
+        total_steps=epochs * 50 * 2 * workers * 50,
+    )
+    return config, HParams()

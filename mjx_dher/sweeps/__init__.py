@@ -1,0 +1,1 @@
+"""Many runs: the grid, the tables, the comparison and its pictures."""
