@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -13,23 +11,24 @@ MEASURE = "measure"
 
 
 def measured(script: str, args: Sequence[str], environ: Mapping[str, str] | None = None, python: str = sys.executable) -> Any:
-    """What the function that `script` gave to `main` returns for `args`, called in a new Python.
+    """Calls, in a new Python, the function that `script` passes to `main`, and returns its result.
 
     Args:
       script: path of the program to start.
-      args: of the function.
-      environ: added to this program's environment variables.
-      python: interpreter that runs it.
+      args: arguments of the function.
+      environ: variables to add to this program's environment.
+      python: interpreter that runs the script; it need not have this library.
     """
-    command = [python, script, MEASURE, *args]
-    done = subprocess.run(command, env={**os.environ, **(environ or {})}, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        sys.exit(f"{' '.join(command)} failed; see above")
-    return json.loads(done.stdout.splitlines()[-1])
+    from mjx_dher.host import subprocesses
+
+    answer = subprocesses.ask([python, script, MEASURE, *args], environ)
+    if answer.failure:
+        sys.exit(f"{python} {script} {MEASURE} {' '.join(args)} failed:\n{answer.err.strip() or answer.failure}")
+    return answer.last_json()
 
 
 def main(measure: Callable[..., Any], otherwise: Callable[[], int | None]) -> None:
-    """Runs a script: as `measured` starts it, `measure`, and `otherwise` what a user starts."""
+    """Runs a script: `measure` if `measured` has started it, `otherwise` if a user has."""
     if sys.argv[1:2] == [MEASURE]:
         print(json.dumps(measure(*sys.argv[2:])))
     else:

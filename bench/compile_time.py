@@ -21,17 +21,18 @@ def measure(env: str, engine: str, preset: str) -> dict[str, float]:
     start = time.perf_counter()
     import dataclasses
 
-    from mjx_dher import envs
+    from mjx_dher import envs, samplers
     from mjx_dher.host.caches import keep_compiled_programs
-    from mjx_dher.trainer import train
+    from mjx_dher.runs.loop import train
 
     keep_compiled_programs()
-    settings, hparams = presets.preset(preset, env)
-    settings = dataclasses.replace(settings, sampler="weighted", total_steps=10**9)
+    spec = presets.preset(preset, env)
+    config = dataclasses.replace(spec.config, total_steps=10**9)
     compiled: list[float] = []
     environment = envs.make(env, engine=engine)
     ready = time.perf_counter()
-    run = train(environment, settings, hparams, 0, lambda seconds: compiled.append(seconds) if seconds else None)
+    note = lambda seconds: compiled.append(seconds) if seconds else None  # noqa: E731
+    run = train(environment, config, spec.hparams, 0, note, sampler=samplers.make("weighted"))
     first, second = next(run), next(run)
     run.close()
     return {

@@ -8,9 +8,7 @@ quantity. It runs in an environment of its own, because the original needs a MuJ
 
 `fit` scales six groups of those numbers so that recorded episodes, replayed open loop in MuJoCo C, stray least (Nelder and
 Mead's simplex, from scipy, which JAX brings along), and prints the errors before and after, also on episodes that it did not
-see. It changes nothing in envs/assets:
-
-    python bench/identify.py fit [--evaluations 150]  # some minutes
+see. It changes nothing in envs/assets: `python bench/identify.py fit [--evaluations 150]`, some minutes.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
         [--dtype bfloat16 [--kernels hopper]]
 
-As in training: as many batches as trainer.DRAWN_AT_ONCE allows are drawn at once, then learned from one by one, until 500
-updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one seed.
+As in training: as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
+until 500 updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one of
+them.
 """
 
 from __future__ import annotations
@@ -19,11 +20,10 @@ from timing import median_seconds, print_table
 from mjx_dher import Config, HParams, replay, samplers
 from mjx_dher.hopper import gradients as hopper
 from mjx_dher.learners import ddpg
-from mjx_dher.learners.ddpg import Networks
-from mjx_dher.networks import Actor, Critic
+from mjx_dher.networks import mlp
 from mjx_dher.relabel import draw_batches
-from mjx_dher.trainer import DRAWN_AT_ONCE
-from mjx_dher.types import Episode
+from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
+from mjx_dher.types import Episode, Sizes
 
 
 def compute_reward(achieved_goal, desired_goal):
@@ -39,8 +39,8 @@ def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayS
         action=jax.ShapeDtypeStruct((num_steps, 4), jnp.float32),
     )
     episodes = jax.tree.map(lambda x: 0.1 * jax.random.normal(jax.random.key(0), (num_episodes, *x.shape)), shapes)
-    eventful = jnp.arange(num_episodes) % 3 == 0
-    return jax.jit(replay.add)(replay.init(shapes, num_episodes), episodes, eventful)
+    priority = (jnp.arange(num_episodes) % 3 == 0).astype(jnp.float32)
+    return jax.jit(replay.add)(replay.init(shapes, num_episodes), episodes, priority)
 
 
 def flops(batch_size: int) -> int:
@@ -69,43 +69,43 @@ def main() -> None:
             Config(learner_dtype=args.dtype, batch_size=batch_size), num_inputs=28, action_size=4
         ):
             parser.error(f"--kernels hopper needs {problem}")
-    hidden_sizes, dtype = Config().hidden_sizes, jnp.dtype(args.dtype)
-    networks = Networks(actor=Actor(4, hidden_sizes, dtype), critic=Critic(hidden_sizes, dtype))
-    hparams = jax.tree.map(jnp.float32, HParams(eventful_share=0.5))
+    playing, learning = (mlp(4, Config().hidden_sizes, dtype) for dtype in ("float32", args.dtype))
+    learner = ddpg.DDPG(Sizes(25, 3, 4), playing, learning, compute_gradients)
+    hparams = jax.tree.map(jnp.float32, HParams(priority_fraction=0.5))
     sampler, ring = samplers.make(args.sampler), full_ring()
-    counts = replay.count_eventful(ring)
+    cumulative = replay.cumulative_priority(ring)
     rows = []
     for batch_size, seeds in itertools.product(args.batch_sizes, args.seeds):
-        at_once = max(1, DRAWN_AT_ONCE // batch_size)
+        at_once = max(1, MAX_TRANSITIONS_PER_DRAW // batch_size)
         draws = -(-500 // at_once)
 
         def draw(key, shape=(at_once, batch_size)):
-            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)
+            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, cumulative)
 
         def draw_all(key, draw=draw, draws=draws):
             """[draws] one number of each batch, so that none is left out."""
             add_up = lambda _, key: (None, sum(jnp.sum(x) for x in jax.tree.leaves(draw(key))))  # noqa: E731
             return jax.lax.scan(add_up, None, jax.random.split(key, draws))[1]
 
-        def update(learner, batch):
-            learner, losses = ddpg.update(networks, learner, batch, hparams, compute_gradients)
-            return ddpg.update_target(learner, hparams), losses
+        def update(state, batch):
+            state, losses = learner.update(state, batch, hparams)
+            return learner.update_target(state, hparams), losses
 
-        def updates_only(learner, batches, update=update, draws=draws):
-            return jax.lax.scan(lambda learner, _: jax.lax.scan(update, learner, batches), learner, length=draws)
+        def updates_only(state, batches, update=update, draws=draws):
+            return jax.lax.scan(lambda state, _: jax.lax.scan(update, state, batches), state, length=draws)
 
-        def both(learner, key, draw=draw, update=update, draws=draws):
-            draw_and_update = lambda learner, key: jax.lax.scan(update, learner, draw(key))  # noqa: E731
-            return jax.lax.scan(draw_and_update, learner, jax.random.split(key, draws))
+        def both(state, key, draw=draw, update=update, draws=draws):
+            draw_and_update = lambda state, key: jax.lax.scan(update, state, draw(key))  # noqa: E731
+            return jax.lax.scan(draw_and_update, state, jax.random.split(key, draws))
 
         keys = jax.random.split(jax.random.key(2), seeds)
-        learners = jax.vmap(lambda key: ddpg.init(key, networks, 25, 3, 4))(keys)
+        states = jax.vmap(learner.init)(keys)
         drawing, updating, whole = (jax.jit(jax.vmap(function)) for function in (draw_all, updates_only, both))
         batches = jax.jit(jax.vmap(draw))(keys)
         each = at_once * draws * seeds
         draw_time = median_seconds(lambda: drawing(keys)) / each
-        update_time = median_seconds(lambda: updating(learners, batches)) / each
-        both_time = median_seconds(lambda: whole(learners, keys)) / each
+        update_time = median_seconds(lambda: updating(states, batches)) / each
+        both_time = median_seconds(lambda: whole(states, keys)) / each
         rows.append(
             (
                 batch_size,

@@ -21,16 +21,17 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
 
     import jax
 
-    from mjx_dher import envs, trainer
+    from mjx_dher import envs, samplers, trainer
     from mjx_dher.host.memory import format_bytes
+    from mjx_dher.runs.loop import train
 
-    settings, hparams = presets.preset(preset, env)
-    settings = dataclasses.replace(
-        settings, num_envs=int(num_envs), sampler="weighted", cycles_per_epoch=1, updates_per_cycle=100, target_period=1
+    spec = presets.preset(preset, env)
+    config = dataclasses.replace(
+        spec.config, num_envs=int(num_envs), cycles_per_epoch=1, updates_per_cycle=100, target_period=1
     )
     environment = envs.make(env, engine=engine)
-    program = trainer.make_train(environment, settings)
-    run = trainer.train(environment, settings, hparams)
+    program = trainer.make_train(environment, config)
+    run = train(environment, config, spec.hparams, sampler=samplers.make("weighted"))
     next(run)
     run.close()
     found = [format_bytes(program.replay_bytes)]

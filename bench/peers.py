@@ -178,28 +178,25 @@ def our_relabel():
 
     from mjx_dher import HParams, replay, samplers
     from mjx_dher.relabel import draw_batches
-    from mjx_dher.trainer import DRAWN_AT_ONCE
+    from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW as NUM_DRAWN
 
     ring, hparams = full_ring(), HParams()
-    counts = replay.count_eventful(ring)
+    cumulative = replay.cumulative_priority(ring)
     rates = {}
     for name in ("future", "weighted"):
         sampler = samplers.make(name)
-        draw = jax.jit(lambda key, s=sampler: draw_batches(ring, key, (DRAWN_AT_ONCE,), s, compute_reward, hparams, counts))
-        rates[name] = DRAWN_AT_ONCE / median_seconds(lambda d=draw: d(jax.random.key(0)))
+        draw = jax.jit(lambda key, s=sampler: draw_batches(ring, key, (NUM_DRAWN,), s, compute_reward, hparams, cumulative))
+        rates[name] = NUM_DRAWN / median_seconds(lambda d=draw: d(jax.random.key(0)))
     return rates
 
 
 def our_train():
     """(seconds, env steps) to SUCCESS of the preset `cpu`, evaluations included and compilation apart; success there."""
-    import dataclasses
+    from mjx_dher import envs, samplers
+    from mjx_dher.runs.loop import train
 
-    from mjx_dher import envs
-    from mjx_dher.trainer import train
-
-    settings, hparams = presets.preset("cpu", "push")
-    settings = dataclasses.replace(settings, sampler="weighted")
-    for progress in train(envs.make("push", engine="native"), settings, hparams, seed=0):
+    spec, sampler = presets.preset("cpu", "push"), samplers.make("weighted")
+    for progress in train(envs.make("push", engine="native"), spec.config, spec.hparams, seed=0, sampler=sampler):
         if progress.metrics["success_rate"] >= SUCCESS:
             break
     return progress.wall_seconds, progress.env_steps, progress.metrics["success_rate"]

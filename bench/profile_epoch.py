@@ -21,7 +21,7 @@ from pathlib import Path
 import jax
 from timing import print_table
 
-from mjx_dher import envs, presets
+from mjx_dher import envs, presets, samplers
 from mjx_dher.trainer import make_train
 
 
@@ -56,10 +56,10 @@ def main() -> None:
     args = parser.parse_args()
     if jax.default_backend() == "cpu":
         parser.error("this reads a GPU's profile, and JAX runs on a CPU here")
-    settings, hparams = presets.preset(args.preset, args.env)
-    settings = dataclasses.replace(settings, cycles_per_epoch=1, updates_per_cycle=200, sampler="weighted")
-    program = make_train(envs.make(args.env), settings)
-    state = jax.jit(program.init)(jax.random.key(0), hparams)
+    spec = presets.preset(args.preset, args.env)
+    config = dataclasses.replace(spec.config, cycles_per_epoch=1, updates_per_cycle=200)
+    program = make_train(envs.make(args.env), config, sampler=samplers.make("weighted"))
+    state = jax.jit(program.init)(jax.random.key(0), spec.hparams)
     epoch = jax.jit(program.epoch, donate_argnums=0)
     for _ in range(2):
         state, _ = jax.block_until_ready(epoch(state))

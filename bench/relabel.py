@@ -17,7 +17,8 @@ from timing import median_seconds, print_table
 
 from mjx_dher import HParams, replay, samplers
 from mjx_dher.relabel import draw_batches
-from mjx_dher.trainer import DRAWN_AT_ONCE
+from mjx_dher.spec import SAMPLERS
+from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Batch
 
 ROUNDS = 10
@@ -64,13 +65,15 @@ def main() -> None:
     parser.add_argument("--flashbax", action="store_true")
     args = parser.parse_args()
     hparams, ring = HParams(), full_ring()
-    counts = replay.count_eventful(ring)
-    shape = (max(1, DRAWN_AT_ONCE // args.batch_size), args.batch_size)
+    cumulative = replay.cumulative_priority(ring)
+    shape = (max(1, MAX_TRANSITIONS_PER_DRAW // args.batch_size), args.batch_size)
     num_drawn = shape[0] * shape[1]
     rates = {}
-    for name in samplers.list_samplers():
-        sampler = samplers.make(name)
-        draw = lambda key, sampler=sampler: draw_batches(ring, key, shape, sampler, compute_reward, hparams, counts)  # noqa: E731
+    for name in SAMPLERS:
+
+        def draw(key, sampler=samplers.make(name)):  # noqa: B008
+            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, cumulative)
+
         rates[name] = transitions_a_second(draw, num_drawn)
     if args.flashbax:
         rates["flashbax, not relabelled"] = transitions_a_second(flashbax(ring, num_drawn), num_drawn)

@@ -26,8 +26,8 @@ import jax
 import numpy as np
 from timing import print_table
 
-from mjx_dher import Config, HParams, envs, trainer
-from mjx_dher.runs import checkpoint, run_folder
+from mjx_dher import Config, HParams, envs, make_train
+from mjx_dher.runs import checkpoint, loop, run_folder
 
 ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.
@@ -62,14 +62,14 @@ class Runs:
         env = envs.make(env_name)
         self.folder = Path(folder)
         total_steps = EPOCHS * SHAPES["num_envs"] * env.episode_length
-        self.config = Config(env=env_name, total_steps=total_steps, **SHAPES)
-        self.program = trainer.make_train(env, self.config)
-        compiled = trainer.compile_program(self.program, jax.random.key(0), HParams())
+        self.env_name, self.config = env_name, Config(total_steps=total_steps, **SHAPES)
+        self.program = make_train(env, self.config)
+        compiled = loop.compile_program(self.program, jax.random.key(0), HParams())
         state = compiled.init(jax.random.key(0), HParams())
         self.right = [digest(state)]  # after each epoch
-        for progress in trainer.run(env, self.config, compiled, trainer.Start(state)):
+        for progress in loop.run(env, self.config, compiled, loop.Start(state)):
             self.right.append(digest(progress.state))
-        self.template = trainer.state_template(self.program)
+        self.template = loop.state_template(self.program)
 
     def start(self, out, limit=None):
         """The command, training into `out` or resuming what is there; `limit`, kB that a file can have."""
@@ -78,8 +78,9 @@ class Runs:
         else:
             shutil.rmtree(out, ignore_errors=True)
             options = dataclasses.asdict(self.config)
-            command = ["--preset", "cpu", "--out", out, "--checkpoint-every", INTERVAL, "--final-episodes", "2"]
-            for name in ("env", "total_steps", *SHAPES):
+            command = ["--env", self.env_name, "--preset", "cpu", "--out", out]
+            command += ["--checkpoint-every", INTERVAL, "--final-episodes", "2"]
+            for name in ("total_steps", *SHAPES):
                 value = options[name] if isinstance(options[name], tuple) else (options[name],)
                 command += ["--" + name.replace("_", "-"), *value]
             numbers = HParams()._asdict()

@@ -14,11 +14,9 @@ import time
 import jax
 from timing import median_seconds, print_table
 
-from mjx_dher import HParams, envs
-from mjx_dher.learners import ddpg
-from mjx_dher.learners.ddpg import Networks
-from mjx_dher.networks import Actor, Critic
+from mjx_dher import Config, HParams, envs, learners
 from mjx_dher.rollout import rollout
+from mjx_dher.trainer import env_sizes
 
 
 def main() -> None:
@@ -31,14 +29,14 @@ def main() -> None:
     rows = []
     for task, engine in itertools.product(args.env, args.engines):
         env = envs.make(task, engine=engine)
-        networks = Networks(actor=Actor(env.action_size), critic=Critic())
-        learner = ddpg.init(jax.random.key(0), networks, env.observation_size, env.goal_size, env.action_size)
+        learner = learners.make("ddpg", Config(), env_sizes(env))
+        state = learner.init(jax.random.key(0))
         for num_envs in args.num_envs:
 
             @jax.jit
-            def play(key, env=env, num_envs=num_envs, networks=networks, learner=learner):
-                noise = ddpg.exploration_noise(key, env.episode_length, num_envs, env.action_size, hparams)
-                policy = lambda noise, obs: ddpg.explore(noise, ddpg.act(networks, learner, obs, hparams))  # noqa: E731
+            def play(key, env=env, num_envs=num_envs, learner=learner, state=state):
+                noise = learner.noise(key, env.episode_length, num_envs, hparams)
+                policy = lambda noise, obs: learner.explore(state, obs, noise, hparams)  # noqa: E731
                 return rollout(env, policy, key, num_envs, noise)
 
             start = time.perf_counter()

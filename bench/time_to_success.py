@@ -15,12 +15,13 @@ import dataclasses
 import statistics
 from pathlib import Path
 
+import jax
 from timing import print_table
 
-from mjx_dher import config, envs, policy, presets, stats
-from mjx_dher.cli import play
+from mjx_dher import HParams, envs, learners, presets, samplers, stats, trainer
 from mjx_dher.host.caches import keep_compiled_programs
-from mjx_dher.trainer import train
+from mjx_dher.runs.loop import train
+from mjx_dher.runs.play import play
 
 
 def main() -> None:
@@ -34,25 +35,27 @@ def main() -> None:
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="what to change in the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
-    static, hparams = presets.preset(args.preset, args.env)
-    static = dataclasses.replace(static, sampler=args.sampler)
+    spec = presets.preset(args.preset, args.env)
+    config, hparams = spec.config, spec.hparams
     for name, _, value in (change.partition("=") for change in args.set):
-        if name in config.HParams._fields:
+        if name in HParams._fields:
             hparams = hparams._replace(**{name: float(value)})
         else:
-            static = dataclasses.replace(static, **{name: int(value)})
+            config = dataclasses.replace(config, **{name: int(value)})
     env = envs.make(args.env, engine=args.engine)
+    learner = learners.make(spec.learner, config, trainer.env_sizes(env), spec.networks)
+    parts = {"sampler": samplers.make(args.sampler), "learner": learner}
     keep_compiled_programs()
     rows, curve, compiled = [], [], []
     for seed in range(args.seeds):
         first = None
-        for progress in train(env, static, hparams, seed, lambda seconds: seconds and compiled.append(seconds)):
+        for progress in train(env, config, hparams, seed, lambda seconds: seconds and compiled.append(seconds), **parts):
             success = progress.metrics["success_rate"]
             curve.append((seed, progress.env_steps, progress.updates, round(progress.wall_seconds, 2), success))
             if first is None and success >= args.threshold:
                 first = progress
             last = progress
-        outcome = play(env, policy.from_learner(last.state.learner, hparams), 500, seed=1000 + seed)
+        outcome = play(env, learner.export(jax.device_get(last.state.learner), hparams), 500, seed=1000 + seed)
         low, high = stats.wilson_interval(int(outcome.success.sum()), len(outcome.success))
         reached = (f"{first.wall_seconds:.0f}", f"{first.env_steps:,}", f"{first.updates:,}") if first else ("never",) * 3
         total = (f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")

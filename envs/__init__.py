@@ -1,4 +1,4 @@
-"""Goal-conditioned environments: `make` one by its name, or your own as "module:attribute"; `register`, `list_envs`."""
+"""Goal-conditioned environments, made by name or as "module:attribute": `make` and `list_envs`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.names import check_name, load_own
+from mjx_dher.names import check_name, load_import_path
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State
 
-__all__ = ["GoalEnv", "State", "list_envs", "make", "register"]
+__all__ = ["GoalEnv", "State", "list_envs", "make"]
 
-# name -> the constructor, or "module:attribute" where importing it can wait (this module must stay cheap to import)
+# name -> constructor, or its "module:attribute", so that this module stays cheap to import
 _REGISTRY: dict[str, Callable[..., Any] | str] = {
     "push": "mjx_dher.envs.push:Push",
     "pick_and_place": "mjx_dher.envs.pick_and_place:PickAndPlace",
@@ -24,52 +24,37 @@ _REGISTRY: dict[str, Callable[..., Any] | str] = {
 
 
 def list_envs() -> tuple[str, ...]:
-    """The names that `make` takes, beside "module:attribute"."""
+    """Returns the names that `make` takes, beside "module:attribute"."""
     return tuple(sorted(_REGISTRY))
 
 
-def register(name: str, constructor: Callable[..., Any] | str) -> None:
-    """Makes an environment available to `make` and to the command line.
-
-    Args:
-      name: how it will be called.
-      constructor: called with the keyword arguments of `make`, it returns a `GoalEnv`, or whatever fits `types.Env`; or
-        "module:attribute" naming one.
-
-    Raises:
-      ValueError: the name is taken, or `constructor` is neither of the two.
-    """
-    if name in _REGISTRY:
-        raise ValueError(f"environment {name!r} is already registered")
-    if not (callable(constructor) or (isinstance(constructor, str) and constructor.count(":") == 1)):
-        raise ValueError(f"constructor must be callable or 'module:attribute'; got {constructor!r}")
-    _REGISTRY[name] = constructor
-
-
 def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
-    """The environment called `name`.
+    """Makes the environment called `name`.
 
     Args:
-      name: one of `list_envs()`, or "module:attribute" of a class, or function, that makes one.
+      name: one of `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
       engine: "native" (MuJoCo C on the host's cores), "warp" (MuJoCo Warp on an NVIDIA GPU), "jax" (MJX) or "auto" (native on
         a CPU, warp on an NVIDIA GPU, else jax). A constructor that takes no `engine` is called without it.
       **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`.
 
     Raises:
-      ValueError: no such environment, module, attribute or engine (the message names the nearest), an argument out of range,
-        an engine for what takes none, or something that is no environment.
+      ValueError: there is no such environment, module, attribute or engine (the message names the nearest), an argument is out
+        of range, an engine is given to a constructor that takes none, or the constructor returns no environment.
     """
     check_name("env", name, list_envs(), own=True)
     constructor = _REGISTRY.get(name, name)
     if isinstance(constructor, str):
-        constructor = load_own("env", constructor)
+        constructor = load_import_path("env", constructor)
     if not callable(constructor):
         raise ValueError(f"env {name!r} must be a class or function that makes an environment; it is {constructor!r}")
     if _takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
         raise ValueError(f"env {name!r} has no engine to choose; got {engine!r}")
-    env = constructor(**overrides)
+    try:
+        env = constructor(**overrides)
+    except TypeError as error:
+        raise ValueError(f"env {name!r} cannot be made: {error}") from error
     missing = [member for member in _MEMBERS if not hasattr(env, member)]
     if missing:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The environment interface: unbatched, pure, of fixed horizon."""
+"""The environment interface: unbatched, pure functions with a fixed horizon."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mjx_dher.types import Array, GoalObs, PRNGKey, PyTree
 
 @struct.dataclass
 class State:
-    """Everything that an episode in progress is made of."""
+    """The state of an episode in progress."""
 
     physics: PyTree  # the engine's state
     obs: GoalObs  # observation [D], achieved_goal [G], desired_goal [G]
-    reward: Array  # [] of the step that led here; 0 after a reset
+    reward: Array  # [] reward of the step that led to this state; 0 after a reset
     success: Array  # [] 1.0 where the achieved goal is within reach of the desired goal, else 0.0
-    step: Array  # [] steps taken, int32
-    failed: Array | bool = False  # [] whether the physics blew up in this episode, which is then not to be learned from
+    step: Array  # [] number of steps taken, int32
+    failed: Array | bool = False  # [] whether the physics blew up in this episode, which must not be learned from
 
 
 class GoalEnv(abc.ABC):
@@ -39,24 +39,24 @@ class GoalEnv(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, key: PRNGKey) -> State:
-        """A first state, drawn with `key`."""
+        """Returns an initial state drawn with `key`."""
 
     @abc.abstractmethod
     def step(self, state: State, action: Array) -> State:
-        """The state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
+        """Returns the state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
 
     @abc.abstractmethod
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """The reward for `achieved_goal` [..., G] under `desired_goal` [..., G], as [...]."""
+        """Returns the rewards [...] for `achieved_goal` [..., G] under `desired_goal` [..., G]."""
 
     def check(self) -> None:  # noqa: B027 - most have nothing to check
-        """Raises ValueError where the steps so far were not what they should be and their results do not show it.
+        """Raises ValueError if steps so far were wrong in a way that their results do not show.
 
-        To be called on the host once they are done, not while tracing.
+        Call it on the host once the steps are done, not while tracing.
         """
 
     def check_action(self, action: Array) -> Array:
-        """`action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
+        """Returns `action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
         shape = jnp.shape(action)
         if shape != (self.action_size,):
             raise ValueError(

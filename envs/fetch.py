@@ -1,4 +1,4 @@
-"""What the Fetch tasks share: action, observation, goals, reward and reset, as functions of (qpos, qvel).
+"""The common part of the Fetch tasks: action, observation, goals, reward and reset, as functions of (qpos, qvel).
 
 The tasks follow gymnasium-robotics 1.4.2, version v4 of its Fetch environments, run on mujoco 3.11.0; constants named
 "settled" were measured there after the environment's own set-up (docs/fidelity.md).
@@ -20,11 +20,12 @@ from mjx_dher.envs.engines import Physics, make_engine
 from mjx_dher.envs.kinematics import Chain, quat_multiply
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
-SUBSTEPS = 20  # of 2 ms: 25 actions a second
-MAX_OBJECT_SPEED = 10.0  # m/s; and
-MAX_JOINT_SPEED = 100.0  # rad/s or, of a finger, m/s: beyond these the physics has blown up
-ACTION_SCALE = 0.05  # m that an action of 1 asks for
-RESET_CANDIDATES = 64  # object positions drawn at once; all lie too close with probability < 1e-6 in any task
+SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
+# Beyond either speed the physics has blown up.
+MAX_OBJECT_SPEED = 10.0  # m/s
+MAX_JOINT_SPEED = 100.0  # rad/s, or m/s for a finger
+ACTION_SCALE = 0.05  # m that an action of 1 moves the target
+RESET_CANDIDATES = 64  # object positions drawn at once; with probability < 1e-6, all lie too close in any task
 TIMESTEP = 0.002  # s
 DT = SUBSTEPS * TIMESTEP  # s; the observation gives velocities as displacements per step
 POINTING_DOWN = np.array([1.0, 0.0, 1.0, 0.0], np.float32)  # the gripper's orientation (w, x, y, z), not normalized
@@ -33,7 +34,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 @dataclasses.dataclass(frozen=True)
 class FetchTask:
-    """The numbers that set one task apart from another (all lengths in m)."""
+    """The numbers that differ between tasks (all lengths in m)."""
 
     xml: str  # file in envs/assets
     arm_qpos: tuple[float, ...]  # [7] settled, rad, shoulder to wrist
@@ -43,20 +44,20 @@ class FetchTask:
     target_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     object_height: float | None = None  # settled height of the object's centre, and of goals on the table; None: no object
     object_range: float = 0.15  # the object starts within this of the gripper, along x and along y
-    min_object_distance: float = 0.1  # but at least this far from it in the plane
+    min_object_distance: float = 0.1  # and at least this far from it in the plane
     max_goal_lift: float = 0.0  # half of all goals are lifted by up to this
-    finger_qvel: tuple[float, float] = (0.0, 0.0)  # settled, m/s, right and left; where there are fingers with joints
+    finger_qvel: tuple[float, float] = (0.0, 0.0)  # settled, m/s, right and left; for fingers with joints
 
 
 class FetchEnv(GoalEnv):
-    """The Fetch arm and, but for reaching, an object; the goal is a place for it (or for the gripper).
+    """The Fetch arm and, except for reaching, an object; the goal is a position of the object (or of the gripper).
 
     Args:
       engine: "auto", "native", "jax" or "warp".
       reward_type: "sparse" (0 where the goal is reached, else -1) or "dense" (minus the distance).
-      distance_threshold: how close, in m, counts as reached.
+      distance_threshold: distance, in m, below which the goal is reached.
       episode_length: steps of an episode.
-      **engine_options: handed to the engine; see `make_engine`.
+      **engine_options: options of the engine; see `make_engine`.
     """
 
     task: ClassVar[FetchTask]
@@ -85,7 +86,7 @@ class FetchEnv(GoalEnv):
         self.has_object = self.task.object_height is not None
         self.observation_size = 25 if self.has_object else 10
         self.arm = Chain(self.model, body="gripper", site="grip")
-        # Two finger joints, right and left. Where nothing drives them they are blocked: put back after every step.
+        # Two finger joints, right and left. Without actuators they are blocked: put back after every step.
         self.has_fingers = any(self.model.joint(i).name == "finger_r" for i in range(self.model.njnt))
         self.drives_fingers = self.model.nu > 0
         if self.has_fingers:
@@ -94,13 +95,13 @@ class FetchEnv(GoalEnv):
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
 
     def reset(self, key: PRNGKey) -> State:
-        """A start drawn as in the original: arm as it settled, object on the table near the gripper, random goal."""
+        """Draws a start as in the original: arm as it settled, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)
         object_qpos = self._sample_object(object_key) if self.has_object else None
         return self.init_state(object_qpos, self._sample_goal(goal_key))
 
     def init_state(self, object_qpos: Array | None, desired_goal: Array) -> State:
-        """A given start, as for replaying a recorded episode; the arm is where it always starts.
+        """Returns the state at a given start, such as that of a recorded episode; the arm starts as always.
 
         Args:
           object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
@@ -120,13 +121,13 @@ class FetchEnv(GoalEnv):
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
 
-        `action[3]` opens and closes the fingers where they are driven. Should the physics blow up (a value that is not finite,
-        or a speed out of all reason), the state goes back to a start, and `failed` stays True until `reset`.
+        `action[3]` opens and closes the fingers if actuators drive them. If the physics blows up (a value is not finite, or a
+        speed above its limit), the state goes back to a start, and `failed` stays True until `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be; and
         # the gripper is asked to turn half-way from where it points to straight down.
-        pos, quat = self.arm.pose(self._seen(state.physics).qpos[self.arm.qpos])
+        pos, quat = self.arm.pose(self._at_observation(state.physics).qpos[self.arm.qpos])
         quat = quat + POINTING_DOWN
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
         ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.drives_fingers else jnp.zeros(0)
@@ -136,7 +137,7 @@ class FetchEnv(GoalEnv):
         sound = self._is_sound(physics)
         physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._start(self._resting_place()))
         failed = state.failed | ~sound
-        obs = self._observe(self._seen(physics), state.obs["desired_goal"])
+        obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
         return State(
             physics=physics,
             obs=obs,
@@ -160,14 +161,14 @@ class FetchEnv(GoalEnv):
         return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
 
     def _resting_place(self) -> Array | None:
-        """[7] where the object is put after the physics has blown up: beside the gripper, as near as a reset would."""
+        """Returns the object's qpos [7] after the physics has blown up: beside the gripper, as near as a reset would put it."""
         if self.task.object_height is None:
             return None
         x, y, _ = self.task.initial_grip_pos
         return jnp.array([x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0])
 
     def _is_sound(self, physics: Physics) -> Array:
-        """[] whether this can be a state of the task. Comparisons with NaN are false, so NaN never passes."""
+        """Returns whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
         qpos, qvel = physics.qpos, physics.qvel
         sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
         sound &= jnp.all(jnp.abs(qvel[self.arm.qvel]) < MAX_JOINT_SPEED)
@@ -178,7 +179,7 @@ class FetchEnv(GoalEnv):
         return sound
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Sparse: 0 within `distance_threshold`, else -1. Dense: minus the distance, m. [..., 3], [..., 3] -> [...]."""
+        """Returns rewards: [..., 3], [..., 3] -> [...]. Sparse: 0 within the threshold, else -1. Dense: minus the distance."""
         distance = goal_distance(achieved_goal, desired_goal)
         return -distance if self.reward_type == "dense" else -(distance > self.distance_threshold).astype(jnp.float32)
 
@@ -187,17 +188,17 @@ class FetchEnv(GoalEnv):
         return (goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
     def _sample_object(self, key: PRNGKey) -> Array:
-        """[7] upright, uniform in the square around the gripper, but not within `min_object_distance` of it."""
+        """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` from it."""
         task = self.task
         offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), minval=-task.object_range, maxval=task.object_range)
         distance = jnp.linalg.norm(offsets, axis=-1)
-        # The first one far enough; were there none, the farthest.
+        # The first candidate that is far enough, or else the farthest.
         index = jnp.argmax(jnp.where(distance >= task.min_object_distance, jnp.inf, distance))
         xy = jnp.array(task.initial_grip_pos[:2]) + offsets[index]
         return jnp.concatenate([xy, jnp.array([task.object_height, 1.0, 0.0, 0.0, 0.0])])
 
     def _sample_goal(self, key: PRNGKey) -> Array:
-        """[3] uniform around the gripper plus the task's offset; with an object, at its height, or (half of them) above."""
+        """Draws a goal [3] around the gripper plus the task's offset; with an object, at its height or (half of them) above."""
         task = self.task
         # Scaled by `uniform`, whose result XLA rounds alike wherever it computes it: reset and first step give the same goal.
         largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift])
@@ -207,11 +208,11 @@ class FetchEnv(GoalEnv):
             return goal
         return goal.at[2].set(task.object_height + jnp.maximum(drawn[3], 0.0))
 
-    def _seen(self, physics: Physics) -> Physics:
-        """What the observation is made from after a step.
+    def _at_observation(self, physics: Physics) -> Physics:
+        """Returns the physics from which the observation after a step is computed.
 
-        Where fingers are driven, the original does not recompute positions after its last substep: gripper and object are seen
-        one substep (2 ms) late, while joint positions and all velocities are fresh.
+        If actuators drive the fingers, the original does not recompute positions after its last substep: gripper and object are
+        observed one substep (2 ms) late, while joint positions and all velocities are up to date.
         """
         if not self.drives_fingers:
             return physics
@@ -235,14 +236,14 @@ class FetchEnv(GoalEnv):
 
 
 def goal_distance(achieved_goal: Array, desired_goal: Array) -> Array:
-    """Euclidean distance, m: [..., G], [..., G] -> [...]."""
+    """Returns Euclidean distances, m: [..., G], [..., G] -> [...]."""
     return jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)
 
 
 def fetch_observation(
     grip_pos: Array, grip_vel: Array, object_qpos: Array, object_qvel: Array, finger_pos: Array, finger_vel: Array
 ) -> Array:
-    """The original's observation vector [25].
+    """Returns the original's observation vector [25].
 
     0-2 grip position, 3-5 object position, 6-8 object minus grip, 9-10 finger positions (right, left), 11-13 object Euler
     angles, 14-16 object velocity minus grip velocity, 17-19 object angular velocity (world axes), 20-22 grip velocity,
@@ -272,7 +273,7 @@ def fetch_observation(
 
 
 def quat_to_matrix(quat: Array) -> Array:
-    """Rotation matrix [3, 3] of a quaternion [4] (w, x, y, z) of any length but 0."""
+    """Returns the rotation matrix [3, 3] of a quaternion [4] (w, x, y, z) of any length except 0."""
     w, x, y, z = quat / jnp.linalg.norm(quat)
     return jnp.array(
         [
@@ -284,9 +285,9 @@ def quat_to_matrix(quat: Array) -> Array:
 
 
 def matrix_to_euler(matrix: Array) -> Array:
-    """Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
+    """Returns Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
 
-    Where b is a right angle, a and c turn about one axis; then a is 0, as in the original.
+    If b is a right angle, a and c turn about the same axis; then a is 0, as in the original.
     """
     cos_b = jnp.hypot(matrix[2, 2], matrix[1, 2])
     regular = cos_b > 4 * np.finfo(np.float32).eps
@@ -297,7 +298,7 @@ def matrix_to_euler(matrix: Array) -> Array:
 
 
 def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
-    """A free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
+    """Returns a free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
     half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
     x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
     turn = jnp.stack([jnp.cos(half_angle), x, y, z])
@@ -305,6 +306,6 @@ def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:
-    """Where `width` consecutive coordinates from `joint` on sit in qpos and in qvel (a free joint: 7 and 6)."""
+    """Returns the slices of qpos and qvel that hold `width` coordinates from `joint` on (7 and 6 for a free joint)."""
     qpos, qvel = int(model.joint(joint).qposadr[0]), int(model.joint(joint).dofadr[0])
     return slice(qpos, qpos + width), slice(qvel, qvel + (6 if width == 7 else width))

@@ -1,4 +1,4 @@
-"""Where the gripper is, as a function of the arm's joint angles."""
+"""Forward kinematics of the arm: pose and velocity of the gripper at given joint angles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mjx_dher.types import Array
 
 
 class Chain:
-    """The bodies from the world to `body`, of which each has a hinge or is fixed to its parent.
+    """Kinematic chain from the world to `body`, whose bodies each have a hinge or are fixed to their parent.
 
     Args:
       model: the compiled MJCF.
@@ -21,7 +21,7 @@ class Chain:
       site: a site on that body.
 
     Raises:
-      ValueError: a body on the way moves other than by one hinge through its origin.
+      ValueError: a body of the chain moves other than by one hinge through its origin.
     """
 
     def __init__(self, model: mujoco.MjModel, body: str, site: str):
@@ -42,7 +42,7 @@ class Chain:
         self.qpos = slice(int(model.jnt_qposadr[joints[0]]), int(model.jnt_qposadr[joints[0]]) + len(joints))
         self.qvel = slice(int(model.jnt_dofadr[joints[0]]), int(model.jnt_dofadr[joints[0]]) + len(joints))
 
-        # What no joint divides is a segment: S = J + 1 of them, each in the frame that the joint before it has turned.
+        # J joints divide the chain into S = J + 1 segments, each in the frame that the joint before it has turned.
         unit = np.array([1.0, 0.0, 0.0, 0.0])
         quat, offset = unit, np.zeros(3)
         offsets: list[np.ndarray] = []
@@ -69,23 +69,23 @@ class Chain:
         self._before = np.tri(len(joints) + 1, len(joints), -1, dtype=np.float32)  # [S, J] 1 where the joint turns the segment
 
     def pose(self, angles: Array) -> tuple[Array, Array]:
-        """Position [3], m, and orientation [4] (w, x, y, z) of the body at joint angles [J], rad."""
+        """Returns position [3], m, and orientation [4] (w, x, y, z) of the body at joint angles [J], rad."""
         quats = self._orientations(angles)
         pos = [jnp.sum(x) for x in _rotate(quats, self._to_body)]
         return jnp.stack(pos), jnp.sum(self._at_body * quats[-1][None], axis=-1)
 
     def site_motion(self, angles: Array, rates: Array) -> tuple[Array, Array]:
-        """Position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and their rates [J], rad/s."""
+        """Returns position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and rates [J], rad/s."""
         quats = self._orientations(angles)
         segments = _rotate(quats, self._to_site)
         axes = _rotate(quats[:-1], self._axes)
-        angular = [jnp.sum(self._before * (rates * x)[None], axis=-1) for x in axes]  # [S] each: of the segments
+        angular = [jnp.sum(self._before * (rates * x)[None], axis=-1) for x in axes]  # [S] each, rad/s of the segments
         return jnp.stack([jnp.sum(x) for x in segments]), jnp.stack([jnp.sum(x) for x in _cross(angular, segments)])
 
     def _orientations(self, angles: Array) -> Array:
-        """[S, 4] of the segments, in the world's frame.
+        """Returns the segments' orientations [S, 4] in the world's frame.
 
-        Sums, not dot products, here and elsewhere: on a GPU these would have the learner's precision.
+        Sums take the place of dot products here and elsewhere, because these would have the learner's precision on a GPU.
         """
         half = 0.5 * angles[:, None, None]
         steps = jnp.cos(half) * self._still + jnp.sin(half) * self._turned  # [J, 4, 4]
@@ -95,12 +95,12 @@ class Chain:
         return jnp.stack(quats)
 
 
-# Vectors coordinate by coordinate: a compiler has less work with these than with arrays that are taken apart and put together.
+# Separate coordinates, because they compile faster than arrays that are split and stacked again.
 _Vectors = Sequence[Array]  # x, y and z, each [S]
 
 
 def _rotate(quats: Array, vectors: np.ndarray) -> _Vectors:
-    """`vectors` [S, 3] turned by the unit quaternions `quats` [S, 4] (w, x, y, z)."""
+    """Returns `vectors` [S, 3] turned by the unit quaternions `quats` [S, 4] (w, x, y, z)."""
     w, *axis = (quats[:, index] for index in range(4))
     vector = list(vectors.T)
     twice = [2 * x for x in _cross(axis, vector)]
@@ -112,13 +112,13 @@ def _cross(a: _Vectors, b: _Vectors) -> _Vectors:
 
 
 def _rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """`vector` [3] turned by the unit quaternion `quat` [4] (w, x, y, z): q v q*."""
+    """Returns `vector` [3] turned by the unit quaternion `quat` [4] (w, x, y, z): q v q*."""
     conjugate = quat * np.array([1.0, -1.0, -1.0, -1.0])
     return (_right(conjugate) @ _right(np.array([0.0, *vector])) @ quat)[1:]
 
 
 def _right(quat: np.ndarray) -> np.ndarray:
-    """[4, 4] such that `_right(q) @ p` is the product p q of quaternions (w, x, y, z)."""
+    """Returns a matrix [4, 4] such that `_right(q) @ p` is the product p q of quaternions (w, x, y, z)."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
@@ -128,7 +128,7 @@ def _float32(values: Any) -> np.ndarray:
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
-    """The rotation b followed by a, as quaternions [4] (w, x, y, z)."""
+    """Returns the rotation b followed by a, as quaternions [4] (w, x, y, z)."""
     # A sum, not a dot product, whose precision on a GPU would be the learner's.
     w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])

@@ -1,4 +1,4 @@
-"""Grasp a cube and bring it to a goal on the table or in the air (FetchPickAndPlace-v4)."""
+"""Task of grasping a cube and bringing it to a goal on the table or in the air (FetchPickAndPlace-v4)."""
 
 from __future__ import annotations
 

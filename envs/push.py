@@ -1,4 +1,4 @@
-"""Push a cube to a goal on the table, with the fingers closed (FetchPush-v4)."""
+"""Task of pushing a cube to a goal on the table, with the fingers closed (FetchPush-v4)."""
 
 from __future__ import annotations
 

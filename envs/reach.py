@@ -1,4 +1,4 @@
-"""Reach a point in the air with the gripper (FetchReach-v4)."""
+"""Task of reaching a point in the air with the gripper (FetchReach-v4)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class Reach(FetchEnv):
-    """FetchReach: the goal is a place for the grip point, up to 15 cm away along each axis; observation [10]."""
+    """FetchReach: the goal is a position of the grip point, up to 15 cm away along each axis; observation [10]."""
 
     name = "reach"
     task = FetchTask(

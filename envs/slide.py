@@ -1,4 +1,4 @@
-"""Hit a puck so that it slides to a goal out of the arm's reach (FetchSlide-v4)."""
+"""Task of hitting a puck so that it slides to a goal out of the arm's reach (FetchSlide-v4)."""
 
 from __future__ import annotations
 

@@ -19,27 +19,49 @@ if not os.path.isdir(os.path.join(_checkout, "mjx_dher", "envs")) and os.path.is
     __path__.append(_checkout)
 
 if TYPE_CHECKING:
-    from mjx_dher import config, envs, normalizer, presets, relabel, replay, rollout, samplers, stats, testing, trainer
+    from mjx_dher import (
+        config,
+        envs,
+        learners,
+        normalizer,
+        presets,
+        priorities,
+        relabel,
+        replay,
+        rollout,
+        samplers,
+        stats,
+        testing,
+        trainer,
+    )
     from mjx_dher.config import Config, HParams
     from mjx_dher.learners import ddpg
     from mjx_dher.policy import Policy
     from mjx_dher.presets import preset
+    from mjx_dher.runs.driver import train_runs
     from mjx_dher.runs.load import load_policy
-    from mjx_dher.trainer import TrainState, make_train, train
+    from mjx_dher.runs.loop import train
+    from mjx_dher.runs.options import Options
+    from mjx_dher.spec import RunSpec
+    from mjx_dher.trainer import TrainState, make_train
 
 __all__ = [
     "Config",
     "HParams",
+    "Options",
     "Policy",
+    "RunSpec",
     "TrainState",
     "config",
     "ddpg",
     "envs",
+    "learners",
     "load_policy",
     "make_train",
     "normalizer",
     "preset",
     "presets",
+    "priorities",
     "relabel",
     "replay",
     "rollout",
@@ -47,6 +69,7 @@ __all__ = [
     "stats",
     "testing",
     "train",
+    "train_runs",
     "trainer",
 ]
 
@@ -54,13 +77,16 @@ __all__ = [
 _HOME = {
     "Config": "config",
     "HParams": "config",
+    "Options": "runs.options",
     "Policy": "policy",
+    "RunSpec": "spec",
     "TrainState": "trainer",
     "ddpg": "learners.ddpg",
     "load_policy": "runs.load",
     "make_train": "trainer",
     "preset": "presets",
-    "train": "trainer",
+    "train": "runs.loop",
+    "train_runs": "runs.driver",
 }
 
 

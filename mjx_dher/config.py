@@ -1,197 +1,217 @@
-"""What a training run is made of: `Config` (static) and `HParams` (traced), the presets, and all validation.
+"""`Config` (static: shapes of the compiled program) and `HParams` (traced: the algorithm's numbers), and their validation.
 
-This module loads neither JAX nor MuJoCo (but for one question, `machine_preset`), so that a wrong argument is refused before
-either has been loaded.
+A number's range, its help text and which samplers read it stand beside its field. This module loads neither JAX nor MuJoCo,
+so that a wrong argument is refused before either has been loaded.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import sys
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from mjx_dher.names import check_name, is_own
+from mjx_dher.names import check_name
 
-ENGINES = ("auto", "native", "jax", "warp")
-SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
-WEIGHT_KERNELS = ("linear", "inverse", "softmax")
-METRICS = ("position",)
-DTYPES = ("float32", "bfloat16")
-LEARNER_KERNELS = ("auto", "xla", "hopper")
+INT32_MAX = 2**31 - 1  # counters on the device are int32
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """Metadata of a field: the interval of its values, such as "[0, 1)"."""
+
+    interval: str
+
+    def contains(self, value: float) -> bool:
+        """Returns whether `value` lies in the interval; NaN does not."""
+        low, high = map(float, self.interval[1:-1].split(","))
+        above = value >= low if self.interval[0] == "[" else value > low
+        return above and (value <= high if self.interval[-1] == "]" else value < high)
+
+
+class ReadBy(tuple[str, ...]):
+    """Metadata of a field: the built-in samplers that read it. A field without it is read by every run."""
+
+    def __new__(cls, *samplers: str) -> ReadBy:
+        """Makes the tuple of `samplers`."""
+        return super().__new__(cls, samplers)
+
+
+Count = Annotated[int, Number("[1, 1000000]")]
+Share = Annotated[float, Number("[0, 1]")]
+Positive = Annotated[float, Number("(0, inf)")]
+NotNegative = Annotated[float, Number("[0, inf)")]
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that shapes the compiled program. Two runs with equal Configs share one compilation.
+    """Sizes that shape the compiled program. Two runs with equal Configs can share one compilation.
 
     A cycle rolls out `num_envs` whole episodes, adds them to the replay ring and makes `updates_per_cycle` updates; an
     epoch is `cycles_per_epoch` cycles and an evaluation.
     """
 
-    env: str = "push"
-    """Environment: a name from `envs.list_envs()`, or one of your own as module:attribute."""
-    sampler: str = "future"
-    """How hindsight goals are chosen: random, episode, future, final, closest, epsilon_closest or weighted, or
-    module:attribute."""
-    weight_kernel: str = "linear"
-    """For the weighted sampler, how weights fall with distance: linear, inverse or softmax."""
-    metric: str = "position"
-    """The distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by."""
-    engine: str = "auto"
-    """Physics: native (MuJoCo C on all cores), warp (MuJoCo Warp on an NVIDIA GPU), jax (MJX) or auto, which picks."""
-    num_envs: int = 16
+    num_envs: Count = 16
     """Environments in parallel, and episodes a cycle."""
-    cycles_per_epoch: int = 50
+    cycles_per_epoch: Count = 50
     """Cycles an epoch."""
-    updates_per_cycle: int = 40
-    """Gradient steps, of critic and actor both, a cycle."""
-    target_period: int = 40
+    updates_per_cycle: Count = 40
+    """Gradient steps a cycle, of critic and actor both."""
+    target_period: Count = 40
     """Gradient steps from one soft update of the targets to the next; divides updates_per_cycle."""
-    batch_size: int = 256
+    batch_size: Annotated[int, Number("[1, 10000000]")] = 256
     """Transitions a gradient step."""
-    total_steps: int = 1_000_000
+    total_steps: Annotated[int, Number("[1, 2000000000]")] = 1_000_000
     """Environment steps of the whole run, rounded up to whole epochs."""
-    replay_size: int = 1_000_000
-    """Transitions that the replay ring holds."""
-    hidden_sizes: tuple[int, ...] = (256, 256, 256)
+    replay_size: Annotated[int, Number("[1, 10000000000]")] = 1_000_000
+    """Transitions that the replay ring (the buffer) holds."""
+    hidden_sizes: Annotated[tuple[int, ...], Number("[1, 65536]")] = (256, 256, 256)
     """Units of the hidden layers, of actor and critic both."""
-    learner_dtype: str = "float32"
-    """Of the hidden layers while learning: float32, or bfloat16, which is faster on a GPU with large batches or many runs side
-    by side. Parameters, and the policy that plays, are float32 with either."""
-    learner_kernels: str = "auto"
-    """What computes the gradients: xla, hopper (this library's kernels for an NVIDIA H100 or H200, for bfloat16) or auto, which
-    takes hopper wherever it can."""
-    eval_episodes: int = 100
+    learner_dtype: Literal["float32", "bfloat16"] = "float32"
+    """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many runs side by side.
+    Parameters, and the policy that plays, are float32 with either."""
+    learner_kernels: Literal["auto", "xla", "hopper"] = "auto"
+    """Implementation of the gradients: xla, hopper (this library's kernels for an NVIDIA H100 or H200, for bfloat16) or auto,
+    which takes hopper wherever it can."""
+    eval_episodes: Count = 100
     """Episodes of the deterministic evaluation that ends each epoch."""
 
 
 class HParams(NamedTuple):
-    """Every number of the algorithm: a pytree, traced, so that a sweep over numbers compiles once.
+    """Numbers of the algorithm: a pytree, traced, so that a sweep over numbers compiles once.
 
     The defaults are those of the original HER code line (Plappert et al. 2018, arXiv 1802.09464) and of the paper.
     """
 
-    actor_lr: float = 1e-3
-    """Adam's step size for the actor."""
-    critic_lr: float = 1e-3
-    """Adam's step size for the critic."""
-    lr_end: float = 1.0
-    """Share of both step sizes that is left at the end of the run, reached linearly; 1 (constant) in the paper."""
-    gamma: float = 0.98
+    actor_lr: Share = 1e-3
+    """Adam's step size (learning rate) for the actor."""
+    critic_lr: Share = 1e-3
+    """Adam's step size (learning rate) for the critic."""
+    lr_end: Share = 1.0
+    """Fraction of both step sizes that is left at the end of the run, reached linearly; 1 (constant) in the paper."""
+    gamma: Annotated[float, Number("[0, 1)")] = 0.98
     """Discount; target values are clipped to [-1/(1-gamma), 0]."""
-    polyak: float = 0.95
-    """Share of the old target that a soft update keeps."""
-    action_l2: float = 1.0
+    polyak: Share = 0.95
+    """Fraction of the old target that a soft update keeps: 1 - tau, where others write tau."""
+    action_l2: NotNegative = 1.0
     """Weight of the mean squared action in the actor's loss."""
-    random_eps: float = 0.3
+    random_eps: Share = 0.3
     """Probability of a uniformly random action while exploring."""
-    noise_std: float = 0.2
+    noise_std: NotNegative = 0.2
     """Standard deviation of the Gaussian noise on the other actions."""
-    her_k: float = 4.0
+    her_k: NotNegative = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
-    eventful_share: float = 0.0
-    """Share of each batch drawn from episodes that moved the achieved goal out of reach of where it was; 0 in the paper."""
-    epsilon: float = 0.2
-    """For epsilon_closest: probability of a uniform future goal instead of the closest."""
-    temperature: float = 1.0
-    """For weighted: the larger, the more even the weights (infinite: the same as future)."""
-    obs_clip: float = 200.0
-    """Observations and goals are clipped to +- this before they are normalized."""
-    norm_clip: float = 5.0
-    """Normalized observations and goals are clipped to +- this."""
-    norm_eps: float = 0.01
+    priority_fraction: Share = 0.0
+    """Fraction of each batch drawn from episodes in proportion to their priority; the rest is uniform. 0 in the paper."""
+    epsilon: Annotated[float, Number("[0, 1]"), ReadBy("epsilon_closest")] = 0.2
+    """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
+    temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0
+    """Evenness of the weights, for weighted: the larger, the more even (infinite: the same as future)."""
+    obs_clip: Positive = 200.0
+    """Bound of observations and goals: they are clipped to +- this before they are normalized."""
+    norm_clip: Positive = 5.0
+    """Bound of normalized observations and goals: they are clipped to +- this."""
+    norm_eps: Positive = 0.01
     """Least standard deviation that the normalizers divide by."""
 
 
+Metadata = TypeVar("Metadata")
+
+
+def metadata(owner: Any, kind: type[Metadata]) -> dict[str, Metadata]:
+    """Returns what is declared of `kind` beside the fields of `owner`, by field name."""
+    hints = get_type_hints(owner, include_extras=True)
+    return {name: m for name, hint in hints.items() for m in getattr(hint, "__metadata__", ()) if isinstance(m, kind)}
+
+
 def episodes_capacity(config: Config, episode_length: int) -> int:
-    """Whole episodes that the replay ring holds."""
+    """Returns the whole episodes that the replay ring holds."""
     return config.replay_size // episode_length
 
 
 def steps_per_epoch(config: Config, episode_length: int) -> int:
-    """Environment steps an epoch, evaluation not counted."""
+    """Returns the environment steps of an epoch, evaluation not counted."""
     return config.num_envs * config.cycles_per_epoch * episode_length
 
 
 def num_epochs(config: Config, episode_length: int) -> int:
-    """Whole epochs that `total_steps` takes."""
+    """Returns the whole epochs that `total_steps` takes."""
     return math.ceil(config.total_steps / steps_per_epoch(config, episode_length))
 
 
-def check_count(field: str, value: int) -> None:
-    """Refuses what is no number of things.
+def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
+    """Refuses what is not a number of `kind` (int or float) in `interval`.
 
     Raises:
-      ValueError: less than 1.
+      ValueError: names the field, the interval and the value.
     """
-    if not _is_count(value):
-        raise ValueError(f"{field} must be an integer of at least 1; got {value}")
+    if problem := _number_problem(field, value, Number(interval), kind):
+        raise ValueError(problem)
 
 
-def check_every(field: str, value: int) -> None:
-    """Refuses what is no interval of epochs.
+def check_count(field: str, value: Any) -> None:
+    """Refuses what is not an integer of at least 1 (and at most a million).
 
     Raises:
-      ValueError: less than 0.
+      ValueError: names the field, the interval and the value.
     """
-    if value < 0:
-        raise ValueError(f"{field} must be a number of epochs, or 0; got {value}")
+    check_number(field, value, "[1, 1000000]")
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+def validate(config: Config, hparams: HParams, episode_length: int) -> None:
+    """Refuses what cannot run in an environment whose episodes have `episode_length` steps.
 
-
-def validate(config: Config, hparams: HParams, episode_length: int | None = None) -> None:
-    """Refuses what cannot run.
-
-    Args:
-      config: shapes and choices.
-      hparams: numbers; arrays among them are not looked at.
-      episode_length: of the environment, where it is known. None: that of the tasks here, and of an environment of the user's
-        own nothing is assumed.
+    Arrays among `hparams` are not looked at: they are one value a seed, made by a program.
 
     Raises:
       ValueError: names every field at fault, its value and what is allowed.
     """
-    if episode_length is None:
-        episode_length = 1 if is_own(config.env) else 50
-    problems = [*_config_problems(config, episode_length), *_hparam_problems(hparams)]
+    problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
+    problems += _field_problems(hparams)
     if problems:
         raise ValueError("\n".join(problems))
 
 
-def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
-    for field, value, allowed in (
-        ("sampler", c.sampler, sampler_names()),
-        ("weight_kernel", c.weight_kernel, WEIGHT_KERNELS),
-        ("metric", c.metric, metric_names()),
-        ("engine", c.engine, ENGINES),
-        ("learner_dtype", c.learner_dtype, DTYPES),
-        ("learner_kernels", c.learner_kernels, LEARNER_KERNELS),
-    ):
-        try:
-            check_name(field, value, allowed, own=field == "sampler")
-        except ValueError as error:
-            yield str(error)
-    positive = ("num_envs", "cycles_per_epoch", "updates_per_cycle", "target_period", "batch_size", "total_steps")
-    wrong = False
-    for field in (*positive, "replay_size", "eval_episodes"):
-        value = getattr(c, field)
-        if not _is_count(value):
-            wrong = True
-            yield f"{field} must be an integer of at least 1; got {value!r}"
-    sizes = c.hidden_sizes
-    if not (isinstance(sizes, tuple) and sizes and all(map(_is_count, sizes))):
-        yield f"hidden_sizes must be one or more integers of at least 1; got {sizes!r}"
-    if wrong:
-        return
+def choice_problems(spec: Any) -> Iterator[str]:
+    """Yields what is wrong with the fields of a dataclass that take one of a closed set of names (`Literal`)."""
+    for name, hint in get_type_hints(type(spec)).items():
+        if get_origin(hint) is Literal:
+            try:
+                check_name(name, getattr(spec, name), get_args(hint))
+            except ValueError as error:
+                yield str(error)
+
+
+def _field_problems(settings: Config | HParams) -> Iterator[str]:
+    """Yields what is wrong with single fields."""
+    hints = get_type_hints(type(settings))
+    for name, number in metadata(type(settings), Number).items():
+        value = getattr(settings, name)
+        if name == "hidden_sizes":
+            if not (isinstance(value, tuple) and 1 <= len(value) <= 100):
+                yield f"{name} must be 1 to 100 integers in {number.interval}; got {value!r}"
+            else:
+                yield from filter(None, (_number_problem(name, size, number, int) for size in value))
+        elif not hasattr(value, "dtype") and (problem := _number_problem(name, value, number, hints[name])):
+            yield problem
+    yield from choice_problems(settings)
+
+
+def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
+    allowed = (int,) if kind is int else (int, float)
+    if isinstance(value, bool) or not isinstance(value, allowed):
+        what = "an integer" if kind is int else "a number"
+        return f"{field} must be {what} in {number.interval}; got {value!r}"
+    return None if number.contains(value) else f"{field} must lie in {number.interval}; got {value!r}"
+
+
+def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
+    """Yields what is wrong with sizes that depend on one another."""
     if c.updates_per_cycle % c.target_period:
+        divisors = [str(n) for n in range(1, c.updates_per_cycle + 1) if c.updates_per_cycle % n == 0]
         yield (
             f"target_period must divide updates_per_cycle ({c.updates_per_cycle}); got {c.target_period},"
-            f" allowed: {', '.join(str(n) for n in range(1, c.updates_per_cycle + 1) if c.updates_per_cycle % n == 0)}"
+            f" allowed: {', '.join(divisors)}"
         )
     cycle = c.num_envs * episode_length
     if c.replay_size < cycle:
@@ -201,50 +221,10 @@ def _config_problems(c: Config, episode_length: int) -> Iterable[str]:
         )
     if c.batch_size > c.replay_size:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
-
-
-def sampler_names() -> tuple[str, ...]:
-    """The samplers known so far: users can have registered more only once the module has been imported."""
-    module = sys.modules.get("mjx_dher.samplers")
-    return module.list_samplers() if module else SAMPLERS
-
-
-def metric_names() -> tuple[str, ...]:
-    """The metrics known so far; see `sampler_names`."""
-    module = sys.modules.get("mjx_dher.samplers")
-    return tuple(module.METRICS) if module else METRICS
-
-
-# field -> (least value, may it be least, greatest value, may it be greatest)
-_HPARAM_RANGES: dict[str, tuple[float, bool, float, bool]] = {
-    "actor_lr": (0, True, 1, True),
-    "critic_lr": (0, True, 1, True),
-    "lr_end": (0, True, 1, True),
-    "gamma": (0, True, 1, False),
-    "polyak": (0, True, 1, True),
-    "action_l2": (0, True, math.inf, False),
-    "random_eps": (0, True, 1, True),
-    "noise_std": (0, True, math.inf, False),
-    "her_k": (0, True, math.inf, False),
-    "eventful_share": (0, True, 1, True),
-    "epsilon": (0, True, 1, True),
-    "temperature": (0, False, math.inf, False),
-    "obs_clip": (0, False, math.inf, False),
-    "norm_clip": (0, False, math.inf, False),
-    "norm_eps": (0, False, math.inf, False),
-}
-
-
-def _hparam_problems(hparams: HParams) -> Iterable[str]:
-    for field, (least, least_too, greatest, greatest_too) in _HPARAM_RANGES.items():
-        value = getattr(hparams, field)
-        if hasattr(value, "dtype"):
-            continue  # an array: one value a seed, made by a program
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            yield f"{field} must be a number; got {value!r}"
-            continue
-        above = value >= least if least_too else value > least
-        below = value <= greatest if greatest_too else value < greatest
-        if not (above and below):
-            brackets = "[("[not least_too], "])"[not greatest_too]
-            yield f"{field} must lie in {brackets[0]}{least:g}, {greatest:g}{brackets[1]}; got {value!r}"
+    epochs = num_epochs(c, episode_length)
+    for field, count in (
+        ("total_steps", epochs * steps_per_epoch(c, episode_length)),
+        ("updates_per_cycle", epochs * c.cycles_per_epoch * c.updates_per_cycle),
+    ):
+        if count > INT32_MAX:
+            yield f"{field} must not make a run of more than {INT32_MAX} steps or updates; got {count} in {epochs} epochs"

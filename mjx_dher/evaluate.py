@@ -1,4 +1,4 @@
-"""How good is a policy without exploration?"""
+"""Evaluation of a policy without exploration."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mjx_dher.types import Array, Env, GoalObs, PRNGKey
 
 
 def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
-    """The outcomes [num_episodes] of a deterministic policy; `act` takes observations that lead with [num_episodes]."""
+    """Plays a deterministic policy: `act` takes observations that lead with [num_episodes]. Returns the outcomes."""
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
 def summary(outcome: Outcome) -> dict[str, Array]:
-    """Means over the episodes; all []. An episode that is not valid counts as a failure and has no return."""
+    """Returns means over the episodes; all []. An episode that is not valid counts as a failure and has no return."""
     return {
         "success_rate": jnp.mean(outcome.success),
         "reset_success_rate": jnp.mean(outcome.reset_success),
@@ -25,6 +25,6 @@ def summary(outcome: Outcome) -> dict[str, Array]:
 
 
 def return_mean(outcome: Outcome) -> Array:
-    """[] mean return of the valid episodes; 0 where there is none."""
+    """Returns the mean return [] of the valid episodes; 0 where there is none."""
     count = jnp.sum(outcome.valid, dtype=outcome.ret.dtype)
     return jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)) / jnp.maximum(count, 1.0)

@@ -1,8 +1,8 @@
-"""The tasks as gymnasium environments: one through `gymnasium.make`, many at once through `gymnasium.make_vec`.
+"""Gymnasium environments of the tasks: single ones by `gymnasium.make`, vectorised ones by `gymnasium.make_vec`.
 
     gymnasium.make("mjx_dher.gym:mjx_dher/FetchPush-v0")
 
-Importing this module registers them and loads neither JAX nor MuJoCo; making one does.
+Importing this module registers them. It loads neither JAX nor MuJoCo; making an environment does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from mjx_dher import envs
 from mjx_dher.config import check_count
-from mjx_dher.names import check_name
+from mjx_dher.names import check_name, missing_extra
 from mjx_dher.tools import render
 
 try:
@@ -27,9 +27,7 @@ try:
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise ImportError(
-        f'mjx_dher.gym needs gymnasium 1.1 or newer, which the extra "gym" installs: pip install "mjx-dher[gym]" ({error})'
-    ) from error
+    raise ImportError(f"{missing_extra('mjx_dher.gym', 'gymnasium 1.1 or newer', 'gym')} ({error})") from error
 
 if TYPE_CHECKING:
     from mjx_dher.envs import GoalEnv, State
@@ -42,35 +40,35 @@ IDS = {
     "mjx_dher/FetchSlide-v0": "slide",
     "mjx_dher/FetchReach-v0": "reach",
 }
-HORIZON = 50  # steps; what the tasks' episode_length is by default, which cannot be asked for without loading them
-PICTURE = 480  # pixels, width and height
+HORIZON = 50  # steps; the tasks' default episode_length, which cannot be read without loading JAX
+PICTURE = 480  # width and height of a picture, pixels
 
 Obs = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Compiled:
-    """An environment and its functions, compiled when they are first called."""
+    """An environment and its functions, each compiled at its first call."""
 
     env: GoalEnv
     reset: Callable[[Any], State]  # seed [] -> state
     step: Callable[[State, np.ndarray], State]  # state, action [A] -> state
-    reset_all: Callable[[Any], State]  # seeds [N] -> states that lead with [N]
+    reset_all: Callable[[Any], State]  # seeds [N] -> states [N, ...]
     step_all: Callable[[State, np.ndarray], State]  # states, actions [N, A] -> states
     reward: Callable[[np.ndarray, np.ndarray], Any]  # achieved [M, G], desired [M, G] -> [M]
 
 
 def _compiled(name: str, options: dict[str, Any]) -> _Compiled:
-    """The functions that all instances of an environment share: `name` and `options` as `envs.make` takes them.
+    """Returns the functions that all instances of an environment share; arguments as for `envs.make`.
 
     Raises:
-      ValueError: as `envs.make`, or an option that gymnasium has another name for.
+      ValueError: as for `envs.make`, or an option has another name in gymnasium.
     """
     if "episode_length" in options:
         raise ValueError("episode_length is called max_episode_steps in gymnasium.make and gymnasium.make_vec")
     from mjx_dher.envs.engines import resolve_engine
 
-    engine = resolve_engine(options.get("engine", "auto"))  # auto shares what is compiled for the one it stands for
+    engine = resolve_engine(options.get("engine", "auto"))  # so that auto shares the programs of the engine it stands for
     return _compile(name, tuple(sorted({**options, "engine": engine}.items())))
 
 
@@ -94,35 +92,35 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> _Compiled:
 
 
 def episode_seed(np_random: np.random.Generator) -> int:
-    """Draws the seed of the next episode: that of the pure environment from `jax.random.key(seed)`."""
+    """Draws the seed of the next episode, which is the pure environment's from `jax.random.key(seed)`."""
     return int(np_random.integers(2**31))
 
 
 class _GoalApi:
-    """What gymnasium-robotics' goal environments have beside `reset` and `step`; the same for one and for many."""
+    """Methods of gymnasium-robotics' goal environments other than `reset` and `step`, for single and vectorised ones."""
 
     _compiled: _Compiled
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """The rewards [...] float32 for `achieved_goal` [..., G] under `desired_goal` [..., G]; `info` is not looked at.
+        """Computes the rewards [...] float32 for `achieved_goal` [..., G] and `desired_goal` [..., G]; ignores `info`.
 
         Raises:
-          ValueError: the goals are not of size G, or do not fit together.
+          ValueError: the goals do not end in an axis of G, or their shapes cannot be broadcast.
         """
         achieved, desired = self._goals(achieved_goal, desired_goal)
         flat = achieved.reshape(-1, achieved.shape[-1]), desired.reshape(-1, desired.shape[-1])
-        # Each number of goals would be compiled for anew: so up to a power of two, as a learner's may be different every time.
+        # Padded to a power of two: a learner may ask for another number of goals each time, and each would be compiled anew.
         num_goals = len(flat[0])
         padding = ((0, (1 << max(num_goals - 1, 0).bit_length()) - num_goals), (0, 0))
         rewards = np.array(self._compiled.reward(*(np.pad(goals, padding) for goals in flat)))
         return rewards[:num_goals].reshape(achieved.shape[:-1])[()]
 
     def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """[...] False: an episode goes on when its goal is reached. Arguments as in `compute_reward`."""
+        """Returns [...] False: an episode continues when its goal is reached. Arguments as in `compute_reward`."""
         return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """[...] False: that an episode ends after so many steps depends on no goal. Arguments as in `compute_reward`."""
+        """Returns [...] False: truncation depends on the number of steps, not on goals. Arguments as in `compute_reward`."""
         return self.compute_terminated(achieved_goal, desired_goal, info)
 
     def _goals(self, achieved_goal: Any, desired_goal: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -136,9 +134,9 @@ class _GoalApi:
 
 
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
-    """One environment. It ends no episode by itself: `gymnasium.make` puts a `TimeLimit` of `max_episode_steps` around it.
+    """A single environment. It never ends an episode: `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
 
-    Observations are float32, which is what the state is kept in; actions outside [-1, 1] are clipped.
+    Observations are float32, as the state is. Actions outside [-1, 1] are clipped.
 
     Args:
       name: one of `envs.list_envs()`.
@@ -146,7 +144,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
       **options: arguments of `envs.make`: `engine`, `reward_type`, ...
 
     Raises:
-      ValueError: as `envs.make`; or the environment cannot be drawn, here or at all.
+      ValueError: as for `envs.make`, or the environment cannot be drawn, at all or on this machine.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": render.FPS}  # noqa: RUF012 - gymnasium's
@@ -156,102 +154,96 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
             check_name("render_mode", render_mode, ("rgb_array",))
             render.choose_gl()
         self._compiled = _compiled(name, options)
-        env = self._compiled.env
         if render_mode is not None:
-            render.check_drawable(env)
+            render.check_drawable(self._compiled.env)
         self.render_mode = render_mode
-        self.observation_space, self.action_space = _spaces(env)
+        self.observation_space, self.action_space = _spaces(self._compiled.env)
         self._state: Any = None
-        self._qpos: deque[np.ndarray] = deque()  # what the next picture is of
-        self._pictures: Generator[np.ndarray] | None = None  # of this episode
+        self._qpos: deque[np.ndarray] = deque()  # configurations to be drawn
+        self._pictures: Generator[np.ndarray] | None = None  # renderer of this episode
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """The first observation of a new episode, and whether its goal is reached already (`is_success`) as info.
+        """Starts an episode; returns its first observation and info, with `is_success` as in `step`.
 
         Raises:
-          ValueError: `options` holds something; or the episodes so far were not what they should be, see `GoalEnv.check`.
+          ValueError: `options` is not empty, or `GoalEnv.check` found a fault in the episodes so far.
         """
         _check_options(options)
         super().reset(seed=seed)
         self._compiled.env.check()
         self.close()
         self._state = self._compiled.reset(episode_seed(self.np_random))
-        obs, _, info = _seen(self._state)
+        obs, _, info = _to_numpy(self._state)
         return obs, {key: value.item() for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """The next observation, reward, False, False, and as info `is_success` (1.0 or 0.0) and `failed`.
+        """Returns the next observation, the reward, False, False, and info: `is_success` (1.0 or 0.0) and `failed`.
 
-        `failed` is True from where the physics blew up to the end of the episode, which is then not to be learned from.
+        `failed` is True from the step at which the simulation diverged to the end of the episode; do not learn from these.
 
         Raises:
-          ValueError: `action` is not of shape [A], or holds a value that is not finite.
-          gymnasium.error.ResetNeeded: there was no reset yet.
+          ValueError: `action` is not of shape [A], or is not finite.
+          gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         action = _checked(action, self.action_space, self._state)
         self._state = self._compiled.step(self._state, action)
-        obs, reward, info = _seen(self._state)
+        obs, reward, info = _to_numpy(self._state)
         return obs, reward.item(), False, False, {key: value.item() for key, value in info.items()}
 
     def render(self) -> np.ndarray:
-        """A picture [480, 480, 3] uint8 of the state, with the goal as a red ball.
+        """Draws a picture [480, 480, 3] uint8 of the state, with the goal as a red ball.
 
         Raises:
           ValueError: the environment was made without render_mode="rgb_array".
-          gymnasium.error.ResetNeeded: there was no reset yet.
+          gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self.render_mode is None:
             raise ValueError('to be drawn, an environment must be made with render_mode="rgb_array"')
         if self._state is None:
             raise gymnasium.error.ResetNeeded("reset must be called before render")
         if self._pictures is None:
-            # One renderer an episode: opening it takes longer than drawing a picture.
+            # One renderer per episode: opening it takes longer than drawing a picture.
             env: Any = self._compiled.env  # Any: a GoalEnv need not have a model
             goal, qpos = np.asarray(self._state.obs["desired_goal"]), self._qpos
-            shown = (qpos.popleft() for _ in itertools.count())
-            self._pictures = render.draw(env.model, shown, goal, PICTURE, PICTURE)
+            configurations = (qpos.popleft() for _ in itertools.count())
+            self._pictures = render.draw(env.model, configurations, goal, PICTURE, PICTURE)
         self._qpos.append(np.asarray(self._state.physics.qpos))
         return next(self._pictures)
 
     def close(self) -> None:
-        """Lets go of what draws; an environment that draws must be closed before the program ends."""
+        """Closes the renderer. An environment with a render mode must be closed before the program ends."""
         if self._pictures is not None:
             self._pictures.close()
             self._pictures = None
 
 
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):
-    """Many copies of one environment, stepped by one compiled program.
+    """A vectorised environment: N copies of one environment, stepped by one compiled program.
 
-    They start and end together: the step after an episode's last one resets all of them and takes no notice of its actions
-    (`AutoresetMode.NEXT_STEP`). Copy i does what a single environment with seed + i does, up to rounding.
+    All copies start and end together. The step after an episode's last one resets all of them and ignores its actions
+    (`AutoresetMode.NEXT_STEP`). Copy i does the same as a single environment with seed + i, up to rounding.
 
     Args:
       name: one of `envs.list_envs()`.
-      num_envs: copies, N.
-      max_episode_steps: of an episode; None takes the environment's `episode_length`.
-      render_mode: None; many are not drawn.
+      num_envs: number of copies, N.
+      max_episode_steps: length of an episode; None means the environment's `episode_length`.
+      render_mode: must be None; vectorised environments are not drawn.
       **options: arguments of `envs.make`: `engine`, `reward_type`, ...
 
     Raises:
-      ValueError: as `envs.make`; a number less than 1; a `render_mode`.
+      ValueError: as for `envs.make`; a number is less than 1; or `render_mode` is not None.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's
-    _np_random: Any  # [N] generators, which the properties without the underscore then give, as those of `SyncVectorEnv` do
+    _np_random: Any  # [N] generators; the properties without the underscore return both, as those of `SyncVectorEnv` do
     _np_random_seed: Any  # [N]
 
     def __init__(
-        self,
-        name: str,
-        num_envs: int = 1,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
+        self, name: str, num_envs: int = 1, max_episode_steps: int | None = None, render_mode: str | None = None, **options: Any
     ):
         check_count("num_envs", num_envs)
         if render_mode is not None:
-            raise ValueError(f"many environments at once are not drawn; render_mode must be None, got {render_mode!r}")
+            raise ValueError(f"render_mode must be None, because many environments at once are not drawn; got {render_mode!r}")
         self._compiled = _compiled(name, options)
         env = self._compiled.env
         self.num_envs = num_envs
@@ -262,19 +254,19 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._np_random, self._np_random_seed = zip(*(seeding.np_random() for _ in range(num_envs)))
         self._states: Any = None
-        self._steps = 0  # of this episode
+        self._steps = 0  # number of steps in this episode
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """The first observations of new episodes, and infos as those of `GymEnv`, in arrays [N] with a mask beside each.
+        """Starts N episodes; returns their first observations, and `GymEnv`'s infos as arrays [N], each with a mask.
 
         Args:
-          seed: of the first copy, those of the others count on from it; or one for each; None draws on as before.
-          options: None.
+          seed: one seed for each copy, or that of the first: copy i then uses seed + i. None continues the random streams.
+          options: must be None or empty.
 
         Raises:
-          ValueError: not N seeds; `options` holds something; or see `GoalEnv.check`.
+          ValueError: there are not N seeds, `options` is not empty, or `GoalEnv.check` found a fault.
         """
         _check_options(options)
         if isinstance(seed, (int, np.integer)):
@@ -289,11 +281,11 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, infos
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Observations, rewards [N] float64, terminations and truncations [N] bool, and infos; see `GymEnv.step`.
+        """Returns observations, rewards [N] float64, terminations and truncations [N] bool, and infos; see `GymEnv.step`.
 
         Raises:
-          ValueError: `actions` is not of shape [N, A], or holds a value that is not finite; or see `GoalEnv.check`.
-          gymnasium.error.ResetNeeded: there was no reset yet.
+          ValueError: `actions` is not of shape [N, A] or is not finite, or `GoalEnv.check` found a fault.
+          gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         actions = _checked(actions, self.action_space, self._states)
         if self._steps == self.max_episode_steps:
@@ -301,7 +293,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         else:
             self._states = self._compiled.step_all(self._states, actions)
             self._steps += 1
-            obs, rewards, infos = self._seen()
+            obs, rewards, infos = self._results()
         ended = self._steps == self.max_episode_steps
         return obs, rewards, np.zeros(self.num_envs, bool), np.full(self.num_envs, ended), infos
 
@@ -309,30 +301,30 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         self._compiled.env.check()
         seeds = np.array([episode_seed(random) for random in self._np_random], np.int32)
         self._states, self._steps = self._compiled.reset_all(seeds), 0
-        return self._seen()
+        return self._results()
 
-    def _seen(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
-        obs, rewards, infos = _seen(self._states)
+    def _results(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
+        obs, rewards, infos = _to_numpy(self._states)
         masks = {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
         return obs, rewards, infos | masks
 
 
 def _spaces(env: GoalEnv) -> tuple[Any, Any]:
-    """The spaces of observations and actions. What is observed has no bounds that would mean anything."""
+    """Returns the spaces of observations, which have no meaningful bounds, and of actions."""
     sizes = {"observation": env.observation_size, "achieved_goal": env.goal_size, "desired_goal": env.goal_size}
     boxes: dict[str, Any] = {key: gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32) for key, size in sizes.items()}
     return gymnasium.spaces.Dict(boxes), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
 
 
-def _seen(state: State) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
-    """Observation, reward (float64) and info of a state or of many, as arrays that the caller may write to."""
+def _to_numpy(state: State) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
+    """Copies observation, reward (float64) and info of one state or a batch to arrays that the caller may write to."""
     obs = {key: np.array(value) for key, value in state.obs.items()}
     info = {"is_success": np.array(state.success, np.float64), "failed": np.array(state.failed)}
     return obs, np.array(state.reward, np.float64), info
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
-    """`actions` as float32, where they fit `space` (but for its bounds) and there is a state to act in."""
+    """Returns `actions` as float32; raises unless they fit `space`, except its bounds, and there is a state to act in."""
     if state is None:
         raise gymnasium.error.ResetNeeded("reset must be called before step")
     actions = np.asarray(actions, np.float32)

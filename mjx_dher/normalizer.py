@@ -10,7 +10,7 @@ from mjx_dher.types import Array
 
 @struct.dataclass
 class NormalizerState:
-    """Moments of all that was seen. Kept as mean and variance: float32 sums of squares would cancel."""
+    """Moments of all values so far. Kept as mean and variance: float32 sums of squares would cancel."""
 
     count: Array  # []
     mean: Array  # [D]
@@ -18,21 +18,21 @@ class NormalizerState:
 
 
 def init(size: int) -> NormalizerState:
-    """Nothing seen: mean 0, variance 1."""
+    """Makes the state before any value: mean 0, variance 1."""
     return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
 
 
 def update(state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None) -> NormalizerState:
-    """The moments with `values` [..., D] added, after clipping them to +- `clip`.
+    """Returns the moments with `values` [..., D] added, after clipping them to +- `clip`.
 
     `valid` broadcasts against [..., 1] and says which of them to add, whatever the others hold; all, where None.
     """
-    seen = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
-    seen = seen.reshape(-1, 1)
+    mask = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
+    mask = mask.reshape(-1, 1)
     values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
-    number = jnp.sum(seen).astype(jnp.float32)
-    batch_mean = jnp.sum(jnp.where(seen, values, 0.0), axis=0) / jnp.maximum(number, 1.0)
-    batch_var = jnp.sum(jnp.where(seen, jnp.square(values - batch_mean[None]), 0.0), axis=0) / jnp.maximum(number, 1.0)
+    number = jnp.sum(mask).astype(jnp.float32)
+    batch_mean = jnp.sum(jnp.where(mask, values, 0.0), axis=0) / jnp.maximum(number, 1.0)
+    batch_var = jnp.sum(jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0), axis=0) / jnp.maximum(number, 1.0)
     count = state.count + number
     share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean
@@ -46,7 +46,7 @@ def update(state: NormalizerState, values: Array, clip: Array | float, valid: Ar
 def normalize(
     state: NormalizerState, values: Array, eps: Array | float, clip: Array | float, input_clip: Array | float
 ) -> Array:
-    """`values` [..., D] clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`."""
+    """Returns `values` [..., D] clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`."""
     values = jnp.clip(values, -input_clip, input_clip)
     mean, std = (jnp.expand_dims(x, range(values.ndim - 1)) for x in (state.mean, jnp.maximum(jnp.sqrt(state.var), eps)))
     return jnp.clip((values - mean) / std, -clip, clip)

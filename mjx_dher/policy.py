@@ -1,4 +1,4 @@
-"""A trained policy as a file, and as a function of NumPy arrays that needs nothing else."""
+"""Trained policies, as files and as functions of NumPy arrays. They need nothing but NumPy."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ _SCALARS = ("norm_clip", "obs_clip")
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A deterministic policy: normalize, four linear layers, tanh.
+    """A deterministic policy: normalization, linear layers with ReLU between them, tanh.
 
-    Call it with a mapping that has "observation" [..., D] and "desired_goal" [..., G] (others are ignored, so a gymnasium
-    goal environment's observation fits as it is); it returns actions [..., A] in [-1, 1], float32.
+    It is called with a mapping that has "observation" [..., D] and "desired_goal" [..., G], such as the observation of a
+    gymnasium goal environment; other keys are ignored. It returns actions [..., A] float32 in [-1, 1].
     """
 
     layers: tuple[tuple[Any, Any], ...]  # (kernel [in, out], bias [out]) of each linear layer
     observation_mean: Any  # [D]
-    observation_std: Any  # [D] not below norm_eps
+    observation_std: Any  # [D], at least norm_eps
     goal_mean: Any  # [G]
     goal_std: Any  # [G]
     norm_clip: float
     obs_clip: float
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Actions [..., A] for observations of one state or a batch.
+        """Computes the actions [..., A] for the observations of one state or a batch.
 
         Raises:
           ValueError: a key is missing, a last axis has the wrong size, or a value is not finite.
@@ -52,7 +52,7 @@ class Policy:
         return self.forward(values[0], values[1], np)
 
     def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any:
-        """Actions for observations [..., D] and goals [..., G], in NumPy or (xp=jax.numpy) traced by JAX."""
+        """Computes the actions for observations [..., D] and goals [..., G], in NumPy or, with xp=jax.numpy, in JAX."""
 
         def normalize(value, mean, std):
             value = xp.clip(value, -self.obs_clip, self.obs_clip)
@@ -72,23 +72,23 @@ class Policy:
         return xp.tanh(x)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that the policy is made of, by name, float32: layerI_kernel [in, out] and layerI_bias [out], and the fields."""
+        """Returns the policy's arrays by name, float32: layerI_kernel [in, out] and layerI_bias [out], and the other fields."""
         arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
         arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
         return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
 
     def save(self, path: Path) -> None:
-        """Writes the policy to `path`; what was there stays whole until the new file is."""
+        """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = self.arrays()
         with files.atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> Policy:
-    """The policy that `Policy.arrays` gave.
+    """Returns the policy with these `Policy.arrays`.
 
     Raises:
-      KeyError: one of them is missing.
+      KeyError: an array is missing.
     """
     num_layers = sum(name.endswith("_kernel") for name in arrays)
     return Policy(
@@ -98,22 +98,21 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
     )
 
 
-def from_learner(learner: Any, hparams: Any) -> Policy:
-    """The policy of a `DDPGState` under `HParams`, with normalizers folded in."""
-    dense = learner.params.actor["params"]
+def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
+    """Returns the policy of an actor's linear layers, by flax's names for them, with the normalizers folded in."""
     layers = tuple(
         (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
     )
 
-    def std(norm):
+    def std(norm: Any) -> np.ndarray:
         return np.maximum(np.sqrt(np.asarray(norm.var)), np.float32(hparams.norm_eps))
 
     return Policy(
         layers=layers,
-        observation_mean=np.asarray(learner.observation_norm.mean),
-        observation_std=std(learner.observation_norm),
-        goal_mean=np.asarray(learner.goal_norm.mean),
-        goal_std=std(learner.goal_norm),
+        observation_mean=np.asarray(observation_norm.mean),
+        observation_std=std(observation_norm),
+        goal_mean=np.asarray(goal_norm.mean),
+        goal_std=std(goal_norm),
         norm_clip=float(hparams.norm_clip),
         obs_clip=float(hparams.obs_clip),
     )

@@ -1,18 +1,23 @@
-"""Presets: the tuned settings, and those of the paper. Loads neither JAX nor MuJoCo, but for `machine_preset`."""
+"""Presets: the tuned settings, and those of the paper. Loads neither JAX nor MuJoCo, except in `machine_preset`."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib.util
+from typing import Any, Literal, get_args
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.names import check_name
+from mjx_dher.spec import RunSpec
 
-PRESETS = ("cpu", "gpu", "paper")
+Preset = Literal["cpu", "gpu", "paper"]
+PRESETS = get_args(Preset)
+
+_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, priority_fraction=0.5)
 
 
 def machine_preset() -> str:
-    """The preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin for one."""
+    """Returns the preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin."""
     if importlib.util.find_spec("jax_plugins") is None:
         return "cpu"
     import jax
@@ -20,8 +25,8 @@ def machine_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def preset(name: str, env: str) -> tuple[Config, HParams]:
-    """The Config and HParams of a preset for an environment.
+def preset(name: str, env: str, **changes: Any) -> RunSpec:
+    """Returns the run of a preset in an environment, with `changes` to its fields, such as `sampler` or `seed`.
 
     `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
     warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
@@ -32,16 +37,12 @@ def preset(name: str, env: str) -> tuple[Config, HParams]:
       ValueError: no such preset.
     """
     check_name("preset", name, PRESETS)
-    if name == "paper":
-        return _paper(env)
-    return _cpu(env) if name == "cpu" else _gpu(env)
-
-
-_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, eventful_share=0.5)
+    config, hparams = {"cpu": _cpu, "gpu": _gpu, "paper": _paper}[name](env)
+    return RunSpec(env=env, config=config, hparams=hparams, **changes)
 
 
 def _cpu(env: str) -> tuple[Config, HParams]:
-    config = Config(env=env, num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
+    config = Config(num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
     if env == "reach":
         config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
     elif env == "pick_and_place":
@@ -55,7 +56,6 @@ def _cpu(env: str) -> tuple[Config, HParams]:
 
 def _gpu(env: str) -> tuple[Config, HParams]:
     config = Config(
-        env=env,
         num_envs=2048,
         cycles_per_epoch=3,
         updates_per_cycle=1000,
@@ -80,7 +80,6 @@ def _paper(env: str) -> tuple[Config, HParams]:
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     config = Config(
-        env=env,
         num_envs=2 * workers,
         cycles_per_epoch=50,
         updates_per_cycle=40,

@@ -18,7 +18,7 @@ class ReplayState:
     """The ring and its write position."""
 
     episodes: Episode  # every leaf leads with [E]
-    eventful: Array  # [E] whether the episode is worth drawing more often, bool; see `draw_rows`
+    priority: Array  # [E] weight by which `draw_rows` can draw the episode, float32
     cursor: Array  # [] row that is written next, int32
     size: Array  # [] rows that hold an episode, int32
 
@@ -36,7 +36,7 @@ class Sample:
 
 
 def init(episode: Episode, num_episodes: int) -> ReplayState:
-    """An empty ring for `num_episodes` episodes like `episode` (arrays or `jax.ShapeDtypeStruct`s, unbatched).
+    """Makes an empty ring for `num_episodes` episodes like `episode` (arrays or `jax.ShapeDtypeStruct`s, unbatched).
 
     Raises:
       ValueError: fewer than one episode, or leaves whose lengths do not agree.
@@ -50,29 +50,29 @@ def init(episode: Episode, num_episodes: int) -> ReplayState:
             raise ValueError(f"leaf {name} must lead with T+1 = {length + 1} (T actions); got shape {leaf.shape}")
     return ReplayState(
         episodes=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape), x.dtype), episode),
-        eventful=jnp.zeros(num_episodes, bool),
+        priority=jnp.zeros(num_episodes),
         cursor=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
     )
 
 
 def nbytes(episode: Episode, num_episodes: int) -> int:
-    """Bytes that `init` allocates for the episodes."""
+    """Returns the bytes that `init` allocates for the episodes."""
     return num_episodes * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(episode))
 
 
 def capacity(state: ReplayState) -> int:
-    """Episodes that the ring holds, E."""
+    """Returns the number of episodes that the ring holds, E."""
     return state.episodes.action.shape[0]
 
 
-def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False, valid: Array | None = None) -> ReplayState:
-    """The ring with `episodes` (leaves lead with [N]) written over its oldest.
+def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, valid: Array | None = None) -> ReplayState:
+    """Returns the ring with `episodes` (leaves lead with [N]) written over its oldest.
 
     Args:
       state: the ring.
       episodes: N of them.
-      eventful: [N], or one for all: whether an episode belongs to those that `draw_rows` can draw more often.
+      priority: [N], or one for all: weight by which `draw_rows` can draw an episode, 0 or more.
       valid: [N] which of them to write; the others leave no trace. All, where None.
 
     Raises:
@@ -87,52 +87,58 @@ def add(state: ReplayState, episodes: Episode, eventful: Array | bool = False, v
     # Out of bounds where not valid, so that the write is dropped; each its own, because indices are promised to be unique.
     rows = jnp.where(valid, (state.cursor + order) % num_rows, num_rows + jnp.arange(num_new, dtype=jnp.int32))
 
-    def write(ring: Array, new: Array | bool) -> Array:
+    def write(ring: Array, new: Array | float) -> Array:
         return ring.at[rows].set(new, mode="drop", unique_indices=True)
 
     return ReplayState(
         episodes=jax.tree.map(write, state.episodes, episodes),
-        eventful=write(state.eventful, eventful),
+        priority=write(state.priority, priority),
         cursor=(state.cursor + written) % num_rows,
         size=jnp.minimum(state.size + written, num_rows),
     )
 
 
 def can_sample(state: ReplayState) -> Array:
-    """[] whether the ring holds any episode."""
+    """Returns [] whether the ring holds any episode."""
     return state.size > 0
 
 
-def count_eventful(state: ReplayState) -> Array:
-    """[E] how many eventful episodes there are up to and with each row, int32. `draw_rows` takes it, so that a loop of draws
-    from one ring makes it once.
+def cumulative_priority(state: ReplayState) -> Array:
+    """Returns the sums [E] of the priorities up to and with each row, int32, in units that make the last about 2^29.
+
+    Integers make the sums exact and never falling, whatever the order of addition; the unit is a power of two, so that
+    priorities of 0 and 1 are exact. `draw_rows` takes the sums, so that a loop of draws from one ring makes them once.
     """
-    return jnp.cumsum(state.eventful, dtype=jnp.int32)
+    largest_power = 0x7F800000  # the exponent's bits of a float32: what they alone stand for is the power of two below it
+    total = jnp.maximum(jnp.sum(state.priority), jnp.finfo(jnp.float32).tiny)
+    bits = jax.lax.bitcast_convert_type(total, jnp.int32) & largest_power
+    unit = jax.lax.bitcast_convert_type(bits, jnp.float32)
+    return jnp.cumsum(jnp.round(state.priority / unit * 2.0**29).astype(jnp.int32), dtype=jnp.int32)
 
 
-def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, eventful_share: Array | float, counts: Array) -> Array:
-    """[B] rows of the ring: with probability `eventful_share` one of the eventful episodes, else any; uniform among each.
+def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array | float, cumulative: Array) -> Array:
+    """Draws rows [B] of the ring: with probability `fraction` in proportion to their priorities, else uniformly.
 
-    While there is no eventful episode, any. `counts` is `count_eventful(state)`. The ring must not be empty.
+    While all priorities are 0, uniformly. `cumulative` is `cumulative_priority(state)`. The ring must not be empty.
     """
     coin_key, bits_key = jax.random.split(key)
-    total = counts[-1]
+    total = cumulative[-1]
     any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size))
-    rank = 1 + below(rank_bits, total)
-    eventful = jnp.searchsorted(counts, rank).astype(jnp.int32)
-    coin = jax.random.uniform(coin_key, (batch_size,)) < eventful_share
-    return jnp.where(coin & (total > 0), eventful, below(any_bits, state.size))
+    rank = 1 + randint_from_bits(rank_bits, total)
+    by_priority = jnp.searchsorted(cumulative, rank).astype(jnp.int32)
+    coin = jax.random.uniform(coin_key, (batch_size,)) < fraction
+    return jnp.where(coin & (total > 0), by_priority, randint_from_bits(any_bits, state.size))
 
 
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
-    """`batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
+    """Draws `batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
 
     Without `rows`, uniform over all transitions in the ring, which must not be empty.
     """
     row_bits, step_bits = jax.random.bits(key, (2, batch_size))
     if rows is None:
-        rows = below(row_bits, state.size)
-    steps = below(step_bits, state.episodes.action.shape[1])
+        rows = randint_from_bits(row_bits, state.size)
+    steps = randint_from_bits(step_bits, state.episodes.action.shape[1])
     episodes = state.episodes
     return Sample(
         observation=jax.tree.map(lambda x: x[rows, steps], episodes.observation),
@@ -145,15 +151,15 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
 
 def sample_episode_goals(state: ReplayState, key: PRNGKey, batch_size: int) -> Array:
-    """[B, T+1, G] the achieved goals of `batch_size` episodes, drawn uniformly. The ring must not be empty."""
-    return state.episodes.achieved_goal[below(jax.random.bits(key, (batch_size,)), state.size)]
+    """Draws `batch_size` episodes uniformly; returns their achieved goals [B, T+1, G]. The ring must not be empty."""
+    return state.episodes.achieved_goal[randint_from_bits(jax.random.bits(key, (batch_size,)), state.size)]
 
 
-def below(bits: Array, number: Array | int) -> Array:
-    """Random integers 0 ... `number` - 1, int32, from random `bits`, uint32 of any shape: the upper 32 of the product's 64.
+def randint_from_bits(bits: Array, number: Array | int) -> Array:
+    """Maps random `bits`, uint32 of any shape, to int32 in [0, number), by the high word of bits * number (Lemire 2019).
 
-    One is likelier than another by `number` / 2^32 of its probability at most. `jax.random.randint` makes three draws, each of
-    them more than a hundred operations to a compiler. 0 where `number` is 0.
+    The bias is at most `number` / 2^32. `jax.random.randint` makes three draws, each of them more than a hundred operations
+    to a compiler. Returns 0 where `number` is 0.
     """
     number = jnp.asarray(number, jnp.uint32)
     high, low, number_high, number_low = bits >> 16, bits & 0xFFFF, number >> 16, number & 0xFFFF

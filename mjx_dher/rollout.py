@@ -15,23 +15,23 @@ PolicyFn = Callable[[PyTree, GoalObs], Array]
 
 
 class Outcome(NamedTuple):
-    """How episodes went; all [N]."""
+    """Outcomes of episodes; all [N]."""
 
     success: Array  # 1.0 where the goal is reached at the last step
     reset_success: Array  # 1.0 where it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
-    valid: Array  # whether all that was seen is finite and the environment did not say `failed`, bool
+    valid: Array  # whether all observations, actions and rewards are finite and the environment is not `failed`, bool
 
 
 def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None) -> tuple[Episode, Outcome]:
-    """`num_envs` episodes side by side.
+    """Plays `num_envs` episodes side by side.
 
     Args:
       env: an unbatched environment.
       policy: called with one step of `inputs` and the observations of all environments.
       key: of the first states.
       num_envs: episodes, N.
-      inputs: what the policy takes beside the observation, such as noise: leaves lead with [T]. None for nothing.
+      inputs: further arguments of the policy, such as noise; leaves lead with [T]. None for none.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
@@ -55,9 +55,15 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
         desired_goal=first.obs["desired_goal"],
         action=jnp.moveaxis(action, 0, 1),
     )
-    seen = (episodes.observation, episodes.achieved_goal, episodes.desired_goal, episodes.action, jnp.moveaxis(reward, 0, 1))
+    arrays = (episodes.observation, episodes.achieved_goal, episodes.desired_goal, episodes.action, jnp.moveaxis(reward, 0, 1))
     valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,))
-    for leaf in jax.tree.leaves(seen):
+    for leaf in jax.tree.leaves(arrays):
         valid &= jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
     ret = jnp.sum(reward, axis=0)
     return episodes, Outcome(success=jnp.where(valid, last.success, 0.0), reset_success=first.success, ret=ret, valid=valid)
+
+
+def check_steps(env: Env) -> None:
+    """Calls `env.check()`, where the environment has one: it raises if steps so far were silently wrong."""
+    if (check := getattr(env, "check", None)) is not None:
+        check()

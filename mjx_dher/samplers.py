@@ -12,7 +12,6 @@ itself.
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import config as config_lib
 from mjx_dher import names
 from mjx_dher.config import HParams
+from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS
 from mjx_dher.types import Array, PRNGKey
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
@@ -39,18 +38,18 @@ class Sampler:
 
     log_weights: LogWeightsFn = struct.field(pytree_node=False)
     # Goals of any episode, not of its own. A function where the answer is traced: see `one_of`.
-    whole_ring: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
+    cross_episode: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
 
 
 def position(achieved: Array, desired: Array) -> Array:
-    """The metric `position`: Euclidean distances [T+1] of `achieved` [T+1, G] to `desired` [G]."""
+    """Returns the Euclidean distances [T+1] of `achieved` [T+1, G] to `desired` [G]: the metric `position`."""
     # Coordinate by coordinate: XLA on a CPU takes three times as long for a sum over an axis of 3.
     squares = jnp.square(achieved - desired[None])
     return jnp.sqrt(sum(squares[..., i] for i in range(squares.shape[-1])))
 
 
 def future_mask(num_goals: int, step: Array) -> Array:
-    """[T+1] true at the goals that come after `step`."""
+    """Returns [T+1], true at the goals that come after `step`."""
     return jnp.arange(num_goals) > step
 
 
@@ -59,32 +58,32 @@ def _uniform(mask: Array) -> Array:
 
 
 def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """Any goal of the episode, each with the same probability."""
+    """Allows any goal of the episode, each with the same probability."""
     del desired, step, hparams
     return jnp.zeros(achieved.shape[0])
 
 
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """Any goal after the step, each with the same probability (Andrychowicz et al. 2017, the paper's baseline)."""
+    """Allows any goal after the step, each with the same probability (Andrychowicz et al. 2017, the paper's baseline)."""
     del desired, hparams
     return _uniform(future_mask(achieved.shape[0], step))
 
 
 def final(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """The episode's last goal."""
+    """Allows the episode's last goal alone."""
     del desired, step, hparams
     return _uniform(jnp.arange(achieved.shape[0]) == achieved.shape[0] - 1)
 
 
 def closest(achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position) -> Array:
-    """The future goal nearest to the desired one (the paper's method 1); equally near ones share."""
+    """Allows the future goal nearest to the desired one (the paper's method 1); equally near ones share."""
     del hparams
     distance = jnp.where(future_mask(achieved.shape[0], step), metric(achieved, desired), jnp.inf)
     return _uniform(distance == jnp.min(distance))
 
 
 def epsilon_closest(achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position) -> Array:
-    """With probability `epsilon` any future goal, else the closest (the paper's method 2)."""
+    """Mixes any future goal, with probability `epsilon`, and the closest one (the paper's method 2)."""
     any_future = jax.nn.softmax(future(achieved, desired, step, hparams))
     nearest = jax.nn.softmax(closest(achieved, desired, step, hparams, metric))
     return jnp.log(hparams.epsilon * any_future + (1.0 - hparams.epsilon) * nearest)
@@ -98,7 +97,7 @@ def weighted(
     kernel: KernelFn,
     metric: MetricFn = position,
 ) -> Array:
-    """Future goals, the likelier the nearer they are to the desired goal (the paper's method 3).
+    """Prefers future goals that are nearer to the desired goal (the paper's method 3).
 
     The weight of a candidate depends on its *normalized distance*: its distance to the goal that the episode was played
     for, divided by the mean of that distance over the candidates of the same transition,
@@ -128,77 +127,46 @@ def weighted(
 
 
 def linear(relative: Array, temperature: Array | float) -> Array:
-    """log max(1 - (r - 1) / temperature, 0), of relative distances r [T+1]."""
+    """Returns log max(1 - (r - 1) / temperature, 0), of relative distances r [T+1]."""
     return jnp.log(jnp.maximum(1.0 - (relative - 1.0) / temperature, 0.0))
 
 
 def inverse(relative: Array, temperature: Array | float) -> Array:
-    """log r^(-1/temperature), of relative distances r [T+1]; one on the goal counts as at a thousandth of the mean distance."""
+    """Returns log r^(-1/temperature), of relative distances r [T+1]; below 0.001, r counts as 0.001."""
     return -jnp.log(jnp.maximum(relative, 1e-3)) / temperature
 
 
 def softmax(relative: Array, temperature: Array | float) -> Array:
-    """-(r - 1) / temperature, of relative distances r [T+1]."""
+    """Returns -(r - 1) / temperature, of relative distances r [T+1]."""
     return -(relative - 1.0) / temperature
 
 
-KERNELS: dict[str, KernelFn] = {"linear": linear, "inverse": inverse, "softmax": softmax}
-METRICS: dict[str, MetricFn] = {"position": position}
 _PLAIN: dict[str, Sampler] = {
-    "random": Sampler(episode, whole_ring=True),
+    "random": Sampler(episode, cross_episode=True),
     "episode": Sampler(episode),
     "future": Sampler(future),
     "final": Sampler(final),
 }
 
 
-def list_samplers() -> tuple[str, ...]:
-    """The names that `make` takes, beside "module:attribute"."""
-    return (*config_lib.SAMPLERS, *(name for name in _PLAIN if name not in config_lib.SAMPLERS))
-
-
-def register(name: str, sampler: Sampler) -> None:
-    """Makes a sampler available to `make` and to the command line.
-
-    Raises:
-      ValueError: the name is taken.
-    """
-    if name in list_samplers():
-        raise ValueError(f"sampler {name!r} is already registered")
-    _PLAIN[name] = sampler
-
-
-def register_metric(name: str, metric: MetricFn) -> None:
-    """Makes a distance available to `make` and to the command line's --metric.
-
-    Raises:
-      ValueError: the name is taken.
-    """
-    if name in METRICS:
-        raise ValueError(f"metric {name!r} is already registered")
-    METRICS[name] = metric
-
-
 def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
-    """The sampler called `name`.
+    """Makes the sampler called `name`.
 
     Args:
-      name: one of `list_samplers()`, or "module:attribute" of a `Sampler` or a function as `Sampler.log_weights`. `random`
+      name: one of `spec.SAMPLERS`, or "module:attribute" of a `Sampler` or a function like `Sampler.log_weights`. `random`
         chooses as `episode` does, but from a random episode of the ring.
-      kernel: for `weighted`, one of linear, inverse, softmax, or a function (relative distance, temperature) -> log weight.
-      metric: for closest, epsilon_closest and weighted: "position", or a function (achieved [T+1, G], desired [G]) -> [T+1].
+      kernel: for `weighted`: linear, inverse, softmax, "module:attribute", or a function (relative distance [T+1],
+        temperature []) -> log weight [T+1].
+      metric: for closest, epsilon_closest and weighted: position, "module:attribute", or a function (achieved [T+1, G],
+        desired [G]) -> distance [T+1].
 
     Raises:
       ValueError: no such sampler, module, attribute, kernel or metric (the message names the nearest), or something that is no
-        sampler.
+        sampler, kernel or metric.
     """
-    names.check_name("sampler", name, list_samplers(), own=True)
-    if isinstance(kernel, str):
-        names.check_name("weight_kernel", kernel, KERNELS)
-        kernel = KERNELS[kernel]
-    if isinstance(metric, str):
-        names.check_name("metric", metric, METRICS)
-        metric = METRICS[metric]
+    names.check_name("sampler", name, SAMPLERS, own=True)
+    kernel = names.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
+    metric = names.resolve("metric", metric, METRICS, ("achieved", "desired"))
     by_distance: dict[str, LogWeightsFn] = {
         "closest": functools.partial(closest, metric=metric),
         "epsilon_closest": functools.partial(epsilon_closest, metric=metric),
@@ -206,25 +174,16 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
     }
     if name in by_distance:
         return Sampler(by_distance[name])
-    return _own(name) if names.is_own(name) else _PLAIN[name]
-
-
-def _own(name: str) -> Sampler:
-    found = names.load_own("sampler", name)
-    if isinstance(found, Sampler):
-        return found
-    try:
-        inspect.signature(found).bind("achieved", "desired", "step", "hparams")
-    except TypeError:
-        raise ValueError(
-            f"sampler {name!r} must be a function (achieved [T+1, G], desired [G], step [], hparams) -> log weights [T+1], or a"
-            f" samplers.Sampler; it is {found!r}"
-        ) from None
-    return Sampler(found)
+    if name in _PLAIN:
+        return _PLAIN[name]
+    custom = names.load_import_path("sampler", name)
+    if isinstance(custom, Sampler):
+        return custom
+    return Sampler(names.check_function("sampler", custom, ("achieved", "desired", "step", "hparams")))
 
 
 def one_of(choices: Sequence[Sampler]) -> Sampler:
-    """Several samplers in one compiled program: `hparams.choice`, a traced number, says which of them a run uses.
+    """Joins several samplers in one compiled program: `hparams.choice`, a traced number, says which of them a run uses.
 
     All log weights are computed and one is kept, so that a run draws what it would have drawn with that sampler alone. A
     field `choice` is not in `HParams`: the caller, `sweep`, adds it.
@@ -241,19 +200,21 @@ def one_of(choices: Sequence[Sampler]) -> Sampler:
     def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
         return pick([choice.log_weights(achieved, desired, step, hparams) for choice in choices], hparams)
 
-    elsewhere = [choice.whole_ring for choice in choices]
-    if not any(elsewhere):
+    crossing = [choice.cross_episode for choice in choices]
+    if not any(crossing):
         return Sampler(log_weights)
-    return Sampler(log_weights, whole_ring=lambda hparams: pick(elsewhere, hparams))
+    return Sampler(log_weights, cross_episode=lambda hparams: pick(crossing, hparams))
 
 
 def probabilities(log_weights: Array) -> Array:
-    """[..., T+1] the probabilities that log weights [..., T+1] stand for."""
+    """Returns the probabilities [..., T+1] that log weights [..., T+1] stand for."""
     return jax.nn.softmax(log_weights, axis=-1)
 
 
 def draw(key: PRNGKey, log_weights: Array) -> Array:
-    """[B] one index each from log weights [B, T+1], by inverting the cumulative distribution: one random number a row.
+    """Draws an index [B] from each row of log weights [B, T+1], by inverting the cumulative distribution.
+
+    This takes one random number a row.
 
     What has no weight is never drawn, whatever the rounding of the cumulative sum. At least one weight must be positive.
     """

@@ -10,7 +10,7 @@ Dimension letters, used in every shape comment:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, TypedDict
+from typing import Any, NamedTuple, Protocol, TypedDict
 
 import jax
 from flax import struct
@@ -48,6 +48,17 @@ class Batch:
     action: Array  # [B, A]
     reward: Array  # [B]
 
+
+class Sizes(NamedTuple):
+    """Numbers in an observation, a goal and an action: D, G and A."""
+
+    observation: int
+    goal: int
+    action: int
+
+
+# Scalars [] by name, for the log.
+Metrics = dict[str, Array]
 
 # compute_reward(achieved_goal [..., G], desired_goal [..., G]) -> reward [...]
 RewardFn = Callable[[Array, Array], Array]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
+import contextlib
+import functools
 import os
-import shutil
 import sys
-import tempfile
+import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,36 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs" / "examples"
-# What one test has compiled the next one need not, in whichever of the processes that run side by side (see pyproject.toml);
-# but nothing of a test stays in the user's cache folder.
+# What one test has compiled the next one need not, nor the next run: it is kept, and apart from what the user's own runs keep.
+# Processes may share the folders: what JAX finds half-written it compiles again, and Warp puts a kernel there in one piece.
+KEPT = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher-tests"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "xla"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("WARP_CACHE_PATH", str(KEPT / "warp"))
+MONTH = 30 * 24 * 60 * 60  # s
+
+
+def _is_of_no_use(entry):
+    """Whether a compiled program is a month old, and so most likely of code that has changed; or cut short, as a process that
+    was killed leaves it: JAX would warn of that in each run, and never write it anew."""
+    if time.time() - entry.stat().st_mtime > MONTH:
+        return True
+    content = entry.read_bytes()
+    if content[:1] == b"x":  # zlib's, not Zstandard's
+        try:
+            zlib.decompress(content)
+        except zlib.error:
+            return True
+    return not content
+
+
 if "PYTEST_XDIST_WORKER" not in os.environ:
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache = tempfile.mkdtemp()
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
-    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    for _entry in (KEPT / "xla").glob("*-cache"):
+        with contextlib.suppress(FileNotFoundError):  # another run was quicker
+            if _is_of_no_use(_entry):
+                _entry.unlink()
 # Compiling takes most of the tests' time, and a fifth less of it without what makes programs fast.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES)]
 
 
@@ -35,3 +58,60 @@ def load_recorded(task):
 def recorded():
     """Episodes of the original FetchPush."""
     return load_recorded("push")
+
+
+class Task:
+    """An environment and its functions, compiled when they are first called; `_all` for a batch."""
+
+    def __init__(self, name, engine):
+        import jax  # after the variables above are set
+
+        from mjx_dher import envs
+
+        self.env = envs.make(name, engine=engine)
+        self.reset, self.step = jax.jit(self.env.reset), jax.jit(self.env.step)
+        self.reset_all, self.step_all = jax.jit(jax.vmap(self.env.reset)), jax.jit(jax.vmap(self.env.step))
+
+
+@pytest.fixture(scope="session")
+def task():
+    """Name and engine -> Task, the same one for all tests.
+
+    MJX takes a quarter of a minute to compile a step, and no cache on the disk holds a program that calls back to Python, as
+    every one with native physics does.
+    """
+    made = {}
+
+    def task(name, engine="native"):
+        if (name, engine) not in made:
+            made[name, engine] = Task(name, engine)
+        return made[name, engine]
+
+    return task
+
+
+@pytest.fixture(scope="session")
+def native(task):
+    return task("push").env
+
+
+@pytest.fixture(scope="session")
+def resets(task):
+    """Name -> 20,000 first states."""
+    import jax
+
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    return functools.cache(lambda name: task(name).reset_all(keys))
+
+
+# The modules that take longest, which start first, so that no worker is left with one of them at the end. Each runs in one
+# worker as a whole (--dist loadfile): its fixtures and what it compiles are made once.
+LONGEST = (
+    *("sweep", "trainer", "engines", "cli", "checkpoint", "sweep_cli", "warp", "render", "driver", "hopper", "ddpg", "own"),
+    *("relabel", "replay", "doctor"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}": number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))  # stable: all else stays in its order

@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import io
 import json
 import os
@@ -13,9 +14,13 @@ from conftest import ROOT
 from rich.console import Console
 
 import mjx_dher
-from mjx_dher import cli, config, presets
+from mjx_dher import Options, RunSpec, cli, config, presets
+from mjx_dher.cli import common
+from mjx_dher.cli import sweep as cli_sweep
+from mjx_dher.cli import train as cli_train
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs import run_folder, sinks
+from mjx_dher.runs import run_folder
+from mjx_dher.runs.loop import Progress
 
 TINY = """
     --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200
@@ -37,7 +42,7 @@ def test_a_run_writes_its_folder(finished):
     out, _ = finished
     assert {path.name for path in out.iterdir()} == {"config.json", "metrics.csv", "policy.npz", "result.json"}
     content = json.loads((out / "config.json").read_text())
-    assert (content["config"]["env"], content["config"]["sampler"], content["engine"]) == ("push", "weighted", "native")
+    assert (content["env"], content["sampler"], content["physics"]) == ("push", "weighted", "native")
     assert {"jax", "mujoco", "mjx_dher", "python"} <= set(content["versions"])
     with (out / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -52,11 +57,10 @@ def test_a_run_writes_its_folder(finished):
 def test_a_run_says_what_it_does(finished):
     out, done = finished
     lines = done.stdout.splitlines()
-    assert "physics native" in lines[0]
-    assert "replay ring 130.5 kB" in lines[0]
-    assert str(out) in lines[0]
-    assert lines[1].startswith("compiling the training loop")
-    assert lines[2].startswith("compiled in ")
+    assert lines[0] == f"push, sampler weighted, seed 0; writing to {out}"
+    assert lines[1].startswith("push: compiling for one run; physics native, learner on")
+    assert "replay ring 130.5 kB" in lines[1]
+    assert lines[2].startswith("push: compiled in ")
     for number in (1, 2):
         line = lines[2 + number]
         assert line.startswith(f"epoch {number}/2  {number * 100} steps")
@@ -89,7 +93,20 @@ def test_an_existing_run_is_never_overwritten(finished, capsys):
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
+HUGE = str(10**20)
 BAD = [
+    (["--learning-rate", "0.01"], ["--learning-rate is called --actor-lr and --critic-lr here"]),
+    (["--buffer-size", "1000"], ["--buffer-size is called --replay-size here"]),
+    (["--tau=0.05"], ["--tau is called --polyak, which is 1 - tau here"]),
+    (["sweep", "--out", "x", "--share", "1/2"], ["--share is called --shard here"]),
+    (["--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
+    (["--cycles-per-epoch", HUGE], [f"cycles_per_epoch must lie in [1, 1000000]; got {HUGE}"]),
+    (["--updates-per-cycle", HUGE], [f"updates_per_cycle must lie in [1, 1000000]; got {HUGE}"]),
+    (["--total-steps", HUGE], [f"total_steps must lie in [1, 2000000000]; got {HUGE}"]),
+    (["--hidden-sizes", HUGE], [f"hidden_sizes must lie in [1, 65536]; got {HUGE}"]),
+    (["--eval-episodes", HUGE], [f"eval_episodes must lie in [1, 1000000]; got {HUGE}"]),
+    (["--checkpoint-every", HUGE], [f"checkpoint_every must lie in [0, 1000000]; got {HUGE}"]),
+    (["sweep", "--out", "x", "--seeds", HUGE], [f"seeds must lie in [1, 1000000]; got {HUGE}"]),
     (
         ["--env", "pusch"],
         ["env must be one of pick_and_place, push", ", or module:attribute; got 'pusch' (did you mean 'push'"],
@@ -100,20 +117,19 @@ BAD = [
     (["sweep", "--out", "x", "--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
     (["render", "--env", "not_there:Task", "--out", "x.png"], ["env 'not_there:Task': there is no module 'not_there'"]),
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
-    (["--engine", "natve"], ["engine must be one of auto, native, jax, warp; got 'natve' (did you mean 'native'?)"]),
     (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, paper; got 'papr' (did you mean 'paper'?)"]),
-    (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax; got 'cubic'"]),
-    (["--metric", "speed"], ["metric must be one of position; got 'speed'"]),
-    (["--num-envs", "0"], ["num_envs must be an integer of at least 1; got 0"]),
-    (["--num-envs", "-3"], ["num_envs must be an integer of at least 1; got -3"]),
+    (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax, or module:attribute; got 'cubic'"]),
+    (["--metric", "speed"], ["metric must be one of position, or module:attribute; got 'speed'"]),
+    (["--num-envs", "0"], ["num_envs must lie in [1, 1000000]; got 0"]),
+    (["--num-envs", "-3"], ["num_envs must lie in [1, 1000000]; got -3"]),
     (["--batch-size", "2000001"], ["batch_size must not exceed replay_size (1000000); got 2000001"]),
     (
         ["--replay-size", "1500"],
         ["replay_size must hold at least one cycle of 32 episodes x 50 steps = 1600 transitions; got 1500"],
     ),
     (["--gamma", "1.0"], ["gamma must lie in [0, 1); got 1.0"]),
-    (["--final-episodes", "0"], ["final_episodes must be an integer of at least 1; got 0"]),
-    (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must be", "gamma must lie"]),
+    (["--final-episodes", "0"], ["final_episodes must lie in [1, 1000000]; got 0"]),
+    (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must lie", "gamma must lie"]),
     (
         ["evall", "runs/x"],
         [
@@ -123,7 +139,7 @@ BAD = [
     ),
     (["eval", "runs/not-there"], ["runs/not-there is not a run folder: no such folder"]),
     (["eval", "docs"], ["docs is not a run folder: it has no config.json"]),
-    (["eval", "docs", "--episodes", "0"], ["episodes must be an integer of at least 1; got 0"]),
+    (["eval", "docs", "--episodes", "0"], ["episodes must lie in [1, 1000000]; got 0"]),
     (["eval", "docs", "--engine", "wrap"], ["engine must be one of auto, native, jax, warp; got 'wrap'"]),
 ]
 
@@ -151,11 +167,32 @@ assert not {{"jax", "mujoco"}} & set(sys.modules)
 
 
 def test_presets_are_the_base_that_options_override():
-    args = cli.parse_train_args(["--preset=paper", "--env", "push", "--num-envs", "4", "--gamma", "0.9"])
-    base, hparams = presets.preset("paper", "push")
-    assert args.config == config.dataclasses.replace(base, num_envs=4)
-    assert args.hparams == hparams._replace(gamma=0.9)
-    assert cli.parse_train_args([]).config == presets.preset("cpu", "push")[0]
+    args = cli_train.parse_train_args(["--preset=paper", "--env", "push", "--num-envs", "4", "--gamma", "0.9"])
+    base = presets.preset("paper", "push")
+    assert args.spec.config == dataclasses.replace(base.config, num_envs=4)
+    assert args.spec.hparams == base.hparams._replace(gamma=0.9)
+    assert cli_train.parse_train_args([]).spec == presets.preset("cpu", "push")
+    assert cli_train.parse_train_args([]).preset == "cpu"
+
+
+@pytest.mark.parametrize("parse", [cli_train.parse_train_args, lambda argv: cli_sweep.parse_sweep_args(["--out", "x", *argv])])
+def test_a_wrong_name_is_refused_before_the_gpu_is_asked_for(parse, monkeypatch):
+    """Asking which preset this machine takes starts CUDA, where JAX has a plug-in for it."""
+    monkeypatch.setattr(presets, "machine_preset", lambda: pytest.fail("CUDA has started"))
+    with pytest.raises(ValueError, match="sampler must be one of"):
+        parse(["--sampler", "futur"])
+    with pytest.raises(ValueError, match="gamma must lie in"):
+        parse(["--gamma", "1.5"] if parse is cli_train.parse_train_args else ["--sweep.gamma", "1.5"])
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+def test_the_machine_s_preset_is_taken(preset, monkeypatch):
+    monkeypatch.setattr(presets, "machine_preset", lambda: preset)
+    args = cli_train.parse_train_args(["--env", "slide", "--gamma", "0.9"])
+    expected = presets.preset(preset, "slide")
+    assert args.spec == dataclasses.replace(expected, hparams=expected.hparams._replace(gamma=0.9))
+    _, trials = cli_sweep.parse_sweep_args(["--out", "x", "--env", "slide", "--seeds", "1", "--sampler", "future"])
+    assert trials == [expected]
 
 
 def test_help_names_every_option(capsys):
@@ -163,7 +200,8 @@ def test_help_names_every_option(capsys):
         cli.main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    fields = [f.name for f in config.dataclasses.fields(config.Config)] + list(config.HParams._fields)
+    fields = [f.name for owner in (config.Config, RunSpec, Options) for f in dataclasses.fields(owner)]
+    fields = [*(name for name in fields if name not in ("config", "hparams")), *config.HParams._fields]
     for field in [*fields, "seed", "out", "preset", "final_episodes"]:
         assert f"--{field.replace('_', '-')}" in text
 
@@ -183,18 +221,35 @@ def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(t
     assert [path.name for path in tmp_path.iterdir()] == ["mine" if chosen else "mjx-dher"]
 
 
-def test_a_terminal_gets_a_live_line():
+def progress(epoch, rate):
+    metrics = {"success_rate": np.asarray(rate), "return_mean": np.asarray(-20.0)}
+    return Progress(epoch, 4, 1000 * epoch, 100 * epoch, 2.0 * epoch, 2.0, metrics, None)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_of_one_run(terminal):
     screen = io.StringIO()
-    sink = sinks.ConsoleSink(Console(file=screen, force_terminal=True, width=200), num_epochs=4)
-    row = {"epoch": 1, "env_steps": 1000, "wall_seconds": 30.0, "success_rate": 0.5, "return_mean": -20.0}
-    sink.write({**row, "steps_per_second": 500.0, "updates_per_second": 50.0})
-    sink.close()
-    assert "epoch 1/4  1,000 steps  500 steps/s  50 updates/s  success 0.50  return -20.0  ETA 1:30" in screen.getvalue()
+    shown = common.Screen(Console(file=screen, force_terminal=terminal, width=200), [RunSpec()])
+    shown.show([RunSpec()], progress(1, 0.5))
+    shown.close()
+    assert "epoch 1/4  1,000 steps  500 steps/s  50 updates/s  success 0.50  return -20.0  ETA 0:06" in screen.getvalue()
+
+
+def test_progress_of_many_runs():
+    specs = [RunSpec(seed=seed, sampler=sampler) for seed in (0, 1) for sampler in ("future", "weighted")]
+    screen = io.StringIO()
+    shown = common.Screen(Console(file=screen, force_terminal=True, width=200), [*specs, *specs])
+    shown.show(specs, progress(2, [0.5, 0.0, 0.7, 0.2]))
+    shown.close()
+    assert "25%  push, 4 runs: epoch 2/4  success future 0.60  weighted 0.10  ETA" in screen.getvalue()
+
+
+POINT_MASS = ["--env", "docs.examples.point_mass:PointMass"]
 
 
 def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     out = tmp_path / "run"
-    long = [*TINY, "--total-steps", "100000", "--out", str(out)]
+    long = [*POINT_MASS, *TINY, "--total-steps", "40000", "--out", str(out)]
     process = subprocess.Popen(
         [sys.executable, "train.py", *long], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -209,13 +264,14 @@ def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     assert stderr == ""
     mjx_dher.load_policy(out)
     epochs = int(stdout.split("stopped after epoch ")[1].split()[0])
-    assert 1 <= epochs < 1000
+    assert 1 <= epochs < 2000
     assert len((out / "metrics.csv").read_text().splitlines()) == 1 + epochs
 
 
 def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
     out = tmp_path / "run"
-    slow = [*TINY, "--total-steps", "10000000", "--num-envs", "32", "--cycles-per-epoch", "40", "--replay-size", "2000"]
+    slow = [*POINT_MASS, *TINY, "--total-steps", "1000000000", "--num-envs", "1000", "--replay-size", "10000"]
+    slow += ["--cycles-per-epoch", "200", "--updates-per-cycle", "10", "--batch-size", "1000"]
     process = subprocess.Popen(
         [sys.executable, "-u", "train.py", *slow, "--out", str(out)], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
@@ -235,9 +291,31 @@ def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
 def test_an_unwritable_out_is_refused(tmp_path):
     blocker = tmp_path / "file"
     blocker.write_text("")
-    run = run_folder.RunConfig(config.Config(), config.HParams(), 0, "native")
     with pytest.raises(FolderError, match="out: cannot create"):
-        run_folder.create(blocker / "run", run, {})
+        run_folder.create(blocker / "run", RunSpec(), "native", {})
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["sweep", "--out", "/proc/x", "--seeds", "1"], "/proc/x"),
+        (["sweep", "--out", "/dev/null/x", "--seeds", "1"], "/dev/null/x"),
+        (["--env", "json:dumps"], "env 'json:dumps'"),
+        (["--sampler", "json:nonsense"], "sampler 'json:nonsense': module json has no 'nonsense'"),
+        (["--metric", "json:JSONDecoder"], "metric"),
+        (["--networks", "json:dumps"], "networks"),
+        (["--learner", "json:dumps"], "learner"),
+        (["--env", "breaks:Task"], "env 'breaks:Task': importing it failed: ZeroDivisionError"),
+    ],
+)
+def test_no_file_system_or_plug_in_ends_in_a_traceback(argv, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "breaks.py").write_text("1 / 0")
+    assert cli.main([*argv, *([] if "sweep" in argv else ["--out", "run"])]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_reader_that_goes_is_no_error():

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from mjx_dher import HParams, stats
-from mjx_dher.config import Config
+from mjx_dher import RunSpec, stats
+from mjx_dher.runs import run_folder
 from mjx_dher.sweeps import comparison
 
 
@@ -16,8 +16,8 @@ def cell(sampler, seed, success, env="push", final=None, **numbers):
         "success_rate": list(success),
     }
     final = {"success_rate": success[-1] if final is None else final, "reset_success_rate": 0.07}
-    settings = {"config": {**vars(Config(env=env, sampler=sampler))}, "hparams": {**HParams()._asdict(), **numbers}}
-    return {"seed": seed, "curve": curve, "final": final, **settings}
+    settings = {**run_folder.settings(RunSpec(env=env, sampler=sampler)), **numbers}
+    return {"settings": settings, "seed": seed, "status": "finished", "curve": curve, "final": final}
 
 
 SLOW = [[0.0, 0.2, 0.5, 0.9], [0.1, 0.3, 0.5, 0.8], [0.0, 0.2, 0.6, 0.9]]
@@ -54,7 +54,7 @@ def test_p_values_are_corrected_over_the_settings_of_an_environment():
 
 
 def test_seeds_that_differ_are_not_paired():
-    cells = [c for c in CELLS if c["config"]["sampler"] != "weighted" or c["seed"] < 2]
+    cells = [c for c in CELLS if c["settings"]["sampler"] != "weighted" or c["seed"] < 2]
     fast = comparison.compare(comparison.groups(cells)["push"], "future", 0.9)[1]
     assert fast.better == 1.0
     assert math.isnan(fast.p_value)

@@ -1,31 +1,34 @@
+import contextlib
 import dataclasses
 
 import pytest
 
-from mjx_dher import config, presets
-from mjx_dher.config import Config, HParams
+from mjx_dher import config, envs, presets, spec
+from mjx_dher.config import Config, HParams, Number
+from mjx_dher.spec import RunSpec
 
 
 @pytest.mark.parametrize(
     ("env", "workers", "epochs"), [("push", 8, 50), ("pick_and_place", 16, 50), ("slide", 8, 200), ("reach", 8, 50)]
 )
 def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
-    c, h = presets.preset("paper", env)
-    assert (c.env, c.num_envs, c.batch_size) == (env, 2 * workers, 256 * workers)
+    run = presets.preset("paper", env)
+    c, h = run.config, run.hparams
+    assert (run.env, c.num_envs, c.batch_size) == (env, 2 * workers, 256 * workers)
     assert (c.cycles_per_epoch, c.updates_per_cycle, c.target_period) == (50, 40, 40)
     assert config.num_epochs(c, 50) == epochs
     assert c.replay_size == 1_000_000
     assert c.hidden_sizes == (256, 256, 256)
     assert (h.actor_lr, h.critic_lr, h.gamma, h.polyak, h.action_l2) == (1e-3, 1e-3, 0.98, 0.95, 1.0)
     assert (h.random_eps, h.noise_std, h.her_k) == (0.3, 0.2, 4.0)
-    assert (h.eventful_share, h.lr_end) == (0.0, 1.0)  # what the paper does not have is off
+    assert (h.priority_fraction, h.lr_end) == (0.0, 1.0)  # what the paper does not have is off
     assert (h.obs_clip, h.norm_clip, h.norm_eps) == (200.0, 5.0, 0.01)
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)
 @pytest.mark.parametrize("env", ["push", "pick_and_place", "slide", "reach"])
 def test_presets_are_valid(name, env):
-    config.validate(*presets.preset(name, env))
+    spec.validate(presets.preset(name, env), envs.list_envs())
 
 
 def test_sizes_that_follow():
@@ -35,19 +38,41 @@ def test_sizes_that_follow():
     assert config.episodes_capacity(c, 50) == 20_000
 
 
-BAD_CONFIG = [
+BAD_PARTS = [
+    ({"env": "pusj"}, "env must be one of pick_and_place, push, .*; got 'pusj' .did you mean 'push'"),
     ({"sampler": "wieghted"}, "sampler must be one of random, .*; got 'wieghted' .did you mean 'weighted'"),
-    ({"weight_kernel": "cubic"}, "weight_kernel must be one of linear, inverse, softmax; got 'cubic'"),
-    ({"learner_dtype": "float16"}, "learner_dtype must be one of float32, bfloat16; got 'float16'"),
+    ({"weight_kernel": "cubic"}, "weight_kernel must be one of linear, inverse, softmax, .*; got 'cubic'"),
+    ({"metric": "speed"}, "metric must be one of position, .*; got 'speed'"),
+    ({"priority": "energy"}, "priority must be one of eventful, .*; got 'energy'"),
+    ({"learner": "dpg"}, "learner must be one of ddpg, .*; got 'dpg' .did you mean 'ddpg'"),
+    ({"networks": "mpl"}, "networks must be one of mlp, .*; got 'mpl' .did you mean 'mlp'"),
     ({"engine": "warpp"}, "engine must be one of auto, native, jax, warp; got 'warpp'"),
-    ({"num_envs": 0}, "num_envs must be an integer of at least 1; got 0"),
-    ({"num_envs": 2.5}, "num_envs must be an integer of at least 1; got 2.5"),
-    ({"num_envs": True}, "num_envs must be an integer of at least 1; got True"),
-    ({"batch_size": -1}, "batch_size must be an integer of at least 1; got -1"),
-    ({"total_steps": 0}, "total_steps must be an integer of at least 1; got 0"),
-    ({"eval_episodes": 0}, "eval_episodes must be an integer of at least 1; got 0"),
-    ({"hidden_sizes": ()}, r"hidden_sizes must be one or more integers of at least 1; got \(\)"),
-    ({"hidden_sizes": (256, 0)}, r"hidden_sizes must be .*; got \(256, 0\)"),
+    ({"seed": -1}, r"seed must lie in \[0, 4294967295\]; got -1"),
+    ({"seed": 10**20}, r"seed must lie in \[0, 4294967295\]; got 1000"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_PARTS)
+def test_a_run_that_cannot_be_is_refused_by_name_value_and_what_is_allowed(change, message):
+    with pytest.raises(ValueError, match=message):
+        spec.validate(dataclasses.replace(RunSpec(), **change), envs.list_envs())
+
+
+BAD_CONFIG = [
+    ({"learner_dtype": "float16"}, "learner_dtype must be one of float32, bfloat16; got 'float16'"),
+    ({"num_envs": 0}, r"num_envs must lie in \[1, 1000000\]; got 0"),
+    ({"num_envs": 2.5}, r"num_envs must be an integer in \[1, 1000000\]; got 2.5"),
+    ({"num_envs": True}, r"num_envs must be an integer in \[1, 1000000\]; got True"),
+    ({"batch_size": -1}, r"batch_size must lie in \[1, 10000000\]; got -1"),
+    ({"total_steps": 0}, "total_steps must lie in .*; got 0"),
+    ({"eval_episodes": 0}, "eval_episodes must lie in .*; got 0"),
+    ({"hidden_sizes": ()}, r"hidden_sizes must be 1 to 100 integers in \[1, 65536\]; got \(\)"),
+    ({"hidden_sizes": (256, 0)}, r"hidden_sizes must lie in \[1, 65536\]; got 0"),
+    (
+        {"cycles_per_epoch": 10**6, "num_envs": 10**5, "replay_size": 10**8},
+        "total_steps must not make a run of more than 21474",
+    ),
+    ({"updates_per_cycle": 10**6, "target_period": 1, "total_steps": 10**9}, "updates_per_cycle must not make a run of more"),
     (
         {"updates_per_cycle": 12, "target_period": 5},
         r"target_period must divide updates_per_cycle \(12\); got 5, allowed: 1, 2",
@@ -63,7 +88,7 @@ BAD_CONFIG = [
 @pytest.mark.parametrize(("change", "message"), BAD_CONFIG)
 def test_what_cannot_run_is_refused_by_name_value_and_range(change, message):
     with pytest.raises(ValueError, match=message):
-        config.validate(dataclasses.replace(Config(), **change), HParams())
+        config.validate(dataclasses.replace(Config(), **change), HParams(), 50)
 
 
 BAD_HPARAMS = [
@@ -73,23 +98,56 @@ BAD_HPARAMS = [
     ({"noise_std": float("inf")}, r"noise_std must lie in \[0, inf\); got inf"),
     ({"temperature": 0.0}, r"temperature must lie in \(0, inf\); got 0.0"),
     ({"her_k": -1}, r"her_k must lie in \[0, inf\); got -1"),
-    ({"eventful_share": 1.5}, r"eventful_share must lie in \[0, 1\]; got 1.5"),
+    ({"priority_fraction": 1.5}, r"priority_fraction must lie in \[0, 1\]; got 1.5"),
 ]
 
 
 @pytest.mark.parametrize(("change", "message"), BAD_HPARAMS)
 def test_numbers_out_of_range_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        config.validate(Config(), HParams(**change))
+        config.validate(Config(), HParams(**change), 50)
 
 
-def test_every_number_has_a_range():
-    assert set(config._HPARAM_RANGES) == set(HParams._fields)
+def test_every_number_has_a_range_and_a_default_in_it():
+    numbers = config.metadata(HParams, Number)
+    assert set(numbers) == set(HParams._fields)
+    assert all(number.contains(getattr(HParams(), name)) for name, number in numbers.items())
+    sizes = set(config.metadata(Config, Number)) | {"learner_dtype", "learner_kernels"}
+    assert sizes == {field.name for field in dataclasses.fields(Config)}
+
+
+FIELDS = [(owner, name) for owner in (Config, HParams) for name in config.metadata(owner, Number)]
+
+
+@pytest.mark.parametrize(("owner", "name"), FIELDS)
+@pytest.mark.parametrize("value", [10**20, -1, 0, float("nan"), float("inf"), 1e-300, "", None, True])
+def test_every_field_s_extremes_are_run_or_refused_by_its_name(owner, name, value):
+    """Never anything but a ValueError that names the field."""
+    settings = {Config: Config(), HParams: HParams()}
+    settings[owner] = settings[owner]._replace(**{name: value}) if owner is HParams else Config(**{name: value})
+    if name == "hidden_sizes":
+        settings[owner] = Config(hidden_sizes=(value,))
+    numeric = isinstance(value, int if owner is Config else (int, float)) and not isinstance(value, bool)
+    if numeric and config.metadata(owner, Number)[name].contains(value):
+        with contextlib.suppress(ValueError):  # sizes that depend on one another may still not agree
+            config.validate(settings[Config], settings[HParams], 50)
+        return
+    with pytest.raises(ValueError, match=name):
+        config.validate(settings[Config], settings[HParams], 50)
+
+
+def test_what_a_sampler_reads():
+    assert spec.reads("weighted", "temperature")
+    assert not spec.reads("future", "temperature")
+    assert spec.reads("epsilon_closest", "metric")
+    assert not spec.reads("epsilon_closest", "weight_kernel")
+    assert spec.reads("future", "gamma")
+    assert spec.reads("mine:sampler", "temperature")  # an own sampler may read any
 
 
 def test_all_problems_are_named_at_once():
     with pytest.raises(ValueError, match=r"num_envs.*\n.*batch_size.*\n.*gamma"):
-        config.validate(Config(num_envs=0, batch_size=0), HParams(gamma=2))
+        config.validate(Config(num_envs=0, batch_size=0), HParams(gamma=2), 50)
 
 
 def test_unknown_preset():

@@ -6,10 +6,11 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from mjx_dher.config import HParams
-from mjx_dher.learners import ddpg
-from mjx_dher.learners.ddpg import Networks, Params
-from mjx_dher.networks import Actor, Critic
-from mjx_dher.types import Batch
+from mjx_dher.learners import common, ddpg
+from mjx_dher.learners.common import Params
+from mjx_dher.learners.ddpg import DDPG
+from mjx_dher.networks import Actor, Critic, Networks, mlp
+from mjx_dher.types import Batch, Sizes
 
 HP = HParams(gamma=0.5, action_l2=0.25)
 
@@ -32,11 +33,13 @@ class LinearCritic(nn.Module):
 
 
 NETWORKS = Networks(actor=LinearActor(), critic=LinearCritic())
+LEARNER = DDPG(Sizes(1, 1, 1), NETWORKS, NETWORKS)
+update = jax.jit(LEARNER.update)
 
 
 @pytest.fixture
 def state():
-    return ddpg.init(jax.random.key(0), NETWORKS, 1, 1, 1)
+    return LEARNER.init(jax.random.key(0))
 
 
 BATCH = Batch(
@@ -72,7 +75,7 @@ def test_losses_by_hand(state):
 
 
 def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
-    updated, losses = ddpg.update(NETWORKS, state, BATCH, HP._replace(critic_lr=0.1, actor_lr=0.01))
+    updated, losses = update(state, BATCH, HP._replace(critic_lr=0.1, actor_lr=0.01))
     target = ddpg.target_value(NETWORKS, state.target, BATCH, HP)
     c_grad = jax.grad(lambda p: ddpg.critic_loss(NETWORKS, p, BATCH, target)[0])(state.params.critic)
     a_grad = jax.grad(lambda p: ddpg.actor_loss(NETWORKS, p, state.params.critic, BATCH, HP))(state.params.actor)
@@ -84,40 +87,58 @@ def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
         jax.tree.map(lambda n, o, g, lr=lr: np.testing.assert_allclose(n, o - lr * np.sign(g), rtol=1e-4), new, old, grad)
     jax.tree.map(np.testing.assert_array_equal, updated.target, state.target)
     assert updated.num_updates == 1
-    np.testing.assert_allclose(losses.q_mean, -0.875, rtol=1e-6)
+    assert losses.keys() == {"critic_loss", "actor_loss", "q_mean"}
+    np.testing.assert_allclose(losses["q_mean"], -0.875, rtol=1e-6)
 
 
 def test_update_normalizes_what_the_networks_see(state):
-    state = ddpg.update_normalizers(state, jnp.array([[-2.0], [6.0]]), jnp.array([[1.0], [1.0]]), HP)
+    state = LEARNER.update_normalizers(state, jnp.array([[-2.0], [6.0]]), jnp.array([[1.0], [1.0]]), HP)
     np.testing.assert_allclose(state.observation_norm.mean, [2.0])
-    action = ddpg.act(NETWORKS, state, {"observation": jnp.array([4.0]), "desired_goal": jnp.array([1.0])}, HP)
+    action = LEARNER.act(state, {"observation": jnp.array([4.0]), "desired_goal": jnp.array([1.0])}, HP)
     np.testing.assert_allclose(action, [np.tanh(0.5)], rtol=1e-6)  # (4 - 2) / 4
-    _, losses = ddpg.update(NETWORKS, state, BATCH, HP)
+    _, losses = update(state, BATCH, HP)
     # Observations (1 - 2) / 4 and -2 / 4; goals (-1 - 1) / 0.01 and -5 / 0.01, both clipped to -5.
     q = [-0.5 * -0.25 + 0.25 * -5 + 0.5, -0.5 * -0.5 + 0.25 * -5 - 0.5]
-    np.testing.assert_allclose(losses.q_mean, np.mean(q), rtol=1e-6)
+    np.testing.assert_allclose(losses["q_mean"], np.mean(q), rtol=1e-6)
 
 
 def test_soft_update(state):
     moved = state.replace(params=jax.tree.map(lambda x: x + 1.0, state.params))
-    target = ddpg.update_target(moved, HP._replace(polyak=0.75)).target
+    target = LEARNER.update_target(moved, HP._replace(polyak=0.75)).target
     jax.tree.map(lambda new, old: np.testing.assert_allclose(new, old + 0.25, rtol=1e-6), target, state.target)
 
 
+def test_the_summary_is_the_norms_of_all_parameters(state):
+    summary = LEARNER.summary(state)
+    assert summary.keys() == {"actor_norm", "critic_norm"}
+    np.testing.assert_allclose(summary["actor_norm"], 1.0)
+    np.testing.assert_allclose(summary["critic_norm"], np.sqrt(0.25 + 0.0625 + 0.25), rtol=1e-6)
+
+
+def test_exploring_is_acting_under_noise(state):
+    """The noise of one step: to the first action it is added, and the second one takes its place."""
+    noise = common.Noise(jnp.array([[0.1], [0.1]]), jnp.array([False, True]), jnp.array([[0.9], [-0.9]]))
+    obs = {"observation": jnp.array([[0.5], [0.5]]), "desired_goal": jnp.zeros((2, 1))}
+    action = LEARNER.explore(state, obs, noise, HP)
+    np.testing.assert_allclose(action, [LEARNER.act(state, obs, HP)[0] + 0.1, [-0.9]], rtol=1e-6)
+    whole = LEARNER.noise(jax.random.key(0), 3, 2, HP)
+    jax.tree.map(np.testing.assert_array_equal, whole, common.exploration_noise(jax.random.key(0), 3, 2, 1, HP))
+
+
 def make_noise(**hparams):
-    return ddpg.exploration_noise(jax.random.key(1), 100, 1000, 2, HParams(**hparams))
+    return common.exploration_noise(jax.random.key(1), 100, 1000, 2, HParams(**hparams))
 
 
 def test_exploration_is_a_mixture_of_uniform_and_clipped_gaussian():
     policy = jnp.tile(jnp.array([0.0, 0.9]), (100, 1000, 1))
-    noisy = ddpg.explore(make_noise(random_eps=0.0, noise_std=0.2), policy)
+    noisy = common.add_noise(make_noise(random_eps=0.0, noise_std=0.2), policy)
     assert abs(float(noisy[..., 0].std()) - 0.2) < 0.002
     assert abs(float(noisy[..., 0].mean())) < 0.002
     assert float(noisy.max()) == 1.0
-    uniform = ddpg.explore(make_noise(random_eps=1.0, noise_std=0.2), policy)
+    uniform = common.add_noise(make_noise(random_eps=1.0, noise_std=0.2), policy)
     assert abs(float(uniform.mean())) < 0.005
     assert abs(float(uniform.std()) - 1 / np.sqrt(3)) < 0.005
-    mixed = ddpg.explore(make_noise(random_eps=0.3, noise_std=0.0), policy)
+    mixed = common.add_noise(make_noise(random_eps=0.3, noise_std=0.0), policy)
     is_random = ~np.asarray(mixed == policy).all(-1)
     assert abs(is_random.mean() - 0.3) < 0.006
     np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), is_random)  # an action is random as a whole
@@ -146,9 +167,8 @@ def test_paper_networks():
 
 def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     """8 bits of mantissa: values to half a per cent, and directions of gradients within five degrees."""
-    exact = Networks(Actor(4), Critic())
-    rounded = Networks(Actor(4, dtype=jnp.bfloat16), Critic(dtype=jnp.bfloat16))
-    params = ddpg.init(jax.random.key(0), exact, 25, 3, 4).params
+    exact, rounded = (mlp(4, (256, 256, 256), dtype) for dtype in ("float32", "bfloat16"))
+    params = DDPG(Sizes(25, 3, 4), exact, rounded).init(jax.random.key(0)).params
     observation, following, goal, action = (
         jax.random.normal(jax.random.key(i), (512, size)) for i, size in enumerate((25, 25, 3, 4))
     )
@@ -172,17 +192,18 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
 
 def test_critic_learns_a_known_value():
     """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma), whatever the action."""
-    networks = Networks(actor=Actor(1, (16,)), critic=Critic((16,)))
-    state = ddpg.init(jax.random.key(0), networks, 1, 1, 1)
+    networks = mlp(1, (16,))
+    learner = DDPG(Sizes(1, 1, 1), networks, networks)
+    state = learner.init(jax.random.key(0))
     hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.01)
     ones = jnp.ones((32, 1))
 
     @jax.jit
     def step(state, key):
         action = jax.random.uniform(key, (32, 1), minval=-1, maxval=1)
-        state, losses = ddpg.update(networks, state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
-        return ddpg.update_target(state, hparams), losses
+        state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+        return learner.update_target(state, hparams), losses
 
     state, losses = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
-    np.testing.assert_allclose(losses.q_mean[-100:].mean(), -5.0, atol=0.1)
+    np.testing.assert_allclose(losses["q_mean"][-100:].mean(), -5.0, atol=0.1)
     assert isinstance(state.params, Params)

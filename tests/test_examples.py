@@ -10,6 +10,7 @@ import pytest
 from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli, testing
+from mjx_dher.cli.train import parse_train_args
 from point_mass import PointMass
 
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
@@ -78,8 +79,8 @@ def tutorial_command():
 
 
 def test_the_tutorial_s_command_is_one():
-    args = cli.parse_train_args(tutorial_command())
-    assert (args.config.env, args.config.sampler) == ("point_mass:PointMass", "point_mass:soon")
+    spec = parse_train_args(tutorial_command()).spec
+    assert (spec.env, spec.sampler) == ("point_mass:PointMass", "point_mass:soon")
 
 
 @pytest.mark.slow

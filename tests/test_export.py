@@ -12,8 +12,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import mjx_dher
-from mjx_dher import cli
-from mjx_dher.config import Config, HParams
+from mjx_dher import RunSpec, cli
 from mjx_dher.policy import Policy
 from mjx_dher.runs import run_folder
 from mjx_dher.tools import export
@@ -24,8 +23,7 @@ FORMATS = ("onnx", "safetensors")
 
 def save_run(path, policy):
     """A run folder that holds `policy`."""
-    config = Config(env="slide", sampler="weighted")
-    run_folder.create(path, run_folder.RunConfig(config, HParams(), seed=3, engine="native"), {})
+    run_folder.create(path, RunSpec(env="slide", sampler="weighted", seed=3), "native", {})
     policy.save(path / run_folder.POLICY_FILE)
     return path
 
@@ -84,9 +82,9 @@ def test_the_file_acts_as_the_policy_does(run, name):
     expected = policy({"observation": observation, "desired_goal": goal})
     assert (np.abs(observation) > 1.5).mean() > 0.3
     assert expected.std(axis=0).min() > 0.1
-    found = ACTIONS[name](run / f"policy.{name}", observation, goal)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    actions = ACTIONS[name](run / f"policy.{name}", observation, goal)
+    assert actions.dtype == np.float32
+    np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
     one = ACTIONS[name](run / f"policy.{name}", observation[:1], goal[:1])
     np.testing.assert_allclose(one, expected[:1], rtol=0, atol=1e-5)
 
@@ -106,8 +104,8 @@ def test_an_action_by_hand(tmp_path, name):
     )
     path = save_run(tmp_path / "run", policy)
     assert cli.main(["export", str(path), "--format", name, "--out", str(tmp_path / f"mine.{name}")]) == 0
-    found = ACTIONS[name](tmp_path / f"mine.{name}", numbers([10]), numbers([-0.25]))
-    np.testing.assert_allclose(found, [[np.tanh(0.1 * 3 - 0.2)]], rtol=1e-6)
+    action = ACTIONS[name](tmp_path / f"mine.{name}", numbers([10]), numbers([-0.25]))
+    np.testing.assert_allclose(action, [[np.tanh(0.1 * 3 - 0.2)]], rtol=1e-6)
 
 
 ABOUT = {
@@ -144,7 +142,7 @@ def test_an_onnx_file_says_what_it_is(run):
 
 
 def test_a_safetensors_file_holds_the_policy_to_the_bit(run):
-    policy, found = mjx_dher.load_policy(run), load_file(run / "policy.safetensors")
+    policy, tensors = mjx_dher.load_policy(run), load_file(run / "policy.safetensors")
     expected = {
         "observation_mean": policy.observation_mean,
         "observation_std": policy.observation_std,
@@ -155,11 +153,11 @@ def test_a_safetensors_file_holds_the_policy_to_the_bit(run):
     }
     for i, (kernel, bias) in enumerate(policy.layers):
         expected |= {f"layer{i}_kernel": kernel, f"layer{i}_bias": bias}
-    assert found.keys() == expected.keys()
+    assert tensors.keys() == expected.keys()
     for name, array in expected.items():
-        assert (found[name].dtype, found[name].shape) == (np.float32, array.shape), name
-        assert found[name].tobytes() == array.tobytes(), name
-    assert found["layer0_kernel"].shape == (D + G, 16)
+        assert (tensors[name].dtype, tensors[name].shape) == (np.float32, array.shape), name
+        assert tensors[name].tobytes() == array.tobytes(), name
+    assert tensors["layer0_kernel"].shape == (D + G, 16)
     with safe_open(run / "policy.safetensors", "np") as file:
         assert file.metadata() == ABOUT
 
@@ -203,7 +201,9 @@ def test_a_file_is_replaced_only_if_asked_for(run, tmp_path, capsys):
     out = tmp_path / "policy.onnx"
     out.write_text("mine")
     assert cli.main(["export", str(run), "--format", "onnx", "--out", str(out)]) == 2
-    assert f"error: out: {out} is there already; name another file or give --overwrite" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: out: {out} ")
+    assert "--overwrite" in error
     assert out.read_text() == "mine"
     assert cli.main(["export", str(run), "--format", "onnx", "--out", str(out), "--overwrite"]) == 0
     assert out.read_bytes() == (run / "policy.onnx").read_bytes()
@@ -226,15 +226,11 @@ def without_relu(policy, about):
 
 
 WRONG = [
-    ("onnx", lambda write, policy, about: write(other_weight(policy), about), "layer0_kernel did not come back"),
-    (
-        "safetensors",
-        lambda write, policy, about: write(other_weight(policy), about),
-        "layer0_kernel did not come back",
-    ),
-    ("onnx", lambda write, policy, about: write(policy, about | {"seed": "4"}), "metadata came back as .*'seed': '4'"),
-    ("safetensors", lambda write, policy, about: write(policy, {}), "metadata came back as "),
-    ("onnx", lambda write, policy, about: without_relu(policy, about), r"actions differ from the policy's by up to \d"),
+    ("onnx", lambda write, policy, about: write(other_weight(policy), about), "layer0_kernel"),
+    ("safetensors", lambda write, policy, about: write(other_weight(policy), about), "layer0_kernel"),
+    ("onnx", lambda write, policy, about: write(policy, about | {"seed": "4"}), "metadata .*'seed': '4'"),
+    ("safetensors", lambda write, policy, about: write(policy, {}), "metadata "),
+    ("onnx", lambda write, policy, about: without_relu(policy, about), r"actions differ .* \d"),
 ]
 
 
@@ -243,7 +239,7 @@ def test_a_file_that_is_not_the_policy_is_not_kept(run, tmp_path, monkeypatch, n
     to_bytes, read = export.FORMATS[name]
     out = tmp_path / f"policy.{name}"
     out.write_text("before")
-    policy, started = mjx_dher.load_policy(run), run_folder.read_config(run)
+    policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
     spoiled = spoil(to_bytes, policy, export.metadata(policy, started))
     monkeypatch.setitem(export.FORMATS, name, (lambda policy, about: spoiled, read))
     with pytest.raises(ValueError, match=f"nothing was written: .*{message}"):
@@ -263,24 +259,24 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path, name, capsys):
 
 
 @pytest.mark.parametrize(
-    ("argv", "message"),
+    ("argv", "parts"),
     [
-        (["{run}", "--format", "onyx"], "format must be one of onnx, safetensors; got 'onyx' (did you mean 'onnx'?)"),
-        (["{run}", "--format", "onnx", "--out", "x.safetensors"], "out must end in .onnx; got 'x.safetensors'"),
-        (["{run}", "--format", "onnx", "--out", "{run}/policy.npz", "--overwrite"], "out must end in .onnx"),
-        (["{run}", "--format", "onnx", "--out", "nowhere/x.onnx"], "out: there is no folder nowhere"),
-        (["{run}", "--format", "safetensors"], "policy.safetensors is there already"),
-        (["docs", "--format", "onnx"], "docs is not a run folder: it has no config.json"),
-        (["nowhere", "--format", "onnx"], "nowhere is not a run folder: no such folder"),
+        (["{run}", "--format", "onyx"], ["format", "onnx, safetensors", "'onyx'", "did you mean 'onnx'?"]),
+        (["{run}", "--format", "onnx", "--out", "x.safetensors"], ["out", ".onnx", "'x.safetensors'"]),
+        (["{run}", "--format", "onnx", "--out", "{run}/policy.npz", "--overwrite"], ["out", ".onnx", "policy.npz"]),
+        (["{run}", "--format", "onnx", "--out", "nowhere/x.onnx"], ["out", "folder nowhere"]),
+        (["{run}", "--format", "safetensors"], ["out", "policy.safetensors", "--overwrite"]),
+        (["docs", "--format", "onnx"], ["docs", "run folder", "config.json"]),
+        (["nowhere", "--format", "onnx"], ["nowhere", "run folder"]),
     ],
 )
-def test_bad_arguments_are_refused(run, argv, message, capsys, monkeypatch):
+def test_bad_arguments_are_refused(run, argv, parts, capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
     before = {path: path.read_bytes() for path in run.iterdir()}
     assert cli.main(["export", *(arg.format(run=run) for arg in argv)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
-    assert message in error
+    assert all(part in error for part in parts), error
     assert {path: path.read_bytes() for path in run.iterdir()} == before
 
 
@@ -288,13 +284,13 @@ def test_a_run_without_a_policy_is_refused(tmp_path, capsys):
     path = save_run(tmp_path / "run", random_policy())
     (path / run_folder.POLICY_FILE).unlink()
     assert cli.main(["export", str(path), "--format", "onnx"]) == 2
-    assert "policy.npz is missing: the run was stopped before its first epoch ended" in capsys.readouterr().err
+    assert "policy.npz is missing" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_to_is_told(run, tmp_path):
     """A folder is where the unfinished file would be."""
     (tmp_path / "policy.onnx.partial").mkdir()
-    policy, started = mjx_dher.load_policy(run), run_folder.read_config(run)
+    policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
     with pytest.raises(ValueError, match=r"out: cannot write .*policy\.onnx \("):
         export.write(policy, started, "onnx", tmp_path / "policy.onnx")
 
@@ -303,7 +299,9 @@ def test_a_folder_that_cannot_be_written_to_is_told(run, tmp_path):
 def test_the_missing_extra_is_named(run, tmp_path, name, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
     assert cli.main(["export", str(run), "--format", name, "--out", str(tmp_path / f"x.{name}")]) == 2
-    assert f'format {name} needs the extra "export": pip install -e ".[export]"' in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert all(part in error for part in (f"format {name}", '"export"', ".[export]"))
 
 
 def test_exporting_loads_neither_jax_nor_mujoco(run, tmp_path):

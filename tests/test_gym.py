@@ -202,9 +202,9 @@ REFUSED = [
     (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), "render_mode must be one of rgb_array; got 'ansi'"),
     (lambda: mjx_dher.tools.render.check_drawable(Probe("auto")), "probe cannot be rendered: it needs a MuJoCo model"),
     (lambda: mjx_dher.gym.GymEnv("pusch"), r"env must be one of .*did you mean 'push'"),
-    (lambda: gymnasium.make_vec(REACH, num_envs=0), "num_envs must be an integer of at least 1; got 0"),
-    (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), "max_episode_steps must be an integer of at least 1; got 0"),
-    (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), "many environments at once are not drawn"),
+    (lambda: gymnasium.make_vec(REACH, num_envs=0), "num_envs must lie in .*; got 0"),
+    (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), "max_episode_steps must lie in .*; got 0"),
+    (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), r"render_mode must be None.*'rgb_array'"),
     (lambda: single().step(np.zeros(3)), r"action must have shape \(2,\); got \(3,\)"),
     (lambda: single().step(np.array([0, np.nan])), r"action must be finite; got \[ 0. nan\]"),
     (lambda: single().reset(options={"goal": 1}), "reset takes no options; got 'goal'"),
@@ -245,7 +245,7 @@ def test_a_step_needs_a_reset(env):
 def test_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "mjx_dher.gym")
-    with pytest.raises(ImportError, match=r'pip install "mjx-dher\[gym\]"'):
+    with pytest.raises(ImportError, match=r"gymnasium 1\.1.*\[gym\]"):
         importlib.import_module("mjx_dher.gym")
 
 

@@ -1,21 +1,25 @@
 """The kernels for Hopper GPUs. Without such a GPU stand-ins read and write what they do."""
 
 import dataclasses
+import functools
+import importlib.util
 import re
 import subprocess
 import sys
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import HParams, envs, presets
+from mjx_dher import HParams, envs, learners, presets
 from mjx_dher.hopper import gradients as hopper
 from mjx_dher.learners import ddpg
-from mjx_dher.networks import Actor, Critic
+from mjx_dher.networks import Networks, mlp
+from mjx_dher.runs.loop import state_template
 from mjx_dher.trainer import make_train
-from mjx_dher.types import Batch
+from mjx_dher.types import Batch, Sizes
 
 OBSERVATION, GOAL, SIZE = 25, 3, 256
 HPARAMS = HParams(action_l2=0.7)
@@ -23,15 +27,19 @@ HOPPER = getattr(jax.devices()[0], "compute_capability", None) == "9.0"
 
 
 def networks(dtype, action_size):
-    return ddpg.Networks(Actor(action_size, dtype=dtype), Critic(dtype=dtype))
+    return mlp(action_size, (256, 256, 256), dtype)
 
 
-def case(action_size, seed=0):
+@functools.partial(jax.jit, static_argnums=0)
+def case(action_size, seed):
     """Parameters and targets whose biases are not zero, and a normalized batch."""
     keys = jax.random.split(jax.random.key(seed), 7)
 
+    default = networks(jnp.float32, action_size)
+    learner = ddpg.DDPG(Sizes(OBSERVATION, GOAL, action_size), default, default)
+
     def params(key):
-        fresh = ddpg.init(key, networks(jnp.float32, action_size), OBSERVATION, GOAL, action_size).params
+        fresh = learner.init(key).params
         return jax.tree.map(lambda x: x + 0.05 * jax.random.normal(jax.random.fold_in(key, x.size), x.shape), fresh)
 
     batch = Batch(
@@ -45,13 +53,13 @@ def case(action_size, seed=0):
 
 
 def number(unit):
-    """Where a kernel has a unit of a hidden layer: see `hopper.blocks`."""
+    """Where a kernel has a unit of a hidden layer: see `hopper.to_kernel_order`."""
     q, t, i, b = unit // 32, unit // 8 % 4, unit // 2 % 4, unit % 2
     return 32 * q + 8 * i + 2 * t + b
 
 
 def read(blocks, rows):
-    """Weights [rows, 256] of what `hopper.blocks` has made of them, one by one."""
+    """Weights [rows, 256] of what `hopper.to_kernel_order` has made of them, one by one."""
     row, column = np.meshgrid(np.arange(rows), np.arange(256), indexing="ij")
     k, n = (number(row) if rows == 256 else row), number(column)
     return blocks.astype(jnp.float32)[64 * (32 * (k // 8) + n // 8) + 8 * (n % 8) + k % 8]
@@ -138,29 +146,35 @@ def errors(found, exact):
     return np.array([float(jnp.linalg.norm(a - b) / jnp.linalg.norm(b)) for a, b in pairs])
 
 
+@functools.cache
+def of_xla(action_size, dtype, precision=None):
+    """The gradients of a case, by XLA."""
+
+    @jax.jit
+    def gradients(*case):
+        with jax.default_matmul_precision(precision):
+            return ddpg.compute_gradients(networks(dtype, action_size), *case, HPARAMS)
+
+    return gradients
+
+
 def assert_as_good_as_xla(found, action_size, cases):
     """Gradients and losses, of several cases, are as near to those in float32 as XLA's in bfloat16 are.
 
     In the mean over the cases: how far off the mean of four numbers is, such as the gradient of the policy's last bias, is
     luck in any one.
     """
-
-    def of_xla(dtype, case):
-        gradients = lambda *x: ddpg.compute_gradients(networks(dtype, action_size), *x, HPARAMS)  # noqa: E731
-        return jax.jit(gradients)(*case)
-
     mine, theirs = [], []
     for one, case_ in zip(found, cases, strict=True):
-        with jax.default_matmul_precision("highest"):
-            exact = of_xla(jnp.float32, case_)
+        exact = of_xla(action_size, jnp.float32, "highest")(*case_)
         jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), one, exact)
         mine.append(errors(one, exact))
-        theirs.append(errors(of_xla(jnp.bfloat16, case_), exact))
+        theirs.append(errors(of_xla(action_size, jnp.bfloat16)(*case_), exact))
     assert np.all(np.mean(mine, axis=0) <= 1.5 * np.mean(theirs, axis=0) + 2e-3)
     assert np.max(mine) < 0.1
 
 
-@pytest.mark.parametrize("action_size", [4, 2])
+@pytest.mark.parametrize("action_size", [4, pytest.param(2, marks=pytest.mark.slow)])
 def test_gradients_are_put_together(action_size, monkeypatch):
     monkeypatch.setattr(hopper, "_calls", lambda: (critic_pass, actor_pass))
     cases = [case(action_size, seed) for seed in range(3)]
@@ -169,7 +183,7 @@ def test_gradients_are_put_together(action_size, monkeypatch):
 
 
 @pytest.mark.skipif(not HOPPER, reason="needs an NVIDIA H100 or H200")
-@pytest.mark.parametrize("action_size", [4, 2])
+@pytest.mark.parametrize("action_size", [4, pytest.param(2, marks=pytest.mark.slow)])
 def test_kernels_compute_gradients(action_size):
     cases = [case(action_size, seed) for seed in range(3)]
     together = jax.tree.map(lambda *x: jnp.stack(x), *cases)
@@ -198,7 +212,7 @@ for kernel in (kernels.critic_pass, kernels.actor_pass):
     assert len(list(tmp_path.glob("*.ptx"))) == 2
 
 
-STATIC = dataclasses.replace(presets.preset("paper", "push")[0], learner_dtype="bfloat16", learner_kernels="hopper")
+STATIC = dataclasses.replace(presets.preset("paper", "push").config, learner_dtype="bfloat16", learner_kernels="hopper")
 
 
 class Device:
@@ -207,28 +221,62 @@ class Device:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sizes", "capability", "message"),
+    ("changes", "sizes", "capability", "parts"),
     [
-        ({}, (28, 4), "9.0", None),
-        ({"learner_dtype": "float32"}, (28, 4), "9.0", "learner_dtype bfloat16; it is float32"),
-        ({"hidden_sizes": (256, 256)}, (28, 4), "9.0", "hidden_sizes (256, 256, 256); they are (256, 256)"),
-        ({"batch_size": 1000}, (28, 4), "9.0", "a batch_size that 256 divides; it is 1000"),
-        ({}, (57, 4), "9.0", "at most 56 numbers of observation and goal and 4 of an action; this environment has 57 and 4"),
-        ({}, (28, 5), "9.0", "at most 56 numbers of observation and goal and 4 of an action; this environment has 28 and 5"),
-        ({}, (28, 4), "8.0", "an NVIDIA H100 or H200; JAX runs on NVIDIA of 8.0 here"),
+        ({"learner_dtype": "float32"}, (28, 4), "9.0", ["learner_dtype bfloat16", "is float32"]),
+        ({"hidden_sizes": (256, 256)}, (28, 4), "9.0", ["hidden_sizes (256, 256, 256)", "are (256, 256)"]),
+        ({"batch_size": 1000}, (28, 4), "9.0", ["batch_size", "256 divides", "is 1000"]),
+        ({}, (57, 4), "9.0", ["56", "observation and goal", "4 of an action", "has 57 and 4"]),
+        ({}, (28, 5), "9.0", ["56", "observation and goal", "4 of an action", "has 28 and 5"]),
+        ({}, (28, 4), "8.0", ["H100 or H200", "NVIDIA of 8.0"]),
     ],
 )
-def test_problem(changes, sizes, capability, message, monkeypatch):
+def test_what_they_lack_is_named(changes, sizes, capability, parts, monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [Device(capability)])
-    assert hopper.unsupported_reason(dataclasses.replace(STATIC, **changes), *sizes) == message
+    reason = hopper.unsupported_reason(dataclasses.replace(STATIC, **changes), *sizes)
+    assert all(part in reason for part in parts), reason
+
+
+@pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs warp-lang")
+def test_they_lack_nothing_on_such_a_gpu(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [Device("9.0")])
+    assert hopper.unsupported_reason(STATIC, 28, 4) is None
 
 
 @pytest.mark.skipif(HOPPER, reason="can use them")
 def test_kernels_that_cannot_be_used_are_refused_at_once():
     env = envs.make("push", engine="native")
-    with pytest.raises(ValueError, match="learner_kernels hopper needs an NVIDIA H100 or H200; JAX runs on cpu here"):
+    with pytest.raises(ValueError, match=r"learner_kernels hopper needs .*H100 or H200; .* cpu here"):
         make_train(env, STATIC)
     make_train(env, dataclasses.replace(STATIC, learner_kernels="auto"))
+
+
+class Bounded(nn.Module):
+    """An actor of one layer."""
+
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        return jnp.tanh(nn.Dense(self.action_size)(jnp.concatenate([observation, goal], axis=-1)))
+
+
+def own_networks(action_size, hidden_sizes, dtype):
+    """An actor of one's own, and the default critic."""
+
+    _, critic = mlp(action_size, hidden_sizes, dtype)
+    return Networks(Bounded(action_size), critic)
+
+
+def test_networks_of_one_s_own_are_refused_and_auto_takes_xla_for_them(monkeypatch):
+    """They know the default networks alone."""
+    monkeypatch.setattr(hopper, "unsupported_reason", lambda *args: None)
+    sizes = Sizes(OBSERVATION, GOAL, 4)
+    with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
+        learners.make("ddpg", STATIC, sizes, own_networks)
+    auto = dataclasses.replace(STATIC, learner_kernels="auto")
+    assert learners.make("ddpg", auto, sizes, own_networks).compute_gradients is ddpg.compute_gradients
+    assert learners.make("ddpg", auto, sizes).compute_gradients is hopper.compute_gradients
 
 
 def test_the_learner_uses_them(monkeypatch):
@@ -242,10 +290,9 @@ def test_the_learner_uses_them(monkeypatch):
     monkeypatch.setattr(hopper, "unsupported_reason", lambda *args: None)
     monkeypatch.setattr(hopper, "compute_gradients", gradients)
     env = envs.make("reach", engine="native")
-    small = dataclasses.replace(STATIC, env="reach", num_envs=2, cycles_per_epoch=1, batch_size=256, replay_size=1000)
+    small = dataclasses.replace(STATIC, num_envs=2, cycles_per_epoch=1, batch_size=256, replay_size=1000)
     for kernels, uses in (("xla", False), ("auto", True), ("hopper", True)):
         program = make_train(env, dataclasses.replace(small, learner_kernels=kernels))
-        state = jax.eval_shape(program.init, jax.random.key(0), jax.tree.map(jnp.float32, HParams()))
-        jax.eval_shape(program.epoch, state)
+        jax.eval_shape(program.epoch, state_template(program))
         assert bool(asked) is uses
         asked.clear()

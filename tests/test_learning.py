@@ -1,23 +1,26 @@
 """From nothing to a policy, with the settings that a user gets."""
 
-import dataclasses
-
 import jax
 import numpy as np
+import pytest
 
-from mjx_dher import cli, envs, policy, presets, trainer
+from mjx_dher import envs, learners, presets, samplers, trainer
+from mjx_dher.runs import play
+from mjx_dher.runs.loop import train
 
 
+@pytest.mark.slow  # tests/test_trainer.py trains the point mass
 def test_reach_is_learned():
     """The preset `cpu`, physics included: at least 0.99 of 300 fresh episodes; an untrained policy reaches hardly any."""
-    settings, hparams = presets.preset("cpu", "reach")
+    spec = presets.preset("cpu", "reach", sampler="weighted")
     env = envs.make("reach")
-    learner = None
-    for progress in trainer.train(env, dataclasses.replace(settings, sampler="weighted"), hparams, seed=0):
-        learner = progress.state.learner
-    untrained = trainer.make_train(env, settings).init(jax.random.key(0), hparams).learner
-    before = cli.play(env, policy.from_learner(untrained, hparams), 300, seed=1)
-    after = cli.play(env, policy.from_learner(learner, hparams), 300, seed=1)
+    learner = learners.make(spec.learner, spec.config, trainer.env_sizes(env), spec.networks)
+    for progress in train(env, spec.config, spec.hparams, seed=0, sampler=samplers.make(*spec.sampler_choice), learner=learner):
+        trained = progress.state.learner
+    before, after = (
+        play.play(env, learner.export(jax.device_get(state), spec.hparams), 300, seed=1)
+        for state in (learner.init(jax.random.key(0)), trained)
+    )
     np.testing.assert_array_equal(before.reset_success, after.reset_success)
     assert before.success.mean() < 0.2
     assert after.success.mean() >= 0.99

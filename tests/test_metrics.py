@@ -3,13 +3,14 @@ import json
 import math
 import struct
 
+import jax
 import jax.numpy as jnp
 import pytest
 
-from mjx_dher import Config, HParams, trainer
+from mjx_dher import HParams, RunSpec, trainer
 from mjx_dher.host import memory
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs import run_folder, sinks
+from mjx_dher.runs import loop, run_folder, sinks
 
 
 def row(epoch, **more):
@@ -76,14 +77,15 @@ def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
 
 def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
-    run_folder.create(tmp_path / "run", run_folder.RunConfig(Config(), HParams(), 3, "native"), {})
+    run_folder.create(tmp_path / "run", RunSpec(seed=3, sampler="closest"), "native", {})
     sink = sinks.open_sinks(tmp_path / "run", ["wandb"])[1]
     run = sink._run
     sink.write(row(1))
     sink.write(row(2))
     assert run.summary["success_rate"] == 0.2
     sink.close()
-    assert (run.config["seed"], run.config["gamma"], run.config["env"]) == (3, HParams().gamma, "push")
+    expected = {"seed": 3, "gamma": HParams().gamma, "env": "push", "sampler": "closest", "engine": "native", "num_envs": 16}
+    assert {name: run.config[name] for name in expected} == expected
     (kept,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
     assert kept.name.endswith(run.id)
     assert any(kept.glob("*.wandb"))
@@ -109,9 +111,9 @@ def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):
 def test_what_was_relabelled_by_hand():
     goal = jnp.zeros((4, 2))
     hindsight = jnp.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
-    found = trainer._moved(goal, hindsight)
+    found = trainer._relabel_metrics(goal, hindsight)
     assert found == {"relabelled_share": 0.5, "relabel_distance": 3.0}
-    assert trainer._moved(goal, goal) == {"relabelled_share": 0.0, "relabel_distance": 0.0}
+    assert trainer._relabel_metrics(goal, goal) == {"relabelled_share": 0.0, "relabel_distance": 0.0}
 
 
 def test_memory_in_use_is_known_and_plausible():
@@ -122,7 +124,7 @@ def test_every_metric_is_documented():
     from test_trainer import ENV, SMALL
 
     program = trainer.make_train(ENV, SMALL)
-    found = trainer.jax.eval_shape(lambda state: program.epoch(state)[1], trainer.state_template(program))
+    found = jax.eval_shape(lambda state: program.epoch(state)[1], loop.state_template(program))
     text = (run_folder.Path(__file__).parent.parent / "docs" / "logs.md").read_text()
     for name in (*sinks.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
         assert f"| `{name}` |" in text, name

@@ -1,15 +1,18 @@
-"""Environments and samplers of one's own, named as module:attribute."""
+"""Environments, samplers, metrics, priorities, learners and networks of one's own, named as module:attribute."""
 
 import csv
+import dataclasses
 import json
+import sys
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import mjx_dher
-from mjx_dher import cli, config, envs, samplers
+from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
 from mjx_dher.cli import sweep as cli_sweep
+from mjx_dher.runs import play, run_folder
 from point_mass import PointMass, soon
 
 TINY = """
@@ -17,8 +20,14 @@ TINY = """
     --hidden-sizes 8 --eval-episodes 2 --final-episodes 4
 """.split()  # noqa: SIM905
 OWN = ["--env", "my_tasks:MyTask", "--sampler", "my_tasks:soon", *TINY]
+PARTS = ("metric", "priority", "learner", "networks")
+OWN_PARTS = [*OWN, "--sampler", "weighted", *(word for part in PARTS for word in (f"--{part}", f"my_tasks:{part}"))]
 MY_TASKS = """
-import os, signal
+import dataclasses, os, signal
+import flax.linen as nn
+import jax.numpy as jnp
+from mjx_dher.learners.ddpg import DDPG
+from mjx_dher.networks import Networks
 from point_mass import PointMass, soon
 
 class MyTask(PointMass):
@@ -30,6 +39,40 @@ class MyTask(PointMass):
     checks = 0
 
 TWO = 2
+
+traced = set()  # which parts a program was made of
+
+def metric(achieved, desired):
+    traced.add("metric")
+    return jnp.abs(achieved - desired[None]).max(axis=-1)
+
+def priority(episode, compute_reward, hparams):
+    traced.add("priority")
+    return jnp.full((), 0.25)
+
+class Actor(nn.Module):
+    @nn.compact
+    def __call__(self, observation, goal):
+        traced.add("networks")
+        return jnp.tanh(nn.Dense(2)(goal - observation))
+
+class Critic(nn.Module):
+    @nn.compact
+    def __call__(self, observation, goal, action):
+        return nn.Dense(1)(jnp.concatenate([goal - observation, action], axis=-1))[..., 0]
+
+def networks(action_size, hidden_sizes, dtype):
+    return Networks(Actor(), Critic())
+
+@dataclasses.dataclass(frozen=True)
+class Learner(DDPG):
+    def summary(self, state):
+        traced.add("learner")
+        return {"updates_made": state.num_updates.astype(jnp.float32)}
+
+def learner(config, sizes, networks):
+    both = networks(sizes.action, config.hidden_sizes, "float32")
+    return Learner(sizes, both, both)
 """
 
 
@@ -48,13 +91,93 @@ def folder(tmp_path_factory):
 def test_a_run_in_the_current_folder_s_module_is_resumed_and_evaluated(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert cli.main(["resume", "run"]) == 0
-    assert "my_tasks:MyTask, sampler my_tasks:soon, seed 0; physics none" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert all(part in said for part in ("my_tasks:MyTask, sampler my_tasks:soon, seed 0;", "physics none")), said
     assert cli.main(["eval", "run", "--episodes", "4"]) == 0
     assert "my_tasks:MyTask: 4 episodes" in capsys.readouterr().out
-    settings = json.loads((folder / "run" / "config.json").read_text())["config"]
-    assert (settings["env"], settings["sampler"]) == ("my_tasks:MyTask", "my_tasks:soon")
-    with (folder / "run" / "metrics.csv").open() as file:
-        assert [row["env_steps"] for row in csv.DictReader(file)] == ["20", "40", "60"]
+    content = json.loads((folder / "run" / "config.json").read_text())
+    assert (content["env"], content["sampler"]) == ("my_tasks:MyTask", "my_tasks:soon")
+    assert [row["env_steps"] for row in rows(folder / "run")] == ["20", "40", "60"]
+
+
+def rows(run):
+    with (run / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def parts(folder):
+    """A run of which every part is the user's own: stopped after an epoch, and resumed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        import my_tasks
+
+        patch.setenv("STOP_AFTER_AN_EPOCH", "1")
+        my_tasks.traced.clear()
+        assert cli.main([*OWN_PARTS, "--total-steps", "60", "--out", "parts"]) == 130
+        assert my_tasks.traced == set(PARTS)
+        assert [row["env_steps"] for row in rows(folder / "parts")] == ["20"]
+        patch.delenv("STOP_AFTER_AN_EPOCH")
+        assert cli.main(["resume", "parts"]) == 0
+    return folder / "parts"
+
+
+def test_every_part_of_a_run_can_be_one_s_own(parts):
+    found = run_folder.read_spec(parts)
+    assert {part: getattr(found, part) for part in PARTS} == {part: f"my_tasks:{part}" for part in PARTS}
+    assert found.sampler == "weighted"
+    written = rows(parts)
+    assert [row["env_steps"] for row in written] == ["20", "40", "60"]
+    assert [row["priority_mean"] for row in written] == ["0.25"] * 3
+    assert [row["updates_made"] for row in written] == ["2", "4", "6"]
+    assert "actor_norm" not in written[0]
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(parts, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert cli.main([*OWN_PARTS, "--total-steps", "60", "--out", "parts_in_one_go"]) == 0
+    with np.load(parts / "policy.npz") as resumed, np.load(folder / "parts_in_one_go" / "policy.npz") as whole:
+        assert resumed.files == whole.files
+        for name in whole.files:
+            np.testing.assert_array_equal(resumed[name], whole[name])
+
+
+def test_a_policy_of_one_s_own_networks_is_evaluated_and_loaded(parts, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert cli.main(["eval", "parts", "--episodes", "4"]) == 0
+    assert "my_tasks:MyTask: 4 episodes" in capsys.readouterr().out
+    policy = mjx_dher.load_policy(parts)
+    actions = policy({"observation": np.zeros((5, 2)), "desired_goal": np.arange(10.0).reshape(5, 2)})
+    assert actions.shape == (5, 2)
+    assert actions.std() > 0
+
+
+@pytest.mark.parametrize("command", [["export", "--format", "onnx"], ["transfer", "--python", sys.executable]])
+def test_what_cannot_take_a_policy_of_one_s_own_networks_says_so(parts, folder, monkeypatch, command, capsys):
+    monkeypatch.chdir(folder)
+    before = {path.name for path in parts.iterdir()}
+    assert cli.main([command[0], "parts", *command[1:]]) == 2
+    error = capsys.readouterr().err
+    assert all(word in error for word in (command[0], "'my_tasks:learner'", "'my_tasks:networks'")), error
+    assert {path.name for path in parts.iterdir()} == before
+
+
+@pytest.mark.parametrize("part", [*PARTS, "weight_kernel"])
+def test_a_part_that_is_none_is_refused(folder, monkeypatch, part, capsys):
+    monkeypatch.chdir(folder)
+    flag = "--" + part.replace("_", "-")
+    default = getattr(RunSpec(), part)
+    for name, said in {
+        default[:-1]: [repr(default[:-1]), repr(default), "module:attribute"],
+        "my_task:x": ["'my_task'", "'my_tasks'", "no module"],
+        "my_tasks:tracd": ["'my_tasks:tracd'", "'traced'"],
+        "my_tasks:TWO": ["must be a function", "2"],
+    }.items():
+        assert cli.main([*OWN, "--sampler", "weighted", flag, name, "--total-steps", "20", "--out", "refused"]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert all(word in error for word in (part, *said)), error
+    assert not (folder / "refused").exists()
 
 
 def test_its_policy_needs_no_module(folder):
@@ -63,20 +186,26 @@ def test_its_policy_needs_no_module(folder):
 
 
 def test_a_policy_is_played_where_there_is_no_check(folder):
-    outcome = cli.play(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
+    outcome = play.play(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
     assert outcome.success.shape == (4,)
 
 
 def test_a_sweep_takes_them(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    _, (cell,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
-    assert (cell.config.env, cell.config.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
-    assert cell.name.startswith("my_tasks-mytask-my_tasks-soon-s0-")
+    _, (trial,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
+    assert (trial.env, trial.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
+    assert run_folder.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
+    _, trials = cli_sweep.parse_sweep_args(
+        [*OWN_PARTS, "--learner", "ddpg", "my_tasks:learner", "--seeds", "1", "--out", "sweep"]
+    )
+    assert [trial.learner for trial in trials] == ["ddpg", "my_tasks:learner"]
+    assert {trial.networks for trial in trials} == {"my_tasks:networks"}
 
 
 @pytest.mark.slow
 def test_a_sweep_trains_them(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
+    monkeypatch.setenv("COLUMNS", "250")  # so that the table's names are not folded
     assert cli.main(["sweep", *OWN, "--total-steps", "20", "--seeds", "1", "--lanes", "1", "--out", "sweep"]) == 0
     assert "my_tasks:soon" in capsys.readouterr().out
     assert len(list((folder / "sweep" / "cells").glob("*/result.json"))) == 1
@@ -90,10 +219,8 @@ def test_what_has_no_model_is_not_rendered():
 
 
 def test_a_fresh_run_folder_s_name_is_one_of_a_file(monkeypatch, tmp_path):
-    from mjx_dher.runs import run_folder
-
     monkeypatch.chdir(tmp_path)
-    path = run_folder.choose(None, config.Config(env="my.Tasks:Mine", sampler="my.tasks:soon"), seed=3)
+    path = run_folder.choose(None, RunSpec(env="my.Tasks:Mine", sampler="my.tasks:soon", seed=3))
     assert path.name.startswith("my-tasks-mine-my-tasks-soon-s3-")
 
 
@@ -121,8 +248,8 @@ def test_make_imports_it():
             "collections:Counter",
             "is no environment: it has no action_size, episode_length, reset, step, comp",
         ),
-        (samplers.make, "my_tasks:TWO", "sampler 'my_tasks:TWO' must be a function .* or a samplers.Sampler; it is 2"),
-        (samplers.make, "point_mass:PointMass", "sampler 'point_mass:PointMass' must be a function .*; it is <class"),
+        (samplers.make, "my_tasks:TWO", r"sampler must be a function \(achieved, desired, step, hparams\); it is 2"),
+        (samplers.make, "point_mass:PointMass", r"sampler must be a function \(achieved, .*\); it is <class"),
         (samplers.make, "point_mass:son", "module point_mass has no 'son' .did you mean 'soon'"),
     ],
 )
@@ -137,22 +264,25 @@ def test_an_environment_without_an_engine_has_none_to_choose():
         envs.make("point_mass:PointMass", engine="native")
 
 
-def test_what_a_module_raises_is_raised_as_it_is(monkeypatch, tmp_path):
+def test_what_a_module_raises_is_named_and_the_cause_kept(monkeypatch, tmp_path):
     (tmp_path / "lacks_another.py").write_text("import not_there")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(ModuleNotFoundError, match="No module named 'not_there'"):
+    with pytest.raises(
+        ValueError, match=r"env 'lacks_another:Task': importing it failed: .*No module named 'not_there'"
+    ) as error:
         envs.make("lacks_another:Task")
+    assert isinstance(error.value.__cause__, ModuleNotFoundError)
 
 
 def test_nothing_is_assumed_of_the_length_of_its_episodes():
-    short = config.Config(env="point_mass:PointMass", num_envs=8, replay_size=80, batch_size=16)
-    config.validate(short, config.HParams())
-    with pytest.raises(ValueError, match="8 episodes x 50 steps = 400"):
-        config.validate(config.dataclasses.replace(short, env="push"), config.HParams())
-    with pytest.raises(ValueError, match="8 episodes x 20 steps = 160"):
-        config.validate(short, config.HParams(), episode_length=20)
+    short = RunSpec(env="point_mass:PointMass", config=Config(num_envs=8, replay_size=80, batch_size=16))
+    spec.validate(short, envs.list_envs())
+    with pytest.raises(ValueError, match=r"replay_size .* 8 episodes x 50 steps = 400 .*got 80"):
+        spec.validate(dataclasses.replace(short, env="push"), envs.list_envs())
+    with pytest.raises(ValueError, match=r"replay_size .* 8 episodes x 20 steps = 160 .*got 80"):
+        spec.validate(short, envs.list_envs(), episode_length=20)
 
 
 def test_soon_halves():
-    log_weights = soon(jnp.zeros((5, 2)), jnp.zeros(2), jnp.array(1), config.HParams())
+    log_weights = soon(jnp.zeros((5, 2)), jnp.zeros(2), jnp.array(1), HParams())
     np.testing.assert_allclose(samplers.probabilities(log_weights), [0, 0, 4 / 7, 2 / 7, 1 / 7], rtol=1e-6)

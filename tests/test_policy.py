@@ -9,32 +9,37 @@ import pytest
 from conftest import ROOT
 
 import mjx_dher
-from mjx_dher import policy
+from mjx_dher import RunSpec, learners
 from mjx_dher.config import Config, HParams
 from mjx_dher.host.files import FolderError
-from mjx_dher.learners import ddpg
-from mjx_dher.learners.ddpg import Networks
-from mjx_dher.networks import Actor, Critic
 from mjx_dher.runs import run_folder
-from mjx_dher.runs.run_folder import RunConfig
+from mjx_dher.types import Sizes
 
 HP = HParams(norm_clip=3.0)
-NETWORKS = Networks(actor=Actor(4), critic=Critic())
+DDPG = learners.make("ddpg", Config(), Sizes(25, 3, 4))
+SPEC = RunSpec(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native", sampler="closest", metric="a:b")
 
 
 @pytest.fixture(scope="module")
 def learner():
     keys = jax.random.split(jax.random.key(0), 3)
-    state = ddpg.init(keys[0], NETWORKS, 25, 3, 4)
     observations = 0.3 * jax.random.normal(keys[1], (100, 25)) + 1.3
-    return ddpg.update_normalizers(state, observations.at[:, 5].set(0.0), jax.random.normal(keys[2], (100, 3)), HP)
+    goals = jax.random.normal(keys[2], (100, 3))
+
+    @jax.jit  # one program instead of some hundred
+    def learner(key, observations, goals):
+        state = DDPG.init(key)
+        # Biases begin as 0, and would not be missed.
+        state = state.replace(params=jax.tree.map(lambda x: x + 0.1 if x.ndim == 1 else x, state.params))
+        return DDPG.update_normalizers(state, observations, goals, HP)
+
+    return learner(keys[0], observations.at[:, 5].set(0.0), goals)
 
 
 @pytest.fixture
 def run_dir(tmp_path, learner):
-    run = RunConfig(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native")
-    run_folder.create(tmp_path / "run", run, {"note": "for the reader"})
-    policy.from_learner(learner, HP).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    run_folder.create(tmp_path / "run", SPEC, "native", {"note": "for the reader"})
+    DDPG.export(learner, HP).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
 
@@ -51,15 +56,16 @@ def test_the_loaded_policy_acts_as_the_learner_does(run_dir, learner):
     assert actions.shape == (64, 4)
     assert np.abs(actions).max() <= 1
     assert np.abs(actions).std() > 0.05
-    np.testing.assert_allclose(actions, ddpg.act(NETWORKS, learner, obs, HP), atol=1e-5)
+    np.testing.assert_allclose(actions, jax.jit(DDPG.act)(learner, obs, HP), atol=1e-5)
     np.testing.assert_allclose(loaded({k: v[7] for k, v in obs.items()}), actions[7], atol=1e-6)
     traced = jax.jit(lambda o: loaded.forward(o["observation"], o["desired_goal"], jnp))(obs)
     np.testing.assert_allclose(actions, traced, atol=1e-5)
 
 
-def test_a_run_config_comes_back_as_it_was(run_dir):
-    run = run_folder.read_config(run_dir)
-    assert run == RunConfig(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native")
+def test_a_description_comes_back_as_it_was(run_dir):
+    assert run_folder.read_spec(run_dir) == SPEC
+    content = run_folder.read_content(run_dir)
+    assert (content["engine"], content["physics"], content["note"]) == ("native", "native", "for the reader")
 
 
 def test_loading_and_acting_need_numpy_alone(run_dir):
@@ -125,9 +131,9 @@ def damage(run_dir, how):
     [
         ("no config", "is not a run folder: it has no config.json"),
         ("broken json", "config.json cannot be read"),
-        ("foreign json", "is not of this program's schema 1 .found None"),
-        ("list", "is not of this program's schema 1"),
-        ("newer schema", "is not of this program's schema 1 .found 99"),
+        ("foreign json", "config.json is not of this program's schema 2 .found None"),
+        ("list", "config.json is not of this program's schema 2"),
+        ("newer schema", "config.json is not of this program's schema 2 .found 99"),
         ("unknown field", "config.json does not describe a run"),
         ("no policy", "policy.npz is missing: the run was stopped before its first epoch ended"),
         ("truncated policy", "policy.npz is damaged"),
@@ -148,11 +154,11 @@ def test_no_folder(tmp_path):
 
 def test_a_folder_in_use_is_never_chosen(run_dir, tmp_path, monkeypatch):
     with pytest.raises(FolderError, match=r"out: .* is there already and is never overwritten"):
-        run_folder.choose(run_dir, Config(), 0)
+        run_folder.choose(run_dir, RunSpec())
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert run_folder.choose(empty, Config(), 0) == empty
+    assert run_folder.choose(empty, RunSpec()) == empty
     monkeypatch.chdir(tmp_path)
-    first = run_folder.choose(None, Config(), 0)
+    first = run_folder.choose(None, RunSpec())
     first.mkdir(parents=True)
-    assert run_folder.choose(None, Config(), 0) != first
+    assert run_folder.choose(None, RunSpec()) != first

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import config, envs, make_train, replay, samplers, trainer
+from mjx_dher import envs, make_train, replay, samplers
 from mjx_dher.learners import ddpg
-from mjx_dher.sweeps import sweep
+from mjx_dher.runs.loop import state_template
+from mjx_dher.runs.program import Lane
+from mjx_dher.spec import SAMPLERS, WEIGHT_KERNELS
 from point_mass import PointMass
 from probes import Explodes
 
@@ -40,21 +42,31 @@ def test_it_would_be_noticed():
 
 @pytest.mark.parametrize(("sampler", "dtype"), [("future", "float32"), ("random", "bfloat16")])
 def test_an_epoch_in_which_physics_may_blow_up(sampler, dtype):
-    program = make_train(Explodes(None), dataclasses.replace(SMALL, sampler=sampler, learner_dtype=dtype))
-    jax.eval_shape(program.epoch, trainer.state_template(program))
+    config = dataclasses.replace(SMALL, learner_dtype=dtype)
+    program = make_train(Explodes(None), config, sampler=samplers.make(sampler))
+    jax.eval_shape(program.epoch, state_template(program))
+
+
+def test_an_epoch_with_a_priority_of_one_s_own():
+    def by_hand(episode, compute_reward, hparams):
+        distance = jnp.linalg.norm(episode.achieved_goal[-1] - episode.achieved_goal[0])
+        return jnp.where(compute_reward(episode.achieved_goal[-1], episode.desired_goal) < 0, distance, hparams.epsilon)
+
+    program = make_train(PointMass(), SMALL, priority=by_hand)
+    jax.eval_shape(program.epoch, state_template(program))
 
 
 def test_an_epoch_with_every_sampler_and_kernel_as_a_sweep_has_them():
-    every = [*(samplers.make(name) for name in config.SAMPLERS), *(samplers.make("weighted", k) for k in config.WEIGHT_KERNELS)]
-    program = make_train(PointMass(), SMALL, samplers.one_of(every))
-    lanes = sweep.Lane(*(jnp.zeros(3) for _ in sweep.Lane._fields))
+    every = [*(samplers.make(name) for name in SAMPLERS), *(samplers.make("weighted", k) for k in WEIGHT_KERNELS)]
+    program = make_train(PointMass(), SMALL, sampler=samplers.one_of(every))
+    lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)
     jax.eval_shape(jax.vmap(program.epoch), states)
 
 
 def test_replay_drawn_from_without_rows():
     program = make_train(PointMass(), SMALL)
-    ring = trainer.state_template(program).replay
+    ring = state_template(program).replay
     jax.eval_shape(lambda ring, key: replay.sample(ring, key, 5), ring, jax.random.key(0))
 
 

@@ -1,7 +1,7 @@
 """What must hold for all values, tried on many: the same ones in every run."""
 
 import dataclasses
-import math
+import re
 
 import jax
 import numpy as np
@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from test_replay import T, make_episodes, make_ring
 
 from mjx_dher import config, replay
-from mjx_dher.config import Config, HParams
+from mjx_dher.config import Config, HParams, Number
 
 every_run_alike = settings(deadline=None, max_examples=60, derandomize=True)
 
-SIZES = [f.name for f in dataclasses.fields(Config) if f.type == "int"]
+INTERVALS = {name: number.interval for owner in (Config, HParams) for name, number in config.metadata(owner, Number).items()}
+SIZES = [name for name in config.metadata(Config, Number) if name != "hidden_sizes"]
 counts = st.integers(1, 300)
 
 
@@ -40,7 +41,7 @@ def configs(draw):
 @given(configs())
 @every_run_alike
 def test_what_can_run_is_taken_and_its_sizes_agree(found):
-    config.validate(found, HParams())
+    config.validate(found, HParams(), 50)
     epochs, steps = config.num_epochs(found, 50), config.steps_per_epoch(found, 50)
     assert steps == found.num_envs * 50 * found.cycles_per_epoch
     assert (epochs - 1) * steps < found.total_steps <= epochs * steps
@@ -49,42 +50,54 @@ def test_what_can_run_is_taken_and_its_sizes_agree(found):
     assert capacity >= found.num_envs
 
 
+def test_every_size_and_every_number_has_a_range():
+    assert set(SIZES) == {field.name for field in dataclasses.fields(Config) if type(field.default) is int}
+    assert len(SIZES) == 8
+    assert INTERVALS.keys() == {*SIZES, "hidden_sizes", *HParams._fields}
+
+
 NO_COUNTS = st.one_of(st.integers(-(10**6), 0), st.floats(), st.booleans(), st.none(), st.text(max_size=3))
 
 
 @given(configs(), st.sampled_from(SIZES), NO_COUNTS)
 @every_run_alike
 def test_what_is_no_count_is_refused_by_the_name_of_its_field(found, field, value):
-    with pytest.raises(ValueError, match=f"{field} must be an integer of at least 1; got"):
-        config.validate(dataclasses.replace(found, **{field: value}), HParams())
+    must = "lie" if type(value) is int else "be an integer"
+    message = f"{field} must {must} in {INTERVALS[field]}; got {value!r}"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        config.validate(dataclasses.replace(found, **{field: value}), HParams(), 50)
 
 
 @given(configs(), st.one_of(st.lists(NO_COUNTS, min_size=1, max_size=3).map(tuple), st.just(()), st.just((True,)), counts))
 @every_run_alike
 def test_what_are_no_hidden_sizes_is_refused(found, sizes):
-    with pytest.raises(ValueError, match="hidden_sizes must be one or more integers of at least 1"):
-        config.validate(dataclasses.replace(found, hidden_sizes=sizes), HParams())
+    interval = re.escape(INTERVALS["hidden_sizes"])
+    with pytest.raises(ValueError, match=rf"^hidden_sizes must .* {interval}; got ") as error:
+        config.validate(dataclasses.replace(found, hidden_sizes=sizes), HParams(), 50)
+    assert repr(sizes[0] if isinstance(sizes, tuple) and sizes else sizes) in str(error.value)
 
 
 @given(st.sampled_from(HParams._fields), st.one_of(st.floats(), st.text(max_size=3), st.none()))
 @every_run_alike
 def test_a_number_is_taken_if_and_only_if_it_is_in_its_range(field, value):
-    low, with_low, high, with_high = config._HPARAM_RANGES[field]
-    inside = isinstance(value, float) and math.isfinite(value)
-    inside = inside and (value >= low if with_low else value > low) and (value <= high if with_high else value < high)
+    left, low, high, right = re.fullmatch(r"([\[(])(.+), (.+)([\])])", INTERVALS[field]).groups()
+    inside = isinstance(value, float) and float(low) <= value <= float(high)
+    inside = inside and (left == "[" or value != float(low)) and (right == "]" or value != float(high))
     hparams = HParams(**{field: value})
     if inside:
-        config.validate(Config(), hparams)
+        config.validate(Config(), hparams, 50)
     else:
-        with pytest.raises(ValueError, match=f"{field} must (lie in|be a number)"):
-            config.validate(Config(), hparams)
+        must = "lie" if isinstance(value, float) else "be a number"
+        with pytest.raises(ValueError, match=re.escape(f"{field} must {must} in {INTERVALS[field]}; got {value!r}")):
+            config.validate(Config(), hparams, 50)
 
 
 ROWS = 5
-add = jax.jit(lambda ring, episodes, eventful, valid: replay.add(ring, episodes, eventful, valid))
+add = jax.jit(replay.add)
+cumulate = jax.jit(replay.cumulative_priority)
 draw = jax.jit(lambda ring, key: replay.sample(ring, key, 64))
-# Of each episode: is it eventful, is it valid.
-added = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=3, max_size=3)
+# Of each episode: its priority, exact in binary, and whether it is valid.
+added = st.lists(st.tuples(st.sampled_from([0.0, 1.0, 0.25, 3.0, 2.0**20]), st.booleans()), min_size=3, max_size=3)
 
 
 @given(st.lists(added, max_size=6), st.integers(0, 2**31 - 1))
@@ -93,16 +106,20 @@ def test_a_ring_holds_the_newest_valid_episodes_and_nothing_else(batches, seed):
     ring, model = make_ring(ROWS), []
     for number, batch in enumerate(batches):
         ids = 3 * number + np.arange(3) + 1
-        eventful, valid = np.array(batch).T
-        ring = add(ring, make_episodes(ids), eventful, valid)
-        model += [(i, e) for i, e, v in zip(ids, eventful, valid) if v]
+        priority, valid = (np.array(values) for values in zip(*batch))
+        ring = add(ring, make_episodes(ids), priority.astype(np.float32), valid)
+        model += [(i, p) for i, p, v in zip(ids, priority, valid) if v]
     model = model[-ROWS:]
     size = int(ring.size)
     assert size == len(model)
     rows = ring.episodes.action[:size, 0, 0] // 1000
-    assert sorted(zip(rows.tolist(), ring.eventful[:size].tolist())) == sorted((float(i), bool(e)) for i, e in model)
+    assert sorted(zip(rows.tolist(), ring.priority[:size].tolist())) == sorted((float(i), p) for i, p in model)
     assert bool(replay.can_sample(ring)) == bool(model)
-    assert replay.count_eventful(ring)[-1] == sum(e for _, e in model)
+    total = sum(p for _, p in model)
+    unit = 2.0 ** np.floor(np.log2(total)) / 2**29 if total else 1.0
+    expected = np.cumsum(np.array(ring.priority, np.float64) / unit)
+    np.testing.assert_array_equal(cumulate(ring), expected)
+    assert expected[-1] == total / unit
     if model:
         sample = draw(ring, jax.random.key(seed))
         ids, steps = np.divmod(np.asarray(sample.observation["scalar"]), 1000)

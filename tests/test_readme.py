@@ -1,4 +1,5 @@
 import re
+import runpy
 
 from conftest import ROOT
 
@@ -24,3 +25,8 @@ def test_the_two_commands_are_what_ci_installs_and_runs():
     assert 'pip install -e ".[test]" && pytest\n' in README
     assert '-e ".[test]"' in ci
     assert ci.rstrip().endswith("\npytest")
+
+
+def test_the_picture_of_the_design_is_what_its_script_draws():
+    figure = runpy.run_path(str(ROOT / "docs" / "make_design_figure.py"))["make"]()
+    assert figure == (ROOT / "docs" / "images" / "design.svg").read_text()

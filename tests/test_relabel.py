@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import config, replay, samplers
+from mjx_dher import replay, samplers
 from mjx_dher.config import HParams
-from mjx_dher.relabel import hindsight_goals, is_eventful, relabel
+from mjx_dher.relabel import hindsight_goals, relabel
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Episode
+from mjx_dher.spec import SAMPLERS
 from probes import Clock
 
 HP = HParams()
@@ -31,7 +31,7 @@ def index_of(goal, episode_goals):
     return np.where(equal.any(-1), equal.argmax(-1), -1)
 
 
-@pytest.mark.parametrize("name", config.SAMPLERS)
+@pytest.mark.parametrize("name", SAMPLERS)
 def test_goals_come_from_where_the_sampler_may_look(ring, name):
     sample = replay.sample(ring, jax.random.key(1), 5000)
     goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(2))
@@ -54,9 +54,10 @@ def test_goals_come_from_where_the_sampler_may_look(ring, name):
 @pytest.mark.parametrize(("gives", "log_weights"), [("[]", lambda a, d, s, h: s * 0.0), ("[13, 2]", lambda a, d, s, h: a)])
 def test_a_sampler_s_log_weights_are_one_for_each_goal(ring, gives, log_weights):
     sample = replay.sample(ring, jax.random.key(1), 5)
-    with pytest.raises(ValueError, match="a sampler gives log weights") as error:
+    with pytest.raises(ValueError, match="log weights") as error:
         hindsight_goals(ring, sample, samplers.Sampler(log_weights), HP, jax.random.key(0))
-    assert str(error.value) == f"a sampler gives log weights [T+1] = [13]; this one gives {gives}"
+    assert "[13]" in str(error.value)
+    assert str(error.value).endswith(gives)
 
 
 @pytest.mark.parametrize("k", [0.0, 1.0, 4.0])
@@ -86,12 +87,6 @@ def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
     assert 0.01 < np.mean(np.asarray(batch.reward) == 0) < 0.99
     np.testing.assert_array_equal(batch.action, sample.action)
     np.testing.assert_array_equal(batch.observation, sample.observation)
-
-
-def test_an_episode_is_eventful_if_it_left_where_it_began():
-    paths = jnp.array([[0.0, 0.5, 0.05], [0.0, 0.0, 0.3], [0.0, 0.0, 0.0]])[..., None] * jnp.array([1.0, 0.0])
-    episodes = Episode(paths, paths, jnp.ones((3, 2)), jnp.zeros((3, 2, 2)))
-    np.testing.assert_array_equal(is_eventful(episodes, ENV.compute_reward), [False, True, False])
 
 
 def test_weighted_prefers_goals_near_the_desired_one(ring):

@@ -1,10 +1,14 @@
+import sys
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import config, samplers
+from mjx_dher import names, samplers, spec
 from mjx_dher.config import HParams
+from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS, RunSpec
 
 HP = HParams()
 # One episode of T = 4 steps; the desired goal is the origin, so the distances are 5, 4, 1, 3 and 2.
@@ -54,7 +58,7 @@ def test_weight_kernels(kernel, temperature, weights):
     np.testing.assert_allclose(got, np.array([0, 0, *weights]) / np.sum(weights), atol=1e-6)
 
 
-@pytest.mark.parametrize("kernel", config.WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
 @pytest.mark.parametrize("distance", [0.0, 1e-6, 0.3])
 def test_equal_distances_make_weighted_exactly_future(kernel, distance):
     # Distances that are equal to the last bit: the same point again and again, and the axes of the plane.
@@ -67,7 +71,7 @@ def test_equal_distances_make_weighted_exactly_future(kernel, distance):
             )
 
 
-@pytest.mark.parametrize("kernel", config.WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
 def test_weights_do_not_depend_on_scale(kernel):
     sampler = samplers.make("weighted", kernel)
     np.testing.assert_allclose(table(sampler, 0), table(sampler, 0, achieved=ACHIEVED * 1e-3), atol=1e-6)
@@ -84,11 +88,9 @@ def test_epsilon_bounds_are_closest_and_future():
         np.testing.assert_allclose(table(sampler, 0, HP._replace(epsilon=epsilon)), table(samplers.make(name), 0), atol=1e-6)
 
 
-def test_custom_metric_and_kernel():
+def test_closest_by_another_metric():
     by_height = samplers.make("closest", metric=lambda achieved, desired: jnp.abs(achieved[:, 2] - desired[2] - 1))
     np.testing.assert_allclose(table(by_height, 0), [0, 0, 1, 0, 0])
-    squared = samplers.make("weighted", kernel=lambda relative, temperature: -2 * jnp.log(relative))
-    np.testing.assert_allclose(table(squared, 2), [0, 0, 0, 4 / 13, 9 / 13], atol=1e-6)
 
 
 def test_draw_follows_the_probabilities():
@@ -110,46 +112,88 @@ def test_draw_never_takes_what_has_no_weight():
     assert bool(jnp.all(mask[jnp.arange(len(index)), index]))
 
 
-def test_names():
-    assert set(samplers.list_samplers()) >= set(config.SAMPLERS)
-    assert set(samplers.KERNELS) == set(config.WEIGHT_KERNELS)
-    assert set(samplers.METRICS) == set(config.METRICS)
-    for name in config.SAMPLERS:
-        assert samplers.make(name).whole_ring == (name == "random")
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_every_name_makes_a_sampler_and_random_alone_crosses_episodes(name):
+    sampler = samplers.make(name)
+    assert sampler.log_weights(ACHIEVED, DESIRED, jnp.array(0), HP).shape == (5,)
+    assert sampler.cross_episode == (name == "random")
 
 
-def test_register(monkeypatch):
-    monkeypatch.setattr(samplers, "_PLAIN", dict(samplers._PLAIN))
-    samplers.register("first", samplers.Sampler(lambda a, d, s, h: jnp.where(jnp.arange(len(a)) == 0, 0.0, -jnp.inf)))
-    np.testing.assert_allclose(table(samplers.make("first"), 2), [1, 0, 0, 0, 0])
-    config.validate(config.Config(sampler="first"), HP)
-    with pytest.raises(ValueError, match="sampler 'future' is already registered"):
-        samplers.register("future", samplers.make("future"))
+@pytest.mark.parametrize(("field", "known"), [("weight_kernel", WEIGHT_KERNELS), ("metric", METRICS)])
+def test_names_are_those_of_functions_here(field, known):
+    for name, place in known.items():
+        assert names.load_import_path(field, place) is getattr(samplers, name)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "message"),
-    [
-        ({"name": "futur"}, "sampler must be one of .*got 'futur' .did you mean 'future'"),
-        ({"name": "weighted", "kernel": "softmx"}, "weight_kernel must be one of linear, inverse, softmax; got 'softmx'"),
-        ({"name": "weighted", "metric": "speed"}, "metric must be one of position; got 'speed'"),
-    ],
-)
-def test_unknown_names_are_refused(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        samplers.make(**kwargs)
+def first(achieved, desired, step, hparams):
+    return jnp.where(jnp.arange(len(achieved)) == 0, 0.0, -jnp.inf)
 
 
-def test_a_registered_metric_is_one_by_name(monkeypatch):
+@pytest.fixture
+def mine(monkeypatch):
+    """A module of the user's."""
+    module = types.ModuleType("mine")
+    module.first = first
+    module.elsewhere = samplers.Sampler(first, cross_episode=True)
+    module.along_x = lambda achieved, desired: jnp.abs(achieved[:, 0] - desired[0])
+    module.squared = lambda relative, temperature: -2 * jnp.log(relative)
+    module.two = 2
+    monkeypatch.setitem(sys.modules, "mine", module)
+    return module
+
+
+def test_a_sampler_of_one_s_own(mine):
+    for name, crosses in (("first", False), ("elsewhere", True)):
+        sampler = samplers.make(f"mine:{name}")
+        np.testing.assert_allclose(table(sampler, 2), [1, 0, 0, 0, 0])
+        assert sampler.cross_episode is crosses
+    assert samplers.make("mine:elsewhere") is mine.elsewhere
+    spec.validate(RunSpec(sampler="mine:first"), ("push",))
+
+
+def test_a_metric_of_one_s_own(mine):
     """Distance along x alone: of the goals after step 1, (0, 0, 1) and (0, 2, 0) lie on the desired one."""
-    monkeypatch.setattr(samplers, "METRICS", dict(samplers.METRICS))
-    along_x = lambda achieved, desired: jnp.abs(achieved[:, 0] - desired[0])  # noqa: E731
-    with pytest.raises(ValueError, match="metric must be one of position; got 'along_x'"):
-        config.validate(config.Config(metric="along_x"), HP)
-    samplers.register_metric("along_x", along_x)
-    config.validate(config.Config(metric="along_x"), HP)
-    np.testing.assert_allclose(table(samplers.make("closest", metric="along_x"), 1), [0, 0, 0.5, 0, 0.5])
-    # At 0, 3, 0 the mean is 1 and the relative distances are 0, 3, 0: weights 2, 0, 2.
-    np.testing.assert_allclose(table(samplers.make("weighted", metric="along_x"), 1), [0, 0, 0.5, 0, 0.5])
-    with pytest.raises(ValueError, match="metric 'along_x' is already registered"):
-        samplers.register_metric("along_x", along_x)
+    spec.validate(RunSpec(metric="mine:along_x"), ("push",))
+    for metric in ("mine:along_x", mine.along_x):
+        np.testing.assert_allclose(table(samplers.make("closest", metric=metric), 1), [0, 0, 0.5, 0, 0.5])
+        # At 0, 3, 0 the mean is 1 and the relative distances are 0, 3, 0: weights 2, 0, 2.
+        np.testing.assert_allclose(table(samplers.make("weighted", metric=metric), 1), [0, 0, 0.5, 0, 0.5])
+    # A fifth of the weight is shared by the three, and the rest by the two nearest.
+    expected = [0, 0, 0.4 + 0.2 / 3, 0.2 / 3, 0.4 + 0.2 / 3]
+    np.testing.assert_allclose(table(samplers.make("epsilon_closest", metric="mine:along_x"), 1), expected, atol=1e-6)
+
+
+def test_a_kernel_of_one_s_own(mine):
+    """The candidates after step 2 are at 3 and 2, so that their weights are as 1 / 9 to 1 / 4."""
+    spec.validate(RunSpec(weight_kernel="mine:squared"), ("push",))
+    for kernel in ("mine:squared", mine.squared):
+        np.testing.assert_allclose(table(samplers.make("weighted", kernel), 2), [0, 0, 0, 4 / 13, 9 / 13], atol=1e-6)
+
+
+REFUSED = [  # arguments of `make`, and what the message names: the field, the value and what is allowed
+    ({"name": "futur"}, ["sampler", "'futur'", ", ".join(SAMPLERS), "did you mean 'future'"]),
+    ({"name": "weighted", "kernel": "softmx"}, ["weight_kernel", "'softmx'", "linear, inverse, softmax", "'softmax'?"]),
+    ({"name": "weighted", "metric": "along_x"}, ["metric", "'along_x'", "position", "module:attribute"]),
+    ({"name": "mine:frist"}, ["sampler", "'mine:frist'", "did you mean 'first'"]),
+    ({"name": "closest", "metric": "mine:along_y"}, ["metric", "'mine:along_y'", "did you mean 'along_x'"]),
+    ({"name": "weighted", "kernel": "no_such:squared"}, ["weight_kernel", "'no_such:squared'", "no module"]),
+    ({"name": "mine:two"}, ["sampler", "(achieved, desired, step, hparams)", " 2"]),
+    ({"name": "mine:along_x"}, ["sampler", "(achieved, desired, step, hparams)"]),
+    ({"name": "closest", "metric": "mine:two"}, ["metric", "(achieved, desired)", " 2"]),
+    ({"name": "closest", "metric": first}, ["metric", "(achieved, desired)"]),
+    ({"name": "weighted", "kernel": "mine:first"}, ["weight_kernel", "(relative, temperature)"]),
+    ({"name": "future", "kernel": "softmx"}, ["weight_kernel", "'softmx'"]),  # what is not read must be right, too
+]
+
+
+@pytest.mark.parametrize(("arguments", "parts"), REFUSED)
+def test_what_cannot_be_used_is_refused(mine, arguments, parts):
+    with pytest.raises(ValueError, match=parts[0]) as error:
+        samplers.make(**arguments)
+    assert all(part in str(error.value) for part in parts), error.value
+
+
+@pytest.mark.parametrize(("field", "value"), [("metric", "along_x"), ("weight_kernel", "squared"), ("sampler", "first")])
+def test_a_run_with_a_name_that_is_not_built_in_is_refused(field, value):
+    with pytest.raises(ValueError, match=f"{field} must be one of .*module:attribute; got '{value}'"):
+        spec.validate(RunSpec(**{field: value}), ("push",))

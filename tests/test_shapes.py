@@ -11,16 +11,18 @@ import jax.numpy as jnp
 import pytest
 from beartype import beartype
 from jax import Array
-from jaxtyping import Bool, Float, Int, Key, TypeCheckError, jaxtyped
+from jaxtyping import Bool, Float, Float32, Int, Key, TypeCheckError, jaxtyped
 
-from mjx_dher import HParams, config, relabel, replay, samplers
-from mjx_dher.learners import ddpg
-from mjx_dher.networks import Actor, Critic
-from mjx_dher.types import Batch, Episode
+from mjx_dher import HParams, priorities, relabel, replay, samplers
+from mjx_dher.learners import common, ddpg
+from mjx_dher.networks import Actor, Critic, Networks
+from mjx_dher.spec import SAMPLERS
+from mjx_dher.types import Batch, Episode, Sizes
 
 E, N, B, T, D, G, A = 11, 3, 5, 7, 13, 2, 4
 HP = HParams()
-NETWORKS = ddpg.Networks(Actor(A, (8,)), Critic((8,)))
+NETWORKS = Networks(Actor(A, (8,)), Critic((8,)))
+LEARNER = ddpg.DDPG(Sizes(D, G, A), NETWORKS, NETWORKS)
 
 
 def shape(*sizes, dtype=jnp.float32):
@@ -37,17 +39,18 @@ fields = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.f
 
 NewEpisodes = tuple[Float[Array, "N T1 D"], Float[Array, "N T1 G"], Float[Array, "N G"], Float[Array, "N T A"]]
 Stored = tuple[Float[Array, "E T1 D"], Float[Array, "E T1 G"], Float[Array, "E G"], Float[Array, "E T A"]]
-Marks = tuple[Bool[Array, "E"], Int[Array, ""], Int[Array, ""]]
+Marks = tuple[Float[Array, "E"], Int[Array, ""], Int[Array, ""]]
 Ring = tuple[Stored, Marks]
 Ends = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B A"]]
 Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], Int[Array, "B"]]
 Drawn = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B G"], Float[Array, "B A"], Float[Array, "B"]]
+Batches = tuple[Float[Array, "T B D"], Float[Array, "T B D"], Float[Array, "T B G"], Float[Array, "T B A"], Float[Array, "T B"]]
 Rows = tuple[Int[Array, "B"], Int[Array, "E"], Bool[Array, ""]]
 Noise = tuple[Float[Array, "T N A"], Bool[Array, "T N"], Float[Array, "T N A"]]
 
 
 def from_ring(state):
-    return fields(state.episodes), (state.eventful, state.cursor, state.size)
+    return fields(state.episodes), (state.priority, state.cursor, state.size)
 
 
 def to_ring(ring):
@@ -67,7 +70,7 @@ def to_sample(sample):
 
 @typed
 def added(ring: Ring, new: NewEpisodes) -> Ring:
-    return from_ring(replay.add(to_ring(ring), Episode(*new), jnp.zeros(N, bool), jnp.ones(N, bool)))
+    return from_ring(replay.add(to_ring(ring), Episode(*new), jnp.zeros(N), jnp.ones(N, bool)))
 
 
 def test_replay():
@@ -78,8 +81,8 @@ def test_replay():
     @typed
     def rows(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Rows:
         state = to_ring(ring)
-        counts = replay.count_eventful(state)
-        return replay.draw_rows(state, key, B, 0.5, counts), counts, replay.can_sample(state)
+        cumulative = replay.cumulative_priority(state)
+        return replay.draw_rows(state, key, B, 0.5, cumulative), cumulative, replay.can_sample(state)
 
     @typed
     def goals(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Float[Array, "B T1 G"]:
@@ -90,7 +93,7 @@ def test_replay():
         jax.eval_shape(function, from_ring(RING), KEY, shape(B, dtype=jnp.int32))
 
 
-@pytest.mark.parametrize("name", config.SAMPLERS)
+@pytest.mark.parametrize("name", SAMPLERS)
 def test_samplers(name):
     @typed
     def log_weights(achieved: Float[Array, "T1 G"], desired: Float[Array, "G"], step: Int[Array, ""]) -> Float[Array, "T1"]:
@@ -119,40 +122,60 @@ def test_relabel(name):
         return fields(relabel.relabel(*args, reward, HP, key)), relabel.hindsight_goals(*args, HP, key)
 
     @typed
-    def eventful(*episodes: Float[Array, "N ..."]) -> Bool[Array, "N"]:
-        return relabel.is_eventful(Episode(*episodes), reward)
+    def weights(*episodes: Float[Array, "N ..."]) -> Float32[Array, "N"]:
+        return priorities.weights(priorities.eventful, Episode(*episodes), reward, HP)
+
+    @typed
+    def batches(ring: Ring, key: Key[Array, ""], like: Float[Array, "T B"]) -> Batches:
+        state = to_ring(ring)
+        args = samplers.make(name), reward, HP, replay.cumulative_priority(state)
+        return fields(relabel.draw_batches(state, key, (T, B), *args))
 
     jax.eval_shape(relabelled, from_ring(RING), from_sample(SAMPLE), KEY)
-    jax.eval_shape(eventful, *fields(EPISODES))
+    jax.eval_shape(weights, *fields(EPISODES))
+    jax.eval_shape(batches, from_ring(RING), KEY, shape(T, B))
+
+
+def assert_alike(before, after):
+    """What learning changes keeps its shapes and dtypes."""
+    before, after = (jax.tree.map(lambda x: (x.shape, x.dtype), x) for x in (before, after))
+    assert before == after
 
 
 def test_ddpg():
     @typed
     def acted(observation: Float[Array, "*N D"], goal: Float[Array, "*N G"], like: Float[Array, "A"]) -> Float[Array, "*N A"]:
-        state = ddpg.init(jax.random.key(0), NETWORKS, D, G, A)
-        return ddpg.act(NETWORKS, state, {"observation": observation, "desired_goal": goal, "achieved_goal": goal}, HP)
+        state = LEARNER.init(jax.random.key(0))
+        return LEARNER.act(state, {"observation": observation, "desired_goal": goal, "achieved_goal": goal}, HP)
 
     @typed
     def noise(key: Key[Array, ""], like: Float[Array, "T N A"]) -> Noise:
-        return tuple(ddpg.exploration_noise(key, T, N, A, HP))
+        return tuple(LEARNER.noise(key, T, N, HP))
 
     @typed
-    def explored(action: Float[Array, "N A"], random: Bool[Array, "N"]) -> Float[Array, "N A"]:
-        return ddpg.explore(ddpg.Noise(action, random, action), action)
+    def explored(
+        observation: Float[Array, "N D"], goal: Float[Array, "N G"], action: Float[Array, "N A"], random: Bool[Array, "N"]
+    ) -> Float[Array, "N A"]:
+        obs = {"observation": observation, "desired_goal": goal, "achieved_goal": goal}
+        return LEARNER.explore(LEARNER.init(jax.random.key(0)), obs, common.Noise(action, random, action), HP)
+
+    @typed
+    def normalized(observation: Float[Array, "N T1 D"], goal: Float[Array, "B G"], valid: Bool[Array, "N"]) -> None:
+        state = LEARNER.init(jax.random.key(0))
+        assert_alike(state, LEARNER.update_normalizers(state, observation, goal, HP, valid))
 
     @typed
     def updated(batch: Drawn) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, "B"]]:
-        state = ddpg.init(jax.random.key(0), NETWORKS, D, G, A)
-        following, losses = ddpg.update(NETWORKS, state, Batch(*batch), HP)
-        # What learning changes keeps its shapes and dtypes.
-        before, after = (jax.tree.map(lambda x: (x.shape, x.dtype), x) for x in (state, ddpg.update_target(following, HP)))
-        assert before == after
-        return *losses, ddpg.target_value(NETWORKS, state.target, Batch(*batch), HP)
+        state = LEARNER.init(jax.random.key(0))
+        following, losses = LEARNER.update(state, Batch(*batch), HP)
+        assert_alike(state, LEARNER.update_target(following, HP))
+        return *losses.values(), ddpg.target_value(NETWORKS, state.target, Batch(*batch), HP)
 
     for lead in ((), (N,), (T, N)):
         jax.eval_shape(acted, shape(*lead, D), shape(*lead, G), shape(A))
     jax.eval_shape(noise, KEY, shape(T, N, A))
-    jax.eval_shape(explored, shape(N, A), shape(N, dtype=bool))
+    jax.eval_shape(explored, shape(N, D), shape(N, G), shape(N, A), shape(N, dtype=bool))
+    jax.eval_shape(normalized, shape(N, T + 1, D), shape(B, G), shape(N, dtype=bool))
     jax.eval_shape(updated, fields(BATCH))
 
 

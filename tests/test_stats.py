@@ -22,7 +22,7 @@ def test_wilson_interval(successes, trials, low, high):
 
 @pytest.mark.parametrize(("successes", "trials"), [(1, 0), (5, 4), (-1, 4)])
 def test_what_is_no_success_rate_is_refused(successes, trials):
-    with pytest.raises(ValueError, match="need 0 <= successes <= trials"):
+    with pytest.raises(ValueError, match=f"successes.*trials.*{successes} of {trials}"):
         stats.wilson_interval(successes, trials)
 
 
@@ -38,18 +38,14 @@ def test_difference_interval():
 SCORES = np.random.default_rng(0).beta(4, 2, (11, 3))
 
 
-@pytest.mark.parametrize("scores", [SCORES[:, 0], SCORES, SCORES[:10], SCORES[:1], SCORES[:4, 0]])
-def test_interquartile_mean(scores):
-    """rliable defines it as scipy's trimmed mean, a quarter cut at either end, of all scores."""
-    assert stats.interquartile_mean(scores) == pytest.approx(scipy.stats.trim_mean(scores, 0.25, axis=None))
-
-
 def test_interquartile_mean_by_hand():
     assert stats.interquartile_mean([0, 0.5, 0.7, 100]) == pytest.approx(0.6)
     assert stats.interquartile_mean([3.0]) == 3
+    assert stats.interquartile_mean([[0, 0.5], [0.7, 100]]) == pytest.approx(0.6)
+    np.testing.assert_allclose(stats.interquartile_mean([[0, 1, 2, 9], [5, 1, 3, 0]], axis=1), [1.5, 2])
 
 
-def test_bootstrap_interval_is_scipy_s():
+def test_bootstrap_interval_agrees_with_scipy():
     """The mean of one task; percentile method. Two bootstraps of 10,000 draws differ by chance: by 2 % of the width here."""
     scores = SCORES[:, 0]
     want = scipy.stats.bootstrap((scores,), np.mean, method="percentile", n_resamples=10_000, rng=1).confidence_interval
@@ -67,7 +63,7 @@ def test_bootstrap_is_stratified():
     low, high = stats.bootstrap_interval(scores, np.mean)
     assert 5.0 <= low < high <= 5.1
     # Each task's seeds are drawn on their own: one task's best seeds come with the other's worst.
-    drawn = [stats._redrawn(scores, rng).mean(axis=0) for _ in range(300)]
+    drawn = [stats._resample(scores, rng).mean(axis=0) for _ in range(300)]
     assert any(a < 0.04 and b > 10.06 for a, b in drawn)
 
 
@@ -94,7 +90,7 @@ def test_first_reach_and_those_that_never_do():
 
 def test_area_under_curve():
     np.testing.assert_allclose(stats.area_under_curve([0, 1, 3], [[0, 1, 1], [1, 1, 1]]), [2.5 / 3, 1])
-    with pytest.raises(ValueError, match="rising order"):
+    with pytest.raises(ValueError, match=r"x must .* increasing"):
         stats.area_under_curve([0, 0], [[1, 1]])
     with pytest.raises(ValueError, match=r"x must be \[P\] and curves \[S, P\]; got shapes \(2,\) and \(1, 3\)"):
         stats.area_under_curve([0, 1], [[1, 1, 1]])
@@ -110,26 +106,23 @@ def test_probability_of_improvement():
     assert stats.probability_of_improvement(mine, other) == pytest.approx(want)
     low, high = stats.improvement_interval(mine, other, repeats=500)
     assert low < want < high
-    with pytest.raises(ValueError, match="the same tasks; got 3 and 2"):
+    with pytest.raises(ValueError, match=r"tasks.* 3 and 2"):
         stats.probability_of_improvement(mine, other[:, :2])
-
-
-@pytest.mark.parametrize("seeds", [3, 10, 20])
-def test_paired_p_value_is_scipy_s(seeds):
-    """Exact up to 13 seeds in both; else by 10^5 draws in both, whose p values scatter by 0.002 each."""
-    a, b = np.random.default_rng(seeds).normal((0.3, 0), 1, (seeds, 2)).T
-    mean = lambda a, b, axis: np.mean(a - b, axis=axis)  # noqa: E731
-    want = scipy.stats.permutation_test((a, b), mean, permutation_type="samples", n_resamples=100_000, rng=0)
-    assert stats.paired_p_value(a, b) == pytest.approx(want.pvalue, abs=1e-9 if seeds <= 13 else 0.012)
 
 
 def test_paired_p_value_by_hand():
     assert stats.paired_p_value([1, 2, 3], [0, 1, 2]) == pytest.approx(2 / 8)
     assert stats.paired_p_value([1, 2], [1, 2]) == 1
-    with pytest.raises(ValueError, match="never reached"):
+    # Differences 3, 1 and -1: of the eight sign flips, six have a sum of at least 3 in absolute value.
+    assert stats.paired_p_value([3, 1, 0], [0, 0, 1]) == pytest.approx(6 / 8)
+    # Equal differences: only two of 2^16 changes of sign are as extreme, and none of a hundred random ones.
+    assert stats.paired_p_value(np.ones(16), np.zeros(16)) == pytest.approx(2 / 2**16)
+    assert stats.paired_p_value(np.ones(16), np.zeros(16), repeats=100) == pytest.approx(2 / 101)
+    with pytest.raises(ValueError, match="finite"):
         stats.paired_p_value([np.inf, 1], [1, 2])
-    with pytest.raises(ValueError, match="seed by seed"):
-        stats.paired_p_value([1, 2, 3], [1, 2])
+    for a, b in (([1, 2, 3], [1, 2]), ([1], [2])):
+        with pytest.raises(ValueError, match=r"a and b must be paired.* \[S\]"):
+            stats.paired_p_value(a, b)
 
 
 def test_holm():
@@ -137,13 +130,13 @@ def test_holm():
     assert stats.holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
     assert stats.holm([0.5, 0.6]) == [1, 1]
     assert stats.holm([]) == []
-    with pytest.raises(ValueError, match="p values must lie"):
+    with pytest.raises(ValueError, match=r"\[0, 1\].*1\.1"):
         stats.holm([0.1, 1.1])
 
 
 @pytest.mark.parametrize("scores", [[], [np.nan, 1], np.zeros((2, 2, 2))])
 def test_what_are_no_scores_is_refused(scores):
-    with pytest.raises(ValueError, match="scores must be numbers"):
+    with pytest.raises(ValueError, match="scores must be"):
         stats.interquartile_mean(scores)
 
 

@@ -1,18 +1,21 @@
 import dataclasses
+import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, config, make_train, relabel, replay, trainer
-from mjx_dher.learners import ddpg
+from mjx_dher import Config, HParams, learners, make_train, relabel, replay, samplers, trainer
+from mjx_dher.host import memory
 from mjx_dher.rollout import rollout
+from mjx_dher.runs import loop
 from probes import Explodes, PointMass
 
 ENV = PointMass()
+DTYPES = ("float32", "bfloat16")
 SMALL = Config(
-    env="point_mass",
     num_envs=4,
     cycles_per_epoch=3,
     updates_per_cycle=4,
@@ -24,8 +27,6 @@ SMALL = Config(
     total_steps=240,
 )
 LEARNS = Config(
-    env="point_mass",
-    sampler="weighted",
     num_envs=16,
     cycles_per_epoch=10,
     updates_per_cycle=20,
@@ -34,8 +35,15 @@ LEARNS = Config(
     replay_size=20_000,
     hidden_sizes=(64, 64),
     eval_episodes=200,
-    total_steps=16_000,
+    total_steps=32_000,  # 20 epochs
 )
+
+
+@pytest.fixture(scope="module")
+def program():
+    """The training loop of SMALL, and its epoch, compiled once."""
+    program = make_train(ENV, SMALL)
+    return program, jax.jit(program.epoch)
 
 
 def test_rollout_keeps_every_observation():
@@ -61,7 +69,7 @@ def test_an_environment_s_check_is_made_before_the_first_epoch_and_after_each_an
                 raise ValueError("contacts were lost")
 
     env = Checked()
-    run = trainer.train(env, SMALL, HParams(), seed=0)
+    run = loop.train(env, dataclasses.replace(SMALL, cycles_per_epoch=1, total_steps=80), HParams(), seed=0)
     assert next(run).epoch == 1
     assert env.checks == 2
     with pytest.raises(ValueError, match="contacts were lost"):
@@ -69,7 +77,7 @@ def test_an_environment_s_check_is_made_before_the_first_epoch_and_after_each_an
 
 
 @pytest.mark.parametrize(("at_once", "draws"), [(32 * 2, 2), (32 * 4, 1), (1, 2)])
-def test_batches_are_drawn_up_to_so_many_at_once_and_all_are_learned_from(monkeypatch, at_once, draws):
+def test_batches_are_drawn_up_to_so_many_at_once(program, monkeypatch, at_once, draws):
     """A cycle of 4 updates of 32 with a target update every 2: never less at once than between two target updates."""
     shapes = []
 
@@ -77,25 +85,25 @@ def test_batches_are_drawn_up_to_so_many_at_once_and_all_are_learned_from(monkey
         shapes.append(shape)
         return relabel.draw_batches(ring, key, shape, *args)
 
-    monkeypatch.setattr(trainer, "DRAWN_AT_ONCE", at_once)
     monkeypatch.setattr(trainer, "draw_batches", draw_batches)
-    program = make_train(ENV, SMALL)
-    state, _ = jax.jit(program.epoch)(program.init(jax.random.key(0), HParams()))
+    parts = dataclasses.replace(program[0].epoch.args[0], max_transitions_per_draw=at_once)
+    state = jax.eval_shape(functools.partial(trainer._epoch, parts), loop.state_template(program[0]))[0]
     assert set(shapes) == {(2 // draws, 2, 32)}
-    assert state.learner.num_updates == 3 * 4
+    jaxpr = str(jax.make_jaxpr(functools.partial(trainer._epoch, parts))(loop.state_template(program[0])))
+    assert f"length={draws}" in jaxpr
+    assert state.learner.num_updates.shape == ()
 
 
-def test_an_epoch_counts_what_it_does():
-    program = make_train(ENV, SMALL)
-    state = program.init(jax.random.key(0), HParams())
-    state, metrics = jax.jit(program.epoch)(state)
+def test_an_epoch_counts_what_it_does(program):
+    program, epoch = program
+    state, metrics = epoch(program.init(jax.random.key(0), HParams()))
     assert state.env_steps == 4 * 3 * 10
     assert state.learner.num_updates == 3 * 4
     assert state.replay.size == 12
     assert state.learner.observation_norm.count == 4 * 3 * 11
     assert state.learner.goal_norm.count == 4 * 3 * 10
     assert set(metrics) == {
-        *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "eventful_share"),
+        *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
         *("relabelled_share", "relabel_distance", "critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"),
         "discarded_episodes",
     }
@@ -107,7 +115,7 @@ def test_an_epoch_counts_what_it_does():
     assert all(value.shape == () and jnp.isfinite(value) for value in metrics.values())
 
 
-@pytest.mark.parametrize("value", [jnp.nan, jnp.inf, None])
+@pytest.mark.parametrize("value", [jnp.nan, pytest.param(jnp.inf, marks=pytest.mark.slow), None])
 def test_episodes_that_blow_up_leave_no_trace(value):
     """A quarter of all starts ends in NaN, Inf or a `failed` state: counted exactly, in no ring, in no normalizer."""
     env = Explodes(value)
@@ -134,31 +142,31 @@ def test_without_any_valid_episode_nothing_is_learned():
     assert not replay.can_sample(state.replay)
 
 
-def test_targets_follow_every_target_period():
+def test_targets_follow_every_target_period(program):
     """With polyak 0 a soft update copies, so after a cycle targets equal the networks; with 1 they never move."""
-    program = make_train(ENV, SMALL)
+    program, epoch = program
     for polyak, moves in ((0.0, True), (1.0, False)):
         first = program.init(jax.random.key(0), HParams(polyak=polyak))
-        learner = jax.jit(program.epoch)(first)[0].learner
+        learner = epoch(first)[0].learner
         same = learner.params if moves else first.learner.target
         jax.tree.map(np.testing.assert_array_equal, learner.target, same)
 
 
-def test_seeds_under_vmap_are_what_they_are_alone_and_differ():
+def test_seeds_under_vmap_are_what_they_are_alone_and_differ(program):
     """Two seeds in one program against two runs of one.
 
     What is drawn is the same to the bit; sums inside the networks are ordered otherwise once a batch axis is there, and Adam
     turns a last-bit difference of a gradient near zero into one of up to its step size. After 24 updates at 1e-3 the
     parameters stay within 1e-3 of each other, a hundredth of what learning moved them.
     """
-    program = make_train(ENV, SMALL)
-    epoch = jax.jit(program.epoch)
+    program, epoch = program
+    epochs = jax.jit(jax.vmap(program.epoch))
     seeds = [0, 1]
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
     hparams = jax.tree.map(lambda x: jnp.full(2, x), HParams())
     together = jax.jit(jax.vmap(program.init))(keys, hparams)
     for _ in range(2):
-        together, metrics = jax.jit(jax.vmap(program.epoch))(together)
+        together, metrics = epochs(together)
     alone = []
     for row, seed in enumerate(seeds):
         state = program.init(jax.random.key(seed), HParams())
@@ -175,18 +183,35 @@ def test_seeds_under_vmap_are_what_they_are_alone_and_differ():
     assert max(float(jnp.abs(a - b).max()) for a, b in leaves) > 0.05
 
 
-def test_hparams_are_traced_one_compilation_serves_all():
-    program = make_train(ENV, SMALL)
-    epoch = jax.jit(program.epoch)
+def test_hparams_are_traced_one_compilation_serves_all(program):
+    program, epoch = program
     for hparams in (HParams(), HParams(gamma=0.9, her_k=2, actor_lr=3e-4)):
         epoch(jax.jit(program.init)(jax.random.key(0), hparams))
     assert epoch._cache_size() == 1
 
 
-@pytest.mark.parametrize("dtype", config.DTYPES)
-def test_training_solves_the_point_mass(dtype):
-    static = dataclasses.replace(LEARNS, learner_dtype=dtype)
-    records = list(trainer.train(ENV, static, HParams(polyak=0.98, gamma=0.9)))
+@pytest.fixture(scope="module")
+def learn():
+    """Trains the point mass for so many epochs, of 1,600 steps, and yields each Progress; compiled once for each dtype."""
+
+    @functools.cache
+    def compiled(dtype):
+        config = dataclasses.replace(LEARNS, learner_dtype=dtype)
+        learner = learners.make("ddpg", config, trainer.env_sizes(ENV))
+        train = make_train(ENV, config, sampler=samplers.make("weighted"), learner=learner)
+        return config, loop.compile_program(train, jax.random.key(0), HParams())
+
+    def learn(hparams, epochs, dtype="float32"):
+        config, program = compiled(dtype)
+        start = loop.Start(program.init(jax.random.key(0), hparams))
+        return itertools.islice(loop.run(ENV, config, program, start), epochs)
+
+    return learn
+
+
+@pytest.mark.parametrize("dtype", [DTYPES[0], pytest.param(DTYPES[1], marks=pytest.mark.slow)])
+def test_training_solves_the_point_mass(dtype, learn):
+    records = list(learn(HParams(polyak=0.98, gamma=0.9), 10, dtype))
     curve = [record.metrics["success_rate"] for record in records]
     assert [record.epoch for record in records] == list(range(1, 11))
     assert records[-1].env_steps == 16_000
@@ -196,15 +221,15 @@ def test_training_solves_the_point_mass(dtype):
     assert records[-1].metrics["return_mean"] > -4.5
 
 
-def test_a_frozen_learner_stays_near_chance():
+def test_a_frozen_learner_stays_near_chance(learn):
     """The probe can fail: a frozen learner stays at the level of chance."""
-    records = list(trainer.train(ENV, LEARNS, HParams(actor_lr=0.0, critic_lr=0.0)))
+    records = list(learn(HParams(actor_lr=0.0, critic_lr=0.0), 10))
     assert records[-1].metrics["success_rate"] < 0.5
 
 
 def test_bfloat16_is_for_learning_alone():
     """First networks, parameters, normalizers and the policy that plays are those of float32."""
-    program, other = (make_train(ENV, dataclasses.replace(SMALL, learner_dtype=dtype)) for dtype in config.DTYPES)
+    program, other = (make_train(ENV, dataclasses.replace(SMALL, learner_dtype=dtype)) for dtype in DTYPES)
     first = other.init(jax.random.key(0), HParams())
     jax.tree.map(np.testing.assert_array_equal, first.learner, program.init(jax.random.key(0), HParams()).learner)
     learned = jax.jit(other.epoch)(first)[0].learner
@@ -212,19 +237,28 @@ def test_bfloat16_is_for_learning_alone():
     moved = jax.tree.map(lambda new, old: float(jnp.abs(new - old).max()), learned.params, first.learner.params)
     assert min(jax.tree.leaves(moved)) > 0.001
     assert ["bf16" in str(jax.make_jaxpr(p.epoch)(first)) for p in (program, other)] == [False, True]
-    play = lambda state, key: trainer.evaluate_state(ENV, other.networks, state, key, 8)  # noqa: E731
+    play = lambda state, key: trainer.evaluate_state(ENV, other.learner, state, key, 8)  # noqa: E731
     assert "bf16" not in str(jax.make_jaxpr(play)(first, jax.random.key(1)))
 
 
-def test_the_same_seed_gives_the_same_run():
-    runs = [[r.metrics for r in trainer.train(ENV, SMALL, seed=seed)] for seed in (3, 3, 4)]
+def test_the_same_seed_gives_the_same_run(program):
+    program, epoch = program
+
+    def run(seed):
+        state, rows = program.init(jax.random.key(seed), HParams()), []
+        for _ in range(2):
+            state, metrics = epoch(state)
+            rows.append({name: float(value) for name, value in metrics.items()})
+        return rows
+
+    runs = [run(seed) for seed in (3, 3, 4)]
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
 
 
 def test_replay_memory_is_what_the_arrays_need():
     """The compiled epoch owns its state in place: beside it there is little, and no second ring."""
-    program = make_train(ENV, config.dataclasses.replace(SMALL, replay_size=1_000_000))
+    program = make_train(ENV, dataclasses.replace(SMALL, replay_size=1_000_000))
     shapes = jax.eval_shape(program.init, jax.random.key(0), HParams())
     memory = jax.jit(program.epoch, donate_argnums=0).lower(shapes).compile().memory_analysis()
     assert program.replay_bytes == sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes.replay.episodes))
@@ -234,9 +268,24 @@ def test_replay_memory_is_what_the_arrays_need():
 
 
 def test_a_ring_that_cannot_fit_is_refused_before_it_is_allocated():
-    huge = config.dataclasses.replace(SMALL, replay_size=10**13)
-    with pytest.raises(ValueError, match=r"replay_size 10000000000000 needs .* TB, but only .* is free; at most"):
-        next(iter(trainer.train(ENV, huge)))
+    huge = dataclasses.replace(SMALL, replay_size=10**10)
+    with pytest.raises(ValueError, match=r"replay_size 10000000000 needs .* GB, but only .* is free; at most"):
+        next(iter(loop.train(ENV, huge)))
+
+
+def test_networks_that_cannot_fit_are_refused_before_anything_is_compiled(monkeypatch):
+    monkeypatch.setattr(loop, "compile_program", lambda *args: pytest.fail("compiled"))
+    huge = dataclasses.replace(SMALL, hidden_sizes=(65_536, 65_536, 65_536))
+    with pytest.raises(ValueError, match=r"hidden_sizes .*65536.*: the learner needs .* GB, but only .* is free"):
+        next(iter(loop.train(ENV, huge)))
+
+
+def test_what_the_compiler_counts_as_too_much_is_refused_before_training(monkeypatch):
+    """Against 300 MB of memory: the ring, 260 MB, and the networks fit, the program does not."""
+    monkeypatch.setattr(memory, "available_bytes", lambda: 3 * 10**8)
+    large = dataclasses.replace(SMALL, cycles_per_epoch=1, replay_size=10**6, total_steps=1, batch_size=10**6)
+    with pytest.raises(ValueError, match=r"an epoch needs .*, but only 300.0 MB of memory is free; .*batch_size 1000000"):
+        next(iter(loop.train(ENV, large)))
 
 
 def test_observations_that_are_no_vector_are_refused():
@@ -252,9 +301,8 @@ def test_observations_that_are_no_vector_are_refused():
 def test_train_refuses_before_it_compiles():
     called = []
     with pytest.raises(ValueError, match="gamma must lie in"):
-        next(iter(trainer.train(ENV, SMALL, HParams(gamma=1.0), on_compile=called.append)))
+        next(iter(loop.train(ENV, SMALL, HParams(gamma=1.0), on_compile=called.append)))
     assert not called
-    assert ddpg  # the learner is reachable as a component
 
 
 def test_step_sizes_fall_linearly_to_their_end():
@@ -265,10 +313,9 @@ def test_step_sizes_fall_linearly_to_their_end():
         assert now.gamma == hparams.gamma
 
 
-def test_a_run_ends_with_the_step_sizes_at_their_end():
+def test_a_run_ends_with_the_step_sizes_at_their_end(learn):
     """With lr_end 0 the last of many small epochs hardly moves the actor, the first one does."""
-    long = dataclasses.replace(LEARNS, total_steps=20 * config.steps_per_epoch(LEARNS, ENV.episode_length))
-    params = [jax.device_get(p.state.learner.params.actor) for p in trainer.train(ENV, long, HParams(lr_end=0.0))]
+    params = [jax.device_get(record.state.learner.params.actor) for record in learn(HParams(lr_end=0.0), 20)]
     first, last = (
         max(float(np.abs(a - b).max()) for a, b in zip(jax.tree.leaves(params[i]), jax.tree.leaves(params[i + 1])))
         for i in (0, -2)

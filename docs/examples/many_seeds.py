@@ -5,7 +5,7 @@ import argparse
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import Config, HParams, make_train, stats
+from mjx_dher import Config, HParams, make_train, samplers, stats
 from point_mass import PointMass
 
 
@@ -16,7 +16,6 @@ def main(argv=None):
     parser.add_argument("--epochs", type=int, default=8)
     args = parser.parse_args(argv)
     config = Config(
-        sampler="weighted",
         num_envs=4,
         cycles_per_epoch=5,
         updates_per_cycle=20,
@@ -27,7 +26,7 @@ def main(argv=None):
         eval_episodes=100,
         total_steps=200 * args.epochs,
     )
-    program = make_train(PointMass(), config)
+    program = make_train(PointMass(), config, sampler=samplers.make("weighted"))
     keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
     hparams = jax.tree.map(lambda x: jnp.full(args.seeds, x), HParams(gamma=0.9, polyak=0.98))  # or a value a lane
     states = jax.jit(jax.vmap(program.init))(keys, hparams)

@@ -1,4 +1,4 @@
-"""The engines that can advance the physics, one file each, behind `make_engine`."""
+"""The physics engines, one file each, behind `make_engine`."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any
 
 import mujoco
 
-from mjx_dher.config import ENGINES
 from mjx_dher.envs.engines.base import Engine, Physics
-from mjx_dher.names import check_name
+from mjx_dher.names import check_name, missing_extra
+from mjx_dher.spec import ENGINES
 
 __all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
-    """The engine that `name` stands for here: `auto` is native on a CPU, warp on a GPU where warp-lang is there, else jax.
+    """Returns the engine that `name` stands for: `auto` is native on a CPU, warp on a GPU with warp-lang installed, else jax.
 
     Raises:
-      ValueError: `name` is no engine.
+      ValueError: there is no engine `name`.
     """
     check_name("engine", name, ENGINES)
     if name != "auto":
@@ -37,17 +37,17 @@ def _has_warp() -> bool:
 
 
 def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
-    """An engine for `model` that advances `substeps` timesteps a call.
+    """Makes an engine for `model` that advances `substeps` timesteps a call.
 
     Args:
       name: "native", "jax", "warp" or "auto".
       model: the compiled MJCF, with exactly one mocap body.
       substeps: MuJoCo timesteps an environment step.
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp
-        those, `contacts` and `constraints` (its memory), and `allow_cpu`.
+        the same two, `contacts` and `constraints` (its memory), and `allow_cpu`.
 
     Raises:
-      ValueError: no such engine or option, or an engine that cannot run here.
+      ValueError: there is no such engine or option, or the engine cannot run on this machine.
     """
     name = resolve_engine(name)
     constructor: Callable[..., Engine]
@@ -55,7 +55,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
         from mjx_dher.envs.engines.native import NativeEngine as constructor
     elif name == "warp":
         if not _has_warp():
-            raise ValueError('engine warp needs warp-lang, which the extra "cuda" installs: pip install -e ".[cuda]"')
+            raise ValueError(missing_extra("engine warp", "warp-lang", "cuda"))
         from mjx_dher.envs.engines.warp import WarpEngine as constructor
     else:
         from mjx_dher.envs.engines.mjx import MjxEngine as constructor

@@ -1,4 +1,4 @@
-"""What an engine is: the part that advances physics, and nothing else."""
+"""The engine interface: the part of an environment that advances physics, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from mjx_dher.types import Array
 
 @struct.dataclass
 class Physics:
-    """The whole state of the simulation between two steps, in MuJoCo's layout."""
+    """The complete state of the simulation between two steps, in MuJoCo's layout."""
 
     qpos: Array  # [nq]
     qvel: Array  # [nv]
-    warmstart: Array  # [nv] the constraint solver's first guess (qacc_warmstart)
+    warmstart: Array  # [nv] initial guess of the constraint solver (qacc_warmstart)
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy of the model without contacts of a cylinder with a box: one of the two gives way to the geom called NAME_stand_in.
+    """Returns a copy of the model in which a geom called NAME_stand_in replaces one geom of each cylinder-box contact pair.
 
-    The box's takes its place if there is one, else the cylinder's. For engines that have no such contact, or a worse one.
+    It replaces the box NAME if the box has a stand-in, else the cylinder NAME. Some engines have no cylinder-box contacts, or
+    inaccurate ones.
 
     Raises:
-      ValueError: neither has one.
+      ValueError: neither geom of a pair has a stand-in.
     """
     model = copy.copy(model)
     cylinder, box = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("CYLINDER", "BOX"))
@@ -46,13 +47,13 @@ def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 class Engine(Protocol):
-    """Advances `Physics` by one environment step under a fixed input."""
+    """Physics engine that advances `Physics` by one environment step under a fixed input."""
 
     name: str
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
-        """One environment step later; meanwhile the mocap body is held at `target` [7] (position, m, and w, x, y, z)."""
+        """Returns the physics one environment step later; the mocap body is held at `target` [7] (position, m; w, x, y, z)."""
         ...
 
     def check(self) -> None:
-        """Raises ValueError where the steps so far were not what they should be and their results do not show it."""
+        """Raises ValueError if steps so far were wrong in a way that their results do not show."""

@@ -1,10 +1,9 @@
-"""MuJoCo MJX, the JAX implementation: runs wherever JAX runs, and is the reference for everything that is traced."""
+"""MuJoCo MJX, the JAX implementation, which runs wherever JAX runs."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -13,38 +12,19 @@ import numpy as np
 
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.envs.kinematics import quat_multiply
+from mjx_dher.host import private_api
 from mjx_dher.types import Array
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line when the optional warp-lang is absent
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx
-    from mujoco.mjx._src import scan
-
-
-@contextlib.contextmanager
-def _bodies_computed_once() -> Iterator[None]:
-    """While tracing: keeps XLA's CPU backend from computing each body's pose anew for each of its descendants.
-
-    Its fusion emitters (JAX 0.10) fuse MJX's walk along the arm into one loop that repeats all ancestors for every use of them:
-    0.7 s instead of 0.9 ms for the kinematics of 16 environments on 2 cores. A barrier after each level ends the fusion.
-    """
-    walk = scan.body_tree
-
-    def body_tree(model, f, *args, **kwargs):
-        return walk(model, lambda *level: jax.lax.optimization_barrier(f(*level)), *args, **kwargs)
-
-    scan.body_tree = body_tree
-    try:
-        yield
-    finally:
-        scan.body_tree = walk
 
 
 class _Weld:
-    """The part of the weld's acceleration that is due to velocity, which MJX leaves out and MuJoCo C and Warp put in.
+    """The part of a weld's acceleration that is due to velocity, which MJX leaves out and MuJoCo C and Warp put in.
 
-    With r the weld's residual, MuJoCo asks for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: a gripper on
-    an arm that moves at 1 m/s is then pulled aside by 1 mm in half a second. The weld must be of a mocap body (which counts as
-    at rest) to a moving body, with their frames made to coincide.
+    With r the weld's residual, MuJoCo asks for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: an arm that
+    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. The weld must join a mocap body (which counts as at
+    rest) to a moving body, in such a way that their frames coincide.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -63,7 +43,7 @@ class _Weld:
         self._dofs = np.array(dofs)
 
     def bias(self, data: mjx.Data) -> Array:
-        """J' qvel [6]: three rows of position, m/s^2, three of orientation, 1/s^2."""
+        """Returns J' qvel [6]: three rows of position, m/s^2, three of orientation, 1/s^2."""
         # Spatial vectors (angular, linear) at the centre of mass of the whole arm.
         acceleration = data.qvel[self._dofs] @ data.cdof_dot[self._dofs]
         velocity, arm = data.cvel[self._body], data.xpos[self._body] - data.subtree_com[self._root]
@@ -78,18 +58,18 @@ class _Weld:
 
 
 def _grow_for_margins(model: mujoco.MjModel) -> None:
-    """Makes geoms larger by their contacts' margin, and the margin 0, where MJX would ignore it.
+    """Enlarges geoms by the margin of their contacts, and sets the margin to 0, if MJX would ignore it.
 
-    A contact with a margin acts from that distance on. MJX 3.17 finds box-box and sphere-box contacts only where the geoms
-    overlap: their distance would jump from none to the whole margin, and a face that lies a fraction of it askew would
-    touch with fewer points. A geom that is larger by the margin gives the same distances and normals (but for boxes' edges,
-    which it leaves sharp). It must have the same margin in all its pairs of that kind.
+    A contact with a margin acts from that distance on. MJX 3.17 finds box-box and sphere-box contacts only if the geoms
+    overlap: their distance would jump from none to the whole margin, and a slightly tilted face would touch with fewer points.
+    A geom that is larger by the margin gives the same distances and normals (except at a box's edges, which stay sharp). The
+    geom must have the same margin in all its pairs of that kind.
     """
     sphere, box = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)
     ends = np.stack([model.pair_geom1, model.pair_geom2], axis=1)
     types = model.geom_type[ends]
     affected = (types == box).any(axis=1) & np.isin(types, (sphere, box)).all(axis=1)
-    # Spheres first: a larger one differs in nothing.
+    # Spheres first: a larger sphere has the same shape.
     for geom in sorted(set(ends[affected].ravel().tolist()), key=lambda geom: int(model.geom_type[geom])):
         pairs = np.flatnonzero((ends == geom).any(axis=1))
         margin = float(model.pair_margin[pairs[0]])
@@ -103,9 +83,9 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
 class MjxEngine:
     """MJX with impl="jax".
 
-    The constraint solver is a while loop that runs, under `vmap`, until the slowest environment has converged; so its
-    iterations are capped. With 4 of them objects pushed by the fingers stray twice to three times as far from recorded
-    episodes as with 8, and 100 gain little more (docs/fidelity.md).
+    Under `vmap`, the constraint solver's loop runs until the slowest environment has converged; so its iterations are capped.
+    With 4 iterations, pushed objects stray two to three times as far from recorded episodes as with 8; 100 iterations gain
+    little more (docs/fidelity.md).
     """
 
     name = "jax"
@@ -116,7 +96,7 @@ class MjxEngine:
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
         self._model = mjx.put_model(model, impl="jax")
-        # NumPy leaves: constants of whatever program traces them, on whatever device it runs.
+        # NumPy leaves become constants of the program that traces them, on any device.
         self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
         self._weld = _Weld(model)  # its six rows are the first of all constraints
         self._substeps = substeps
@@ -131,7 +111,7 @@ class MjxEngine:
                 mocap_quat=target[None, 3:],
                 ctrl=ctrl,
             )
-            with _bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
+            with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
                 data = self._step(data)
             return Physics(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart)
 
@@ -139,12 +119,11 @@ class MjxEngine:
             return jax.lax.fori_loop(0, self._substeps, substep, physics)
 
     def check(self) -> None:
-        pass  # nothing is lost unseen: all contacts have their place
+        pass  # no contact is lost: there is memory for all of them
 
     def _step(self, data: mjx.Data) -> mjx.Data:
-        """mjx.step with the weld corrected, and without sensors, of which there are none."""
+        """Computes `mjx.step` with the weld corrected, and without sensors, which the models do not have."""
         data = mjx.fwd_velocity(self._model, mjx.fwd_position(self._model, data))
-        aref = data._impl.efc_aref
-        data = data.tree_replace({"_impl.efc_aref": aref.at[:6].add(-self._weld.bias(data))})
+        data = private_api.shift_reference_acceleration(data, -self._weld.bias(data))
         data = mjx.fwd_acceleration(self._model, mjx.fwd_actuation(self._model, data))
         return mjx.euler(self._model, mjx.solve(self._model, data))

@@ -18,12 +18,12 @@ from mjx_dher.types import Array
 
 
 def usable_cores() -> int:
-    """The cores that this process may run on, which a container or `taskset` can hold below those of the machine."""
+    """Returns the number of cores that this process may use, which a container or `taskset` can limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class NativeEngine:
-    """One `jax.pure_callback` a step, whatever the number of (nested) batch axes around it.
+    """MuJoCo C behind one `jax.pure_callback` a step, for any number of (nested) batch axes.
 
     The results are those of a plain loop over `mj_step` at any number of threads: float64 inside, float32 between steps.
     """
@@ -34,18 +34,17 @@ class NativeEngine:
         self._model = copy.copy(model)
         # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-        # MuJoCo would silently put a simulation that blows up back to qpos0, all bodies at the world's origin: the environment
-        # is to see it instead.
+        # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0, and the environment cannot notice.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._substeps = substeps
-        # Where qpos, qvel, warmstart and the target end in the packed rows; ctrl is the rest.
+        # Ends of qpos, qvel, warmstart and target in a packed row; ctrl is the rest.
         self._ends = np.cumsum([model.nq, model.nv, model.nv, 7])
         self._num_threads = num_threads or usable_cores()
         self._batches: dict[int, Batch] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
-        # One array in and one out: each costs the callback some 20 microseconds.
+        # One array in and one out, because each costs the callback some 20 microseconds.
         state = jnp.concatenate([physics.qpos, physics.qvel, physics.warmstart])
         inputs = jnp.concatenate([state, target, ctrl])
         result = jax.ShapeDtypeStruct(state.shape, jnp.float32)
@@ -54,10 +53,10 @@ class NativeEngine:
         return Physics(qpos=qpos, qvel=qvel, warmstart=warmstart)
 
     def check(self) -> None:
-        pass  # nothing is lost unseen
+        pass  # nothing goes wrong unnoticed
 
     def _advance(self, inputs: Any) -> np.ndarray:
-        """The host side: `inputs` leads with any number of batch axes. NumPy only: JAX calls could deadlock."""
+        """Advances `inputs` [..., row] on the host. NumPy only: calls of JAX in a callback could deadlock."""
         rows = np.asarray(inputs).reshape(-1, inputs.shape[-1])
         qpos, qvel, warmstart, target, ctrl = np.split(rows, self._ends, axis=1)
         with self._lock:

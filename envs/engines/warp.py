@@ -1,14 +1,11 @@
 """MuJoCo Warp, the CUDA implementation that MJX brings: thousands of environments on one NVIDIA GPU.
 
-Not through `mjx.step`: that would hand some 170 arrays of every substep from Warp to XLA and back. One call advances the whole
-batch by all substeps of an environment step, in a CUDA graph that is captured once for a number of environments; what
-Warp needs between the substeps stays with it, and only the state goes in and out.
+One call advances the whole batch by all substeps of an environment step, in a CUDA graph that is captured once for each number
+of environments. Only the state goes in and out; `mjx.step` would pass some 170 arrays from Warp to XLA and back every substep.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
 import concurrent.futures
-import contextlib
-import io
 import threading
 from typing import Any
 
@@ -18,41 +15,39 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
+from mjx_dher.envs.engines.warp_substep import make_substep
+from mjx_dher.host import private_api
 from mjx_dher.host.warp_setup import prepare, wp
 from mjx_dher.types import Array
 
-with contextlib.redirect_stdout(io.StringIO()):
-    # MuJoCo Warp as it comes with MJX, not the package of that name: versions that belong together.
-    from mujoco.mjx.third_party import mujoco_warp
+mujoco_warp = private_api.mujoco_warp()
 
-    from mjx_dher.envs.engines.warp_substep import make_substep
-
-# Contacts between two geoms, at most.
+# Maximum number of contacts between two geoms, by their kinds.
 _MAX_CONTACTS = {
     frozenset(("PLANE", "BOX")): 4,
     frozenset(("PLANE", "CYLINDER")): 4,
     frozenset(("SPHERE", "BOX")): 1,
     frozenset(("BOX",)): 8,
 }
-_OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # of which contacts or constraints are lost
+_OVERFLOWS = ("NEFC", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")  # overflows that lose contacts or constraints
 
 
 class WarpEngine:
     """MuJoCo Warp on the device of the JAX program around it.
 
-    Its sums depend on the order in which threads finish: two runs agree to rounding, not bit for bit.
+    Sums depend on the order in which threads finish: two runs agree to rounding, not bit for bit.
 
     Args:
       model: the compiled MJCF, with exactly one mocap body.
       substeps: MuJoCo timesteps an environment step.
-      iterations: Newton iterations of the constraint solver, at most; the slowest environment of the batch sets the pace.
-      ls_iterations: steps of its line search, at most.
-      contacts: contacts for which there is memory, an environment (in the mean over all of them); enough for all by default.
-      constraints: rows of constraints for which there is memory, in any one environment; enough for all by default.
-      allow_cpu: run where there is no NVIDIA GPU, too, on one thread: for comparing engines, not for training.
+      iterations: maximum Newton iterations of the constraint solver; the slowest environment of the batch sets the pace.
+      ls_iterations: maximum steps of the solver's line search.
+      contacts: contacts per environment (a mean over the batch) that fit into memory; by default, all that can occur.
+      constraints: constraint rows that fit into memory in each environment; by default, all that can occur.
+      allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
-      ValueError: JAX does not run on an NVIDIA GPU here.
+      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False.
     """
 
     name = "warp"
@@ -67,15 +62,12 @@ class WarpEngine:
         constraints: int | None = None,
         allow_cpu: bool = False,
     ):
-        if not allow_cpu and not (jax.default_backend() in ("gpu", "cuda") and wp.is_cuda_available()):
-            raise ValueError(
-                f"engine warp needs JAX on an NVIDIA GPU, and JAX runs on {jax.default_backend()} here:"
-                ' pip install -e ".[cuda]" on a machine that has one, or use engine native or jax'
-            )
+        if not allow_cpu:
+            _check_gpu()
         self._model = with_stand_ins(model)
         self._model.opt.iterations = iterations
         self._model.opt.ls_iterations = ls_iterations
-        # Box against box as in C, analytically, not by the general convex algorithm.
+        # Box-box contacts are analytic, as in MuJoCo C, not from the general convex algorithm.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._substeps = substeps
         self.most_contacts, self.most_constraints = capacities(self._model)
@@ -84,6 +76,10 @@ class WarpEngine:
         self._simulations: dict[tuple[str, int], _Simulation] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
+        self._call = self._jax_callable()
+
+    def _jax_callable(self) -> Any:
+        """Returns a function of JAX that advances a batch; it makes the batch's memory when it first runs."""
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -99,29 +95,28 @@ class WarpEngine:
                 simulation = self._simulation(qpos.device, qpos.shape[0])
                 simulation.advance((qpos, qvel, warmstart), inputs, (qpos_out, qvel_out, warmstart_out))
 
-        shapes = {"qpos_out": (1, model.nq), "qvel_out": (1, model.nv), "warmstart_out": (1, model.nv)}
-        self._call = wp.jax_callable(
+        nq, nv = self._model.nq, self._model.nv
+        return wp.jax_callable(
             advance_all,
             num_outputs=3,
-            graph_mode=wp.JaxCallableGraphMode.NONE,  # `_Simulation` captures its own, whatever the buffers
+            graph_mode=wp.JaxCallableGraphMode.NONE,  # `_Simulation` captures one graph for all buffers
             vmap_method="broadcast_all",
-            output_dims=shapes,
-            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_load` does it, and two at once would clash
+            output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "warmstart_out": (1, nv)},
+            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_load` does it; two at once would clash
         )
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
         self._begin_loading()
         rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, physics.warmstart)]
-        # Else numbered by how often it has been traced, and JAX would not find a program again that it has compiled and kept.
-        self._call.call_id = 0
+        private_api.reset_call_id(self._call)
         qpos, qvel, warmstart = self._call(*rows, jnp.concatenate([target, ctrl])[None])
         return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0])
 
     def check(self) -> None:
-        """Raises where contacts or constraints were lost since the last call, for want of memory; waits for kernels to compile.
+        """Checks that no contacts or constraints were lost since the last call; waits for kernels to compile.
 
         Raises:
-          ValueError: says which, and how much memory is always enough.
+          ValueError: memory did not suffice; the message names what was lost and the sizes that always suffice.
         """
         lost = 0
         self._wait()
@@ -137,7 +132,7 @@ class WarpEngine:
             )
 
     def _begin_loading(self) -> None:
-        """Has a thread compile the kernels, which takes most of a minute once a machine, while XLA compiles the rest."""
+        """Compiles the kernels in a thread while XLA compiles the rest: most of a minute, once a machine."""
         if self._loading is None:
             pool = concurrent.futures.ThreadPoolExecutor(1)
             self._loading = pool.submit(self._load)
@@ -164,7 +159,7 @@ class _Simulation:
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, constraints: int):
         self._model = mujoco_warp.put_model(model)
-        self._model.opt.warn_overflow = 0  # a print from a kernel would stop all others
+        self._model.opt.warn_overflow = 0  # a kernel that prints would stop all others
         self._data = mujoco_warp.make_data(model, nworld=num_envs, naconmax=num_envs * contacts, njmax=constraints)
         self._substep, self._substeps = make_substep(model, self._model, self._data), substeps
         self._graph: Any = None
@@ -172,8 +167,9 @@ class _Simulation:
 
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
         data = self._data
-        for held, given in zip((data.qpos, data.qvel, data.qacc_warmstart), state):
-            wp.copy(held, given)
+        held = (data.qpos, data.qvel, data.qacc_warmstart)
+        for array, given in zip(held, state):
+            wp.copy(array, given)
         wp.copy(self._inputs, inputs)
         if not wp.get_device().is_cuda:
             self.run()
@@ -183,8 +179,8 @@ class _Simulation:
                     self.run()
                 self._graph = capture.graph
             wp.capture_launch(self._graph)
-        for given, held in zip(result, (data.qpos, data.qvel, data.qacc_warmstart)):
-            wp.copy(given, held)
+        for taken, array in zip(result, held):
+            wp.copy(taken, array)
 
     def run(self) -> None:
         data = self._data
@@ -194,7 +190,7 @@ class _Simulation:
             self._substep()
 
     def overflow(self) -> int:
-        """The kinds of overflow since the last call, as a mask."""
+        """Returns the kinds of overflow since the last call, as a mask."""
         mask = int(np.bitwise_or.reduce(self._data.overflow.numpy()))
         self._data.overflow.zero_()
         return mask
@@ -214,11 +210,19 @@ def _set_inputs(
         ctrl[world, i] = inputs[world, 7 + i]
 
 
+def _check_gpu() -> None:
+    if jax.default_backend() not in ("gpu", "cuda") or not wp.is_cuda_available():
+        raise ValueError(
+            f"engine warp needs JAX on an NVIDIA GPU, and JAX runs on {jax.default_backend()} here:"
+            ' pip install -e ".[cuda]" on a machine that has one, or use engine native or jax'
+        )
+
+
 def capacities(model: mujoco.MjModel) -> tuple[int, int]:
-    """The most contacts, and the most rows of constraints, that one environment can have: whatever the pairs can give at once.
+    """Returns the maximum numbers of contacts and of constraint rows in one environment, if all pairs touch at once.
 
     Raises:
-      ValueError: a pair of geoms of kinds that are not known.
+      ValueError: the number of contacts of a pair of geoms is not known.
     """
     contacts, rows = 0, 6 * model.neq + 2 * int(np.count_nonzero(model.jnt_limited))
     for geom1, geom2, dim in zip(model.pair_geom1, model.pair_geom2, model.pair_dim):

@@ -1,13 +1,13 @@
-"""A substep of MuJoCo Warp in fewer kernels, for models without what it then does not look for.
+"""MuJoCo Warp's substep in fewer kernels, for models without the features that this substep leaves out.
 
-A kernel takes as long to start as it takes to run, up to some ten thousand environments. MuJoCo Warp's own step sums over the
-bodies of a tree in a kernel a level (three times, and the arm is eleven levels deep), and looks after sites, cameras, sensors,
-tendons, applied forces, gravity compensation and energy, whether or not there are any. Collisions, constraints, the solver and
-the integration of positions are its own here, too.
+Up to some ten thousand environments, a kernel takes as long to start as to run. MuJoCo Warp's own step sums over a tree's
+bodies in one kernel per level (three times, and the arm is eleven levels deep). It also launches kernels for sites, cameras,
+sensors, tendons, applied forces, gravity compensation and energy that the model does not have. Collisions, constraints, the
+solver and the integration of positions are MuJoCo Warp's here, too.
 
-And it finds constraints before it computes the velocities of bodies, which the weld's acceleration depends on: so they are
-those of the substep before, or, in the first one of a call, of whatever the environment's memory was last used for, NaN
-included. Here velocities come first, and a step depends on its arguments alone.
+MuJoCo Warp also computes constraints before the velocities of bodies, on which the weld's acceleration depends. It uses the
+velocities of the substep before or, in the first substep of a call, those that its memory last held, NaN included. Here
+velocities come first, and a step depends on its arguments alone.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
 
@@ -17,70 +17,51 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import warp as wp
-from mujoco.mjx.third_party import mujoco_warp
-from mujoco.mjx.third_party.mujoco_warp._src import collision_driver, constraint, forward, smooth, solver
-from mujoco.mjx.third_party.mujoco_warp._src.types import vec10
 
-_DISABLED = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # of the options that can be disabled, the ones that make no difference
+from mjx_dher.host import private_api
+from mjx_dher.host.warp_setup import wp
 
+mujoco_warp = private_api.mujoco_warp()
+vec10 = private_api.vec10()
 
-# The library's kernels that are used here, by module. Warp compiles a module whole, and these are less than a third of theirs.
-_USED = {
-    forward: "_actuator_force _actuator_velocity _next_activation _next_position _next_velocity _qfrc_actuator"
-    " _qfrc_actuator_gravcomp_limits",
-    smooth: "_M _cacc_branch _cacc_world _cdof _cfrc _cinert _compute_body_inertial_frames _compute_body_matrices"
-    " _comvel_branch _comvel_root _geom_local_to_global _kinematics_branch _site_local_to_global _transmission",
-    solver: "_inertia_scale _qfrc_constraint_from_grad _solve_init_efc _update_gradient_h_incremental _zero_change_counters",
-}
-
-
-@functools.cache
-def _set_apart() -> None:
-    """Puts the kernels of each of these modules into a new one. What is not on the list stays where it is, and works."""
-    for module, names in _USED.items():
-        new = f"{__name__}.{module.__name__.rpartition('.')[2]}"
-        for name in names.split():
-            kernel = getattr(module, name)
-            wp.get_module(new).options.update(kernel.module.options)
-            setattr(module, name, wp.kernel(kernel.func, module=new, **kernel.options))
+_DISABLED = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # flags that make no difference to the fewer kernels
 
 
 def make_substep(model: mujoco.MjModel, m: Any, d: Any) -> Callable[[], None]:
-    """What advances `d` by a timestep: the fewer kernels where the model is one for them, else MuJoCo Warp's own step.
+    """Returns a function that advances `d` by a timestep: in fewer kernels if the model allows it, else by MuJoCo Warp's step.
 
     Args:
       model: the compiled MJCF.
-      m, d: Model and Data of MuJoCo Warp, made from it.
+      m, d: Model and Data of MuJoCo Warp, made from `model`.
     """
-    _set_apart()
-    if needs(model, m):
+    parts = private_api.mujoco_warp_parts()
+    if unsupported_features(model, m):
         return functools.partial(_library_substep, m, d)
     last: Any = wp.array(last_below(model), dtype=int)
     springs = _springs(model)
     damped = _Damped(m, d)
-    smooth._rne_cacc_world(m, d)  # gravity, as the world's acceleration: it stays
+    parts.rne_cacc_world(m, d)  # gravity, as the world's acceleration, which stays
 
     def substep() -> None:
         _constraints(m, d, last)
         _smooth_forces(m, d, last, springs)
-        smooth.factor_solve_i(m, d, d.M, d.qLD, d.qLDiagInv, d.qacc_smooth, d.qfrc_smooth)
-        solver.solve(m, d)
+        parts.factor_solve(m, d, d.M, d.qLD, d.qLDiagInv, d.qacc_smooth, d.qfrc_smooth)
+        mujoco_warp.solve(m, d)
         damped.integrate()
 
     return substep
 
 
 def _library_substep(m: Any, d: Any) -> None:
-    """MuJoCo Warp's step, with the velocities of bodies before constraints here, too."""
-    forward.fwd_kinematics(m, d)
-    smooth.com_vel(m, d)
+    """Computes MuJoCo Warp's step, with the velocities of bodies before constraints."""
+    mujoco_warp.fwd_kinematics(m, d)
+    mujoco_warp.com_vel(m, d)
     mujoco_warp.step(m, d)
 
 
-def needs(model: mujoco.MjModel, m: Any) -> list[str]:
-    """What the model has that the fewer kernels leave out."""
-    found = {
+def unsupported_features(model: mujoco.MjModel, m: Any) -> list[str]:
+    """Returns the names of the features of the model that the fewer kernels leave out."""
+    features = {
         "an integrator other than Euler": model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
         "options disabled or enabled": model.opt.disableflags & ~_DISABLED or model.opt.enableflags,
         "tendons": model.ntendon,
@@ -94,26 +75,26 @@ def needs(model: mujoco.MjModel, m: Any) -> list[str]:
         "springs of free or ball joints": model.jnt_stiffness[~_is_scalar(model)].any(),
         "springs or damping that are not linear": model.jnt_stiffnesspoly.any() or model.dof_dampingpoly.any(),
     }
-    return [name for name, is_there in found.items() if is_there]
+    return [name for name, used in features.items() if used]
 
 
 def _is_scalar(model: mujoco.MjModel) -> np.ndarray:
-    """[njnt] whether a joint is one coordinate."""
+    """Returns a mask [njnt] of joints that have one coordinate."""
     return np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def _springs(model: mujoco.MjModel) -> tuple[Any, Any, Any]:
-    """[nv] each: stiffness (0 but for joints of one coordinate), that coordinate's place in qpos, and where it is at rest."""
-    stiffness, place, rest = np.zeros(model.nv, np.float32), np.zeros(model.nv, np.int32), np.zeros(model.nv, np.float32)
+    """Returns stiffness (0 except for joints of one coordinate), index in qpos and rest position, [nv] each."""
+    stiffness, index, rest = np.zeros(model.nv, np.float32), np.zeros(model.nv, np.int32), np.zeros(model.nv, np.float32)
     joints = np.flatnonzero(_is_scalar(model))
     dofs = model.jnt_dofadr[joints]
-    stiffness[dofs], place[dofs] = model.jnt_stiffness[joints], model.jnt_qposadr[joints]
-    rest[dofs] = model.qpos_spring[place[dofs]]
-    return wp.array(stiffness, dtype=float), wp.array(place, dtype=int), wp.array(rest, dtype=float)
+    stiffness[dofs], index[dofs] = model.jnt_stiffness[joints], model.jnt_qposadr[joints]
+    rest[dofs] = model.qpos_spring[index[dofs]]
+    return wp.array(stiffness, dtype=float), wp.array(index, dtype=int), wp.array(rest, dtype=float)
 
 
 def last_below(model: mujoco.MjModel) -> np.ndarray:
-    """[nbody] int32: body b and those below it are b ... last_below[b], because MuJoCo numbers them depth first."""
+    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
     last = np.arange(model.nbody, dtype=np.int32)
     for body in range(model.nbody - 1, 0, -1):
         parent = model.body_parentid[body]
@@ -122,38 +103,40 @@ def last_below(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _constraints(m: Any, d: Any, last: Any) -> None:
-    """All that follows from positions and velocities: frames, inertias, contacts and constraints."""
+    """Computes frames, inertias, velocities, contacts and constraints from the state."""
+    parts = private_api.mujoco_warp_parts()
     bodies = (d.nworld, m.nbody)
-    smooth.kinematics(m, d)
+    mujoco_warp.kinematics(m, d)
     wp.launch(_subtree_com, dim=bodies, inputs=[last, m.body_mass, m.body_subtreemass, d.xipos], outputs=[d.subtree_com])
     inputs = [m.body_rootid, m.body_mass, m.body_inertia, d.xipos, d.ximat, d.subtree_com]
-    wp.launch(smooth._cinert, dim=bodies, inputs=inputs, outputs=[d.cinert])
+    wp.launch(parts.cinert, dim=bodies, inputs=inputs, outputs=[d.cinert])
     inputs = [m.body_rootid, m.jnt_type, m.jnt_dofadr, m.jnt_bodyid, d.xmat, d.xanchor, d.xaxis, d.subtree_com]
-    wp.launch(smooth._cdof, dim=(d.nworld, m.njnt), inputs=inputs, outputs=[d.cdof])
+    wp.launch(parts.cdof, dim=(d.nworld, m.njnt), inputs=inputs, outputs=[d.cdof])
     wp.launch(_composite_inertia, dim=bodies, inputs=[last, d.cinert], outputs=[d.crb])
     d.M.zero_()
     inputs = [m.dof_bodyid, m.dof_parentid, m.dof_armature, m.M_rownnz, m.M_rowadr, d.cdof, d.crb]
-    wp.launch(smooth._M, dim=(d.nworld, m.nv), inputs=inputs, outputs=[d.M])
-    smooth.com_vel(m, d)
-    collision_driver.collision(m, d)
-    constraint.make_constraint(m, d)
+    wp.launch(parts.mass, dim=(d.nworld, m.nv), inputs=inputs, outputs=[d.M])
+    mujoco_warp.com_vel(m, d)
+    mujoco_warp.collision(m, d)
+    mujoco_warp.make_constraint(m, d)
 
 
 def _smooth_forces(m: Any, d: Any, last: Any, springs: tuple[Any, Any, Any]) -> None:
-    """All forces but those of constraints, as `d.qfrc_smooth`."""
+    """Computes all forces except those of constraints, as `d.qfrc_smooth`."""
+    parts = private_api.mujoco_warp_parts()
     if m.nactuator:
-        smooth.transmission(m, d)
+        mujoco_warp.transmission(m, d)
         inputs = [d.qvel, d.moment_rownnz, d.moment_rowadr, d.moment_colind, d.actuator_moment]
-        wp.launch(forward._actuator_velocity, dim=(d.nworld, m.nactuator), inputs=inputs, outputs=[d.actuator_velocity])
-        forward.fwd_actuation(m, d)
-    smooth._rne_cacc_forward(m, d)
-    smooth._rne_cfrc(m, d)
+        wp.launch(parts.actuator_velocity, dim=(d.nworld, m.nactuator), inputs=inputs, outputs=[d.actuator_velocity])
+        mujoco_warp.fwd_actuation(m, d)
+    parts.rne_cacc_forward(m, d)
+    parts.rne_cfrc(m, d)
     inputs = [last, m.dof_bodyid, m.dof_damping, *springs, d.qpos, d.qvel, d.cdof, d.cfrc_int, d.qfrc_actuator]
     wp.launch(_forces, dim=(d.nworld, m.nv), inputs=inputs, outputs=[d.qfrc_smooth])
 
 
 class _Damped:
-    """MuJoCo's Euler integrator: velocities by the force at their end as far as damping goes, then positions."""
+    """MuJoCo's Euler integrator: velocities implicitly in damping, then positions."""
 
     def __init__(self, m: Any, d: Any):
         self._m, self._d = m, d
@@ -161,11 +144,11 @@ class _Damped:
         self._diagonal, self._qacc = wp.empty((d.nworld, m.nv), dtype=float), wp.empty((d.nworld, m.nv), dtype=float)
 
     def integrate(self) -> None:
-        m, d = self._m, self._d
+        m, d, parts = self._m, self._d, private_api.mujoco_warp_parts()
         inputs = [m.opt.timestep, m.dof_damping, m.M_rownnz, m.M_rowadr, d.M]
         wp.launch(_damped_mass, dim=(d.nworld, m.nv), inputs=inputs, outputs=[self._mass])
-        smooth.factor_solve_i(m, d, self._mass, self._factor, self._diagonal, self._qacc, d.efc.Ma)
-        forward._advance(m, d, self._qacc)
+        parts.factor_solve(m, d, self._mass, self._factor, self._diagonal, self._qacc, d.efc.Ma)
+        parts.advance(m, d, self._qacc)
 
 
 @wp.kernel
@@ -176,7 +159,7 @@ def _subtree_com(
     xipos: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
     subtree_com: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
 ):
-    """Where the centre of mass is of each body and those below it."""
+    """Computes the centre of mass of each body with its descendants."""
     world, body = wp.tid()  # type: ignore[misc]
     row = world % mass.shape[0]
     total = wp.vec3(0.0)
@@ -194,7 +177,7 @@ def _composite_inertia(
     cinert: wp.array2d(dtype=vec10),  # type: ignore[valid-type]
     crb: wp.array2d(dtype=vec10),  # type: ignore[valid-type]
 ):
-    """The inertia of each body with those below it as one."""
+    """Computes the composite inertia of each body with its descendants."""
     world, body = wp.tid()  # type: ignore[misc]
     if body == 0:
         return
@@ -219,7 +202,7 @@ def _forces(
     actuators: wp.array2d(dtype=float),  # type: ignore[valid-type]
     force: wp.array2d(dtype=float),  # type: ignore[valid-type]
 ):
-    """Of springs, damping and actuators, less what gravity and motion ask for: `cfrc` of the body and of those below it."""
+    """Computes the sum of spring, damping and actuator forces, less `cfrc` summed over the body and its descendants."""
     world, dof = wp.tid()  # type: ignore[misc]
     body = dof_body[dof]
     total = wp.spatial_vector()
@@ -239,7 +222,7 @@ def _damped_mass(
     mass: wp.array2d(dtype=float),  # type: ignore[valid-type]
     damped: wp.array2d(dtype=float),  # type: ignore[valid-type]
 ):
-    """The mass matrix, with the timestep times the damping on its diagonal, which ends each row."""
+    """Computes the mass matrix plus the timestep times the damping on its diagonal, which ends each row."""
     world, dof = wp.tid()  # type: ignore[misc]
     begin = rowadr[dof]
     end = begin + rownnz[dof]

@@ -23,7 +23,7 @@ class DoctorArgs:
 
 
 def doctor_command(argv: list[str], console: Console) -> int:
-    """`doctor`: says what works on this machine."""
+    """Says what works on this machine."""
     from mjx_dher.tools import doctor
 
     args = tyro.cli(DoctorArgs, prog="train.py doctor", args=argv)

@@ -20,30 +20,31 @@ class ExportArgs:
     """
 
     run: tyro.conf.Positional[Path]
-    """The run folder."""
+    """Run folder."""
     format: str
-    """onnx (a graph from observation and goal to action) or safetensors (the tensors alone)."""
+    """Format: onnx (a graph from observation and goal to action) or safetensors (the tensors alone)."""
     out: Path | None = None
     """File to write, which ends in the format's name; policy.onnx or policy.safetensors in the run folder unless given."""
     overwrite: bool = False
-    """Replace `out` if it is there already."""
+    """Replacement of an existing `out`."""
 
 
 def export_command(argv: list[str], console: Console) -> int:
-    """`export RUN`: writes the policy of a run folder for other programs."""
-    from mjx_dher.runs.load import load_policy
+    """Writes the policy of a run folder for other programs."""
+    from mjx_dher.runs.load import check_plain, load_policy
     from mjx_dher.tools import export
 
     args = tyro.cli(ExportArgs, prog="train.py export", args=argv)
     names.check_name("format", args.format, export.FORMATS)
-    run = run_folder.read_config(args.run)
+    run = run_folder.read_spec(args.run)
     out = args.out or args.run / f"policy.{args.format}"
     export.check(args.format, out, args.overwrite)
     policy = load_policy(args.run)
+    check_plain(policy, run, "export")
     difference = export.write(policy, run, args.format, out)
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(
-        f"{run.config.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"
+        f"{run.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"
         f" the same actions for {export.CHECKED:,} observations (largest difference {difference:.1g}); wrote {out}",
         soft_wrap=True,
     )

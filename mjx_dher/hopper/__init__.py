@@ -1,1 +1,1 @@
-"""Kernels for NVIDIA's Hopper GPUs (H100, H200). Loaded only where a run may use them."""
+"""Kernels for NVIDIA's Hopper GPUs (H100, H200), imported only where a run may use them."""

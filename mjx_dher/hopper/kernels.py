@@ -1,13 +1,13 @@
 # mypy: disable-error-code="valid-type,var-annotated"
-"""The kernels that `kernels.cu` describes, as Warp takes them."""
+"""Warp kernels around the CUDA code in kernels.cu."""
 
 from pathlib import Path
 
 from mjx_dher.hopper.layout import BLOCKS, INPUTS, ROWS, THREADS, WIDTH
 from mjx_dher.host.warp_setup import wp
 
-_CONSUMERS = THREADS - 128  # threads that multiply: two warpgroups; a third one copies
-_CHUNK = 64 * WIDTH  # numbers of a chunk of weights: 64 of its rows
+_CONSUMERS = THREADS - 128  # threads that multiply: two warpgroups; a third warpgroup copies
+_CHUNK = 64 * WIDTH  # weights in a chunk: 64 rows of a matrix
 _STAGES = 5  # chunks in the ring
 # Numbers of a network that stay in shared memory: three biases, the last layer's weights, [4, 256] or [256], and its bias.
 _ACTOR_VECTORS = 3 * WIDTH + 4 * WIDTH + 4
@@ -40,7 +40,7 @@ def _code(kernel: str) -> str:
 
 
 def _shared_floats(vectors: int, masks: int) -> int:
-    """Shared memory of a block: the ring, the vectors, where units are active, and the barriers."""
+    """Returns the size of a block's shared memory: the ring, the vectors, masks of active units, and the barriers."""
     return (_STAGES * _CHUNK * 2 + 4 * vectors + 16 * masks * _CONSUMERS + 128) // 4
 
 
@@ -75,8 +75,8 @@ def critic_pass(
     tiles: int, size: int, h1: _bf16, h2: _bf16, d1: _bf16, d2: _bf16, d3: _bf16, sum1: _f32, sum2: _f32, sum3: _f32,
     sum4: _f32, q_out: _f32, target_out: _f32,
 ):
-    """Critic's targets and values, and what its gradients are made of."""
-    _ = wp.tile_empty(shape=_CRITIC_SHARED, dtype=float, storage="shared")  # all of the block's
+    """Computes the critic's targets and values, and the factors of its gradients."""
+    _ = wp.tile_empty(shape=_CRITIC_SHARED, dtype=float, storage="shared")  # reserves the block's shared memory
     _critic_block(
         x, next_x, reward, gamma, target_actor_1, target_actor_2, target_actor_3, target_actor_b1, target_actor_b2,
         target_actor_b3, target_actor_w4, target_actor_b4, target_critic_1, target_critic_2, target_critic_3,
@@ -104,8 +104,8 @@ def actor_pass(
     critic_action: _f32, tiles: int, size: int, h1: _bf16, h2: _bf16, h3: _bf16, d1: _bf16, d2: _bf16, d3: _bf16, sum1: _f32,
     sum2: _f32, sum3: _f32, q_out: _f32, action_out: _f32, slope_out: _f32,
 ):
-    """Policy's actions and their values, and what the actor's gradients are made of."""
-    _ = wp.tile_empty(shape=_ACTOR_SHARED, dtype=float, storage="shared")  # all of the block's
+    """Computes the policy's actions and their values, and the factors of the actor's gradients."""
+    _ = wp.tile_empty(shape=_ACTOR_SHARED, dtype=float, storage="shared")  # reserves the block's shared memory
     _actor_block(
         x, action_l2, actor_1, actor_2, actor_3, actor_3t, actor_2t, actor_b1, actor_b2, actor_b3, actor_w4, actor_b4,
         critic_1, critic_2, critic_3, critic_3t, critic_2t, critic_b1, critic_b2, critic_b3, critic_w4, critic_b4,

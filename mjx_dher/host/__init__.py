@@ -1,1 +1,1 @@
-"""The machine that runs the program: memory, files, caches, Warp's set-up. Knows nothing of learning."""
+"""The machine that runs the program: memory, files, caches, libraries' internals. Nothing here knows of learning."""

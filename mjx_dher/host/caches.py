@@ -1,29 +1,31 @@
-"""Where what can be made again is kept, and compiled programs among it."""
+"""The user's cache folder, and the compiled programs that JAX keeps in it."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 
 def user_cache() -> Path:
-    """The folder for what can be made again, in the user's cache."""
+    """Returns this library's folder in the user's cache, whose files can all be made again."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher"
 
 
 def keep_compiled_programs() -> None:
-    """Has JAX keep what it compiles in the user's cache folder, unless the user has chosen one.
+    """Makes JAX keep compiled programs in the user's cache folder, unless the user has chosen another.
 
-    A program that calls back to Python, as every one with native physics, cannot be kept.
+    JAX cannot keep a program that calls back to Python, as every program with native physics does.
     """
     import jax
 
-    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
+    config: Any = jax.config  # not all versions of JAX have types for its fields
+    if config.jax_compilation_cache_dir is None:
+        config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
 
 
 def prepare() -> None:
-    """What a program that trains for hours needs: compiled programs are kept, and memory is not."""
+    """Prepares a process that trains for hours: compiled programs are kept, freed memory is not."""
     from mjx_dher.host import memory
 
     memory.keep_heap_small()  # before JAX starts threads

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, locked, checked before anything slow happens."""
+"""Files and folders: atomic writes, locks, and checks before anything slow happens."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 try:
     import fcntl
-except ImportError:  # not on Windows, where two programs on one run are not told apart
+except ImportError:  # Windows, where two programs may write to one run unnoticed
     fcntl = None  # type: ignore[assignment]
 
 
 class FolderError(ValueError):
-    """A folder that is no run of this program, is damaged, or must not be written to."""
+    """Error for a folder that is no run of this program, is damaged, or must not be written to."""
 
 
 def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
-    """Refuses a file that cannot or must not be written, before anything slow has happened.
+    """Checks that the file `out` can and may be written, to fail before anything slow happens.
 
     Raises:
-      FolderError: it ends in none of `endings`, is a folder, is there already (without `overwrite`), or its folder is not.
+      FolderError: `out` ends in none of `endings`, is a folder, exists (without `overwrite`), or its folder does not exist.
     """
     endings = tuple(endings)
     if out.suffix.lower() not in endings:
@@ -36,22 +36,22 @@ def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes `content` as JSON, whole or not at all."""
+    """Writes `content` as JSON, atomically."""
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n")
 
 
 @contextlib.contextmanager
 def lock(path: Path, name: str, wait: bool = False) -> Iterator[None]:
-    """Keeps other programs off the folder `path`. The system lets go of the lock when this one ends, however it ends.
+    """Locks the folder `path` against other programs. The system releases the lock when this process ends, however it ends.
 
     Args:
-      path: the folder, of a run as a rule.
-      name: a file in it that no one puts another in the place of; it is made where it is not there.
-      wait: until the other one is done.
+      path: the folder, as a rule that of a run.
+      name: a file in the folder that is never replaced; it is created if it does not exist.
+      wait: whether to wait until another program releases the lock.
 
     Raises:
-      FolderError: another program is at work there.
+      FolderError: another program holds the lock, and `wait` is False.
     """
     with (path / name).open("a") as file:
         if fcntl is not None:
@@ -64,9 +64,9 @@ def lock(path: Path, name: str, wait: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A path to write to that takes the place of `path` when it is complete; until then, what was there stays.
+    """Yields a path to write to, which replaces `path` once the block ends.
 
-    After an error it stays for good, and nothing is left of the new.
+    After an error `path` stays as it was, and the new file is deleted.
     """
     partial = path.with_name(path.name + ".partial")
     try:

@@ -1,4 +1,4 @@
-"""How much memory there is, how much is held, and having the C library give back what is free."""
+"""Memory that is available and in use, and settings that make the C library give freed memory back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of glibc's malloc.h
 
 
 def available_bytes() -> int | None:
-    """Bytes that the default device can still allocate, None where it does not tell.
+    """Returns the bytes that the default device can still allocate, or None where they are unknown.
 
     On a CPU: the free memory of the machine, or of the container if that is less (Linux only).
     """
@@ -20,12 +20,12 @@ def available_bytes() -> int | None:
     if device.platform != "cpu":
         stats = device.memory_stats()
         return stats["bytes_limit"] - stats["bytes_in_use"] if stats and "bytes_limit" in stats else None
-    found = [amount for amount in (_meminfo_available(), _container_available()) if amount is not None]
-    return min(found, default=None)
+    known = [amount for amount in (_meminfo_available(), _container_available()) if amount is not None]
+    return min(known, default=None)
 
 
 def used_bytes() -> int | None:
-    """Bytes that the default device holds for JAX; on a CPU, that this program holds (Linux only). None where unknown."""
+    """Returns the bytes that JAX uses on the default device, or on a CPU this process (Linux only). None where unknown."""
     import jax
 
     device = jax.devices()[0]
@@ -39,11 +39,11 @@ def used_bytes() -> int | None:
 
 
 def keep_heap_small() -> None:
-    """Has the C library give freed blocks of a megabyte and more back to the system, and keep the others in one heap.
+    """Makes the C library return freed blocks of a megabyte and more to the system, and keep smaller ones in one heap.
 
-    As it comes, glibc keeps freed blocks of up to 32 MB for later ones, in as many heaps as threads ask for. Buffers of
-    checkpoints then leave holes that the next ones, of other threads, do not fit into, and a long run grows by some MB with
-    each. To be called before threads are started. Elsewhere than on Linux with glibc: nothing.
+    By default, glibc keeps freed blocks of up to 32 MB for reuse, in as many heaps as threads ask for. The buffers of a
+    checkpoint leave holes that those of the next one, of other threads, do not fit into: each makes a long run grow by some MB.
+    Call this before threads are started. It does nothing except on Linux with glibc.
     """
     if (library := _glibc()) is not None:
         library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
@@ -51,7 +51,7 @@ def keep_heap_small() -> None:
 
 
 def release() -> None:
-    """Gives the system back what the C library has kept of freed memory (glibc only): after compiling, hundreds of MB."""
+    """Returns freed memory that the C library has kept to the system (glibc only): hundreds of MB after compiling."""
     if (library := _glibc()) is not None:
         library.malloc_trim(0)
 
@@ -65,7 +65,7 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def format_bytes(amount: float) -> str:
-    """For a reader: "130.5 MB"."""
+    """Formats a number of bytes for people, such as "130.5 MB"."""
     for unit in ("B", "kB", "MB", "GB"):
         if amount < 1000:
             return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -12,27 +12,15 @@ import optax
 from flax import struct
 
 from mjx_dher import normalizer
-from mjx_dher.config import HParams
-from mjx_dher.networks import Actor, Critic
+from mjx_dher.config import Config, HParams
+from mjx_dher.learners import common
+from mjx_dher.learners.common import Losses, Params
+from mjx_dher.networks import Actor, Critic, Networks, NetworksFn
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.types import Array, Batch, GoalObs, PRNGKey, PyTree
+from mjx_dher.policy import Policy, from_mlp
+from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 _ADAM = optax.scale_by_adam()  # the step size is applied apart, because it is traced
-
-
-class Networks(NamedTuple):
-    """The two modules; static."""
-
-    actor: Actor
-    critic: Critic
-
-
-@struct.dataclass
-class Params:
-    """Parameters of both networks."""
-
-    actor: PyTree
-    critic: PyTree
 
 
 @struct.dataclass
@@ -47,82 +35,12 @@ class DDPGState:
     num_updates: Array  # [] int32
 
 
-class Losses(NamedTuple):
-    """What one update saw; all []."""
-
-    critic_loss: Array  # mean squared Bellman error
-    actor_loss: Array  # minus the mean Q value, plus the action penalty
-    q_mean: Array  # mean Q value of the critic on the batch
-
-
-# What `compute_gradients` is: networks, parameters, target parameters, a normalized batch and numbers to gradients and losses.
+# compute_gradients(networks, params, target params, normalized batch, hparams) -> gradients, losses
 GradientFn = Callable[[Networks, Params, Params, Batch, HParams], tuple[Params, Losses]]
 
 
-def init(key: PRNGKey, networks: Networks, observation_size: int, goal_size: int, action_size: int) -> DDPGState:
-    """Fresh networks, targets equal to them, normalizers that have seen nothing."""
-    actor_key, critic_key = jax.random.split(key)
-    obs, goal, action = jnp.zeros(observation_size), jnp.zeros(goal_size), jnp.zeros(action_size)
-    params = Params(actor=networks.actor.init(actor_key, obs, goal), critic=networks.critic.init(critic_key, obs, goal, action))
-    return DDPGState(
-        params=params,
-        target=jax.tree.map(jnp.copy, params),
-        opt_state=_ADAM.init(params),
-        observation_norm=normalizer.init(observation_size),
-        goal_norm=normalizer.init(goal_size),
-        num_updates=jnp.zeros((), jnp.int32),
-    )
-
-
-def act(networks: Networks, state: DDPGState, obs: GoalObs, hparams: HParams) -> Array:
-    """The policy's actions [..., A] in [-1, 1], without exploration."""
-    observation = _normalize(state.observation_norm, obs["observation"], hparams)
-    goal = _normalize(state.goal_norm, obs["desired_goal"], hparams)
-    return _pi(networks, state.params.actor, observation, goal)
-
-
-class Noise(NamedTuple):
-    """What exploration adds to the actions of whole episodes; drawn at once, because it does not depend on them."""
-
-    gaussian: Array  # [T, N, A] added to the policy's action
-    is_random: Array  # [T, N] where the policy's action gives way to a uniformly random one
-    uniform: Array  # [T, N, A] that one, in [-1, 1]
-
-
-def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-    """Noise for `num_envs` episodes of `num_steps` steps: a share `random_eps` of the actions is uniformly random."""
-    gaussian_key, uniform_key = jax.random.split(key)
-    shape = (num_steps, num_envs)
-    uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1))
-    return Noise(
-        gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size)),
-        is_random=uniform[..., -1] < hparams.random_eps,
-        uniform=2.0 * uniform[..., :-1] - 1.0,
-    )
-
-
-def explore(noise: Noise, action: Array) -> Array:
-    """`action` [N, A] with the noise of one step (leaves lead with [N])."""
-    return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
-
-
-def update_normalizers(
-    state: DDPGState, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
-) -> DDPGState:
-    """The state after its normalizers saw observations [..., D] and goals [..., G].
-
-    `valid`, where given, is [N] and says which of the observations [N, ..., D] to see; the goals are seen if any of it is true.
-    """
-    seen = None if valid is None else valid.reshape(-1, *(1,) * (observation.ndim - 2))
-    return dataclasses.replace(
-        state,
-        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip, seen),
-        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip, None if valid is None else jnp.any(valid)),
-    )
-
-
 def target_value(networks: Networks, target: Params, batch: Batch, hparams: HParams) -> Array:
-    """[B] reward + gamma Q'(s', pi'(s')), clipped to what returns can be: [-1/(1-gamma), 0]. `batch` is normalized.
+    """Returns [B] reward + gamma Q'(s', pi'(s')), clipped to what returns can be: [-1/(1-gamma), 0]. `batch` is normalized.
 
     Episodes end by the clock alone, so every next state has a value.
     """
@@ -132,13 +50,13 @@ def target_value(networks: Networks, target: Params, batch: Batch, hparams: HPar
 
 
 def critic_loss(networks: Networks, critic: PyTree, batch: Batch, target: Array) -> tuple[Array, Array]:
-    """Mean squared difference of Q to `target` [B], and the mean Q. `batch` is normalized."""
+    """Returns the mean squared difference of Q to `target` [B], and the mean Q. `batch` is normalized."""
     q = _q(networks, critic, batch.observation, batch.desired_goal, batch.action)
     return jnp.mean(jnp.square(q - target)), jnp.mean(q)
 
 
 def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, hparams: HParams) -> Array:
-    """Minus the mean Q of the policy's actions plus `action_l2` times their mean square. `batch` is normalized."""
+    """Returns minus the mean Q of the policy's actions plus `action_l2` times their mean square. `batch` is normalized."""
     action = _pi(networks, actor, batch.observation, batch.desired_goal)
     q = _q(networks, critic, batch.observation, batch.desired_goal, action)
     return -jnp.mean(q) + hparams.action_l2 * jnp.mean(jnp.square(action))
@@ -147,7 +65,7 @@ def actor_loss(networks: Networks, actor: PyTree, critic: PyTree, batch: Batch, 
 def compute_gradients(
     networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams
 ) -> tuple[Params, Losses]:
-    """The gradients of both losses, each by its own network's parameters. `batch` is normalized."""
+    """Computes the gradients of both losses, each by its own network's parameters. `batch` is normalized."""
     value = target_value(networks, target, batch, hparams)
     (c_loss, q_mean), c_grad = jax.value_and_grad(lambda critic: critic_loss(networks, critic, batch, value), has_aux=True)(
         params.critic
@@ -156,34 +74,104 @@ def compute_gradients(
     return Params(actor=a_grad, critic=c_grad), Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
 
 
-def update(
-    networks: Networks, state: DDPGState, batch: Batch, hparams: HParams, compute_gradients: GradientFn = compute_gradients
-) -> tuple[DDPGState, Losses]:
-    """One step of Adam for critic and actor, both from the parameters before it. Targets stay: see `update_target`.
+@dataclasses.dataclass(frozen=True)
+class DDPG:
+    """The learner: pure functions of a `DDPGState`. `learners.Learner` says what each does."""
 
-    `compute_gradients` computes both: the function above, or `hopper.gradients.compute_gradients`.
+    sizes: Sizes
+    networks: Networks  # float32; these play
+    learning: Networks  # of the learner's dtype, with the same parameters; these learn
+    compute_gradients: GradientFn = compute_gradients  # what kernels may replace
+
+    def init(self, key: PRNGKey) -> DDPGState:
+        """Makes fresh networks, targets equal to them, and empty normalizers."""
+        actor_key, critic_key = jax.random.split(key)
+        obs, goal, action = (jnp.zeros(size) for size in self.sizes)
+        params = Params(
+            actor=self.networks.actor.init(actor_key, obs, goal),
+            critic=self.networks.critic.init(critic_key, obs, goal, action),
+        )
+        return DDPGState(
+            params=params,
+            target=jax.tree.map(jnp.copy, params),
+            opt_state=_ADAM.init(params),
+            observation_norm=normalizer.init(self.sizes.observation),
+            goal_norm=normalizer.init(self.sizes.goal),
+            num_updates=jnp.zeros((), jnp.int32),
+        )
+
+    update_normalizers = staticmethod(common.update_normalizers)
+
+    def act(self, state: DDPGState, obs: GoalObs, hparams: HParams) -> Array:
+        """Returns the policy's actions [..., A] in [-1, 1], without exploration."""
+        return _pi(self.networks, state.params.actor, *common.normalize_obs(state, obs, hparams))
+
+    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> common.Noise:
+        """Draws what `explore` takes; leaves lead with [T, N]."""
+        return common.exploration_noise(key, num_steps, num_envs, self.sizes.action, hparams)
+
+    def explore(self, state: DDPGState, obs: GoalObs, noise: common.Noise, hparams: HParams) -> Array:
+        """Returns the exploring policy's actions [N, A] under the noise of one step."""
+        return common.add_noise(noise, self.act(state, obs, hparams))
+
+    def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
+        """Takes one step of Adam for critic and actor, both from the parameters before it. Targets stay as they are."""
+        params = state.params
+        normalized = common.normalize_batch(state, batch, hparams)
+        grads, losses = self.compute_gradients(self.learning, params, state.target, normalized, hparams)
+        direction, opt_state = _ADAM.update(grads, state.opt_state)
+        params = Params(
+            actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
+            critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),
+        )
+        state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
+        return state, losses._asdict()
+
+    def update_target(self, state: DDPGState, hparams: HParams) -> DDPGState:
+        """Moves the targets softly: they keep a fraction `polyak` of themselves and take the rest from the networks."""
+        target = optax.incremental_update(state.params, state.target, 1.0 - hparams.polyak)
+        return dataclasses.replace(state, target=target)
+
+    def summary(self, state: DDPGState) -> Metrics:
+        """Returns the Euclidean norms of all parameters: actor_norm and critic_norm."""
+        return {"actor_norm": optax.tree.norm(state.params.actor), "critic_norm": optax.tree.norm(state.params.critic)}
+
+    def export(self, state: DDPGState, hparams: HParams) -> Policy | None:
+        """Returns the policy as NumPy arrays; None for networks of one's own, which NumPy cannot compute."""
+        if not isinstance(self.networks.actor, Actor):
+            return None
+        return from_mlp(state.params.actor["params"], state.observation_norm, state.goal_norm, hparams)
+
+
+def make(config: Config, sizes: Sizes, networks: NetworksFn) -> DDPG:
+    """Makes the learner, with the gradients that `config.learner_kernels` asks for.
+
+    Raises:
+      ValueError: kernels that cannot compute this run's gradients, or networks that give the wrong shapes.
     """
-    batch = dataclasses.replace(
-        batch,
-        observation=_normalize(state.observation_norm, batch.observation, hparams),
-        next_observation=_normalize(state.observation_norm, batch.next_observation, hparams),
-        desired_goal=_normalize(state.goal_norm, batch.desired_goal, hparams),
-    )
-    params = state.params
-    grads, losses = compute_gradients(networks, params, state.target, batch, hparams)
-    direction, opt_state = _ADAM.update(grads, state.opt_state)
-    params = Params(
-        actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
-        critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),
-    )
-    state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
-    return state, losses
+    playing, learning = (networks(sizes.action, config.hidden_sizes, dtype) for dtype in ("float32", config.learner_dtype))
+    _check_networks(playing, sizes)
+    return DDPG(sizes, playing, learning, _choose_gradients(config, sizes, playing))
 
 
-def update_target(state: DDPGState, hparams: HParams) -> DDPGState:
-    """Soft update: the targets keep a share `polyak` of themselves and take the rest from the networks."""
-    target = optax.incremental_update(state.params, state.target, 1.0 - hparams.polyak)
-    return dataclasses.replace(state, target=target)
+def _check_networks(networks: Networks, sizes: Sizes) -> None:
+    key, (obs, goal, action) = jax.random.key(0), (jax.ShapeDtypeStruct((2, size), jnp.float32) for size in sizes)
+    for name, inputs, shape in (("actor", (obs, goal), (2, sizes.action)), ("critic", (obs, goal, action), (2,))):
+        output = jax.eval_shape(getattr(networks, name).init_with_output, key, *inputs)[0]
+        if getattr(output, "shape", None) != shape:
+            raise ValueError(f"networks: the {name} must give {list(shape)} for a batch of 2; it gives {output}")
+
+
+def _choose_gradients(config: Config, sizes: Sizes, networks: Networks) -> GradientFn:
+    if config.learner_kernels == "xla" or (config.learner_kernels == "auto" and config.learner_dtype != "bfloat16"):
+        return compute_gradients
+    from mjx_dher.hopper import gradients as hopper
+
+    stock = isinstance(networks.actor, Actor) and isinstance(networks.critic, Critic)
+    reason = hopper.unsupported_reason(config, sizes.observation + sizes.goal, sizes.action) if stock else "networks mlp"
+    if config.learner_kernels == "hopper" and reason is not None:
+        raise ValueError(f"learner_kernels hopper needs {reason}")
+    return compute_gradients if reason is not None else hopper.compute_gradients
 
 
 def _pi(networks: Networks, actor: PyTree, observation: Array, goal: Array) -> Array:
@@ -192,7 +180,3 @@ def _pi(networks: Networks, actor: PyTree, observation: Array, goal: Array) -> A
 
 def _q(networks: Networks, critic: PyTree, observation: Array, goal: Array, action: Array) -> Array:
     return cast(Array, networks.critic.apply(critic, observation, goal, action))
-
-
-def _normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:
-    return normalizer.normalize(state, values, hparams.norm_eps, hparams.norm_clip, hparams.obs_clip)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import shutil
 from pathlib import Path
@@ -19,14 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.host import memory
+from mjx_dher.host import memory, private_api
 from mjx_dher.host.files import FolderError
 from mjx_dher.runs.run_folder import CHECKPOINTS, checkpoints, checkpoints_to_resume, read_versioned
 
-SCHEMA = 1
+SCHEMA = 2
 MANIFEST = "manifest.json"
 _STATE = "state"
 _PARTIAL = ".partial-"
+_HPARAMS = ".hparams."
 
 
 class CheckpointError(FolderError):
@@ -34,7 +34,7 @@ class CheckpointError(FolderError):
 
 
 class Restored(NamedTuple):
-    """What `restore` found."""
+    """A restored checkpoint."""
 
     path: Path
     epoch: int  # epochs that had ended
@@ -75,7 +75,7 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
             "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
         }
         with (partial / MANIFEST).open("w") as file:
-            json.dump({**content, "sha256": _digest_of(content)}, file, indent=1)
+            json.dump({**content, "sha256": digest_of(content)}, file, indent=1)
         for path in _files(partial):
             _flush(path)
         if target.exists():
@@ -95,7 +95,7 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
 
 
 def restore(folder: Path, template: Any) -> Restored:
-    """The newest checkpoint of the run in `folder` that is whole.
+    """Returns the newest checkpoint of the run in `folder` that is whole.
 
     Args:
       folder: of the run.
@@ -119,31 +119,64 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
     manifest = _read_manifest(path)
     for name, digest in manifest["files"].items():
         try:
-            found = _digest(path / name)
+            digest_now = _digest(path / name)
         except OSError as error:
             raise CheckpointError(f"{path} is damaged: {name} cannot be read ({error.strerror})") from error
-        if found != digest:
+        if digest_now != digest:
             raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
-    expected = [[name, list(leaf.shape), str(leaf.dtype)] for name, leaf in _to_shapes(template).items()]
-    for saved, wanted in zip(manifest["leaves"], expected):
-        if saved != wanted:
-            raise CheckpointError(f"{path} does not fit this run: it holds {_say(saved)} where {_say(wanted)} is needed")
-    if len(manifest["leaves"]) != len(expected):
-        raise CheckpointError(f"{path} does not fit this run: {len(manifest['leaves'])} arrays, not {len(expected)}")
-    arrays = _read_arrays(path / _STATE, len(expected))
-    for array, (name, shape, dtype) in zip(arrays, expected):
-        if (list(array.shape), str(array.dtype)) != (shape, dtype):
-            found = _say([name, list(array.shape), str(array.dtype)])
-            raise CheckpointError(f"{path} was read as {found}, and was written as {_say([name, shape, dtype])}")
-    return manifest, _from_arrays(arrays, template)
+    saved = {name: [name, shape, dtype] for name, shape, dtype in manifest["leaves"]}
+    arrays = dict(zip(saved, _read_arrays(path / _STATE, len(saved))))
+    for name, array in arrays.items():
+        if [name, list(array.shape), str(array.dtype)] != saved[name]:
+            read = _say([name, list(array.shape), str(array.dtype)])
+            raise CheckpointError(f"{path} was read as {read}, and was written as {_say(saved[name])}")
+    shapes = _to_shapes(template)
+    if manifest["schema"] == 1:
+        arrays = _upgraded(arrays, shapes)
+    return manifest, _from_arrays(_fit(path, arrays, shapes), template)
+
+
+def _upgraded(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
+    """Returns the arrays of schema 1 as today's: two have other names, and one lane had an axis of its own."""
+    names = {".replay.eventful": ".replay.priority", ".hparams.eventful_share": ".hparams.priority_fraction"}
+    arrays = {names.get(name, name): array for name, array in arrays.items()}
+    if ".replay.priority" in arrays:
+        arrays[".replay.priority"] = arrays[".replay.priority"].astype(np.float32)
+    lane = {name for name, leaf in shapes.items() if name in arrays and arrays[name].shape == (1, *leaf.shape)}
+    return {name: array[0] if name in lane else array for name, array in arrays.items()}
+
+
+def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
+    """Returns the arrays in the order of `shapes`.
+
+    HParams that the checkpoint lacks are 0, and those that it has too many are left out: a run takes them from its settings.
+
+    Raises:
+      CheckpointError: names the first array that is not what `shapes` asks for.
+    """
+    fitted = []
+    for name, leaf in shapes.items():
+        needed = [name, list(leaf.shape), str(leaf.dtype)]
+        if name not in arrays and name.startswith(_HPARAMS):
+            fitted.append(np.zeros(leaf.shape, leaf.dtype))
+        elif name not in arrays:
+            raise CheckpointError(f"{path} does not fit this run: it has no {_say(needed)}")
+        elif [name, list(arrays[name].shape), str(arrays[name].dtype)] != needed:
+            held = _say([name, list(arrays[name].shape), str(arrays[name].dtype)])
+            raise CheckpointError(f"{path} does not fit this run: it holds {held} where {_say(needed)} is needed")
+        else:
+            fitted.append(arrays[name])
+    if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
+        raise CheckpointError(f"{path} does not fit this run: it holds {extra[0]}, which is not needed")
+    return fitted
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        content = read_versioned(path / MANIFEST, SCHEMA)
+        content = read_versioned(path / MANIFEST, 1, SCHEMA)
     except FileNotFoundError:
         raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
-    if content.pop("sha256", None) != _digest_of(content):
+    if content.pop("sha256", None) != digest_of(content):
         raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
     return content
 
@@ -162,12 +195,13 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _digest_of(content: dict[str, Any]) -> str:
+def digest_of(content: Any) -> str:
+    """Returns the SHA-256 of what JSON can hold."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _flush(path: Path) -> None:
-    """Onto the disk, so that a name never stands for what is not there."""
+    """Flushes a file onto the disk, so that a name never stands for missing content."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -202,23 +236,15 @@ def _from_arrays(arrays: list[np.ndarray], template: Any) -> Any:
     return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
 
 
-def _checkpointer() -> Any:
-    import orbax.checkpoint
-
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax tells how long each step took
-    # A folder for each array: the process keeps some memory of every checkpoint in orbax's other format, OCDBT.
-    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False))
-
-
 def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
-    with _checkpointer() as checkpointer:
+    with private_api.array_checkpointer() as checkpointer:
         checkpointer.save(path.absolute(), {f"{index:04d}": array for index, array in enumerate(arrays)})
 
 
 def _read_arrays(path: Path, count: int) -> list[np.ndarray]:
     try:
-        with _checkpointer() as checkpointer:
-            found = checkpointer.restore(path.absolute())
-        return [np.asarray(found[f"{index:04d}"]) for index in range(count)]
+        with private_api.array_checkpointer() as checkpointer:
+            arrays = checkpointer.restore(path.absolute())
+        return [np.asarray(arrays[f"{index:04d}"]) for index in range(count)]
     except Exception as error:
         raise CheckpointError(f"{path} cannot be read ({error})") from error

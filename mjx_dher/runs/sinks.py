@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import importlib.util
 import json
 import math
 import os
@@ -12,16 +11,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
-
+from mjx_dher.host import memory
 from mjx_dher.host.files import FolderError, atomic_write
-from mjx_dher.names import check_name
-from mjx_dher.runs.run_folder import METRICS_FILE, read_content
+from mjx_dher.names import check_name, require_extra
+from mjx_dher.runs import run_folder
+from mjx_dher.runs.run_folder import METRICS_FILE
 
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
 COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
 FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
+OLD_NAMES = {"eventful_share": "priority_mean"}  # metrics of earlier versions, and what they are called now
 LOGS = ("jsonl", "tensorboard", "wandb")
 
 
@@ -51,7 +50,7 @@ class CsvSink:
             raise FolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
         self._file = path.open("a", newline="")
         if kept:
-            self._writer = csv.DictWriter(self._file, kept[0].strip().split(","))
+            self._writer = csv.DictWriter(self._file, [OLD_NAMES.get(name, name) for name in kept[0].strip().split(",")])
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:
@@ -119,14 +118,16 @@ class WandbSink:
     def __init__(self, folder: Path, content: dict[str, Any]):
         import wandb
 
-        identity = hashlib.sha256(json.dumps([folder.absolute().name, content], sort_keys=True).encode()).hexdigest()[:16]
+        run = run_folder.to_spec(folder, content)
+        written = json.loads((folder / run_folder.CONFIG_FILE).read_text())  # as it was, whatever version wrote it
+        identity = hashlib.sha256(json.dumps([folder.absolute().name, written], sort_keys=True).encode()).hexdigest()[:16]
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
             name=folder.absolute().name,
             id=identity,
             resume="allow",
             dir=folder,
-            config={**content["config"], **content["hparams"], "seed": content["seed"], "engine": content["engine"]},
+            config={**run_folder.settings(run), "seed": run.seed, "engine": content["physics"]},
             settings=wandb.Settings(silent=True),
         )
 
@@ -141,59 +142,36 @@ EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # of LOGS, and the p
 
 
 def check(logs: Sequence[str]) -> None:
-    """Refuses names that are not in LOGS, and those whose packages are missing.
+    """Raises unless all names are in LOGS and their packages are installed.
 
     Raises:
       ValueError: names the log, and the extra to install.
     """
     for log in logs:
         check_name("log", log, LOGS)
-        if log in EXTRAS and importlib.util.find_spec(EXTRAS[log]) is None:
-            raise ValueError(f'log {log} needs {EXTRAS[log]}, which is not installed: pip install -e ".[{log}]"')
+        if log in EXTRAS:
+            require_extra(f"log {log}", EXTRAS[log], log)
 
 
 def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0) -> list[Sink]:
-    """metrics.csv, and `logs`, of the run in `folder`, of which so many epochs and environment steps had ended."""
+    """Opens metrics.csv, and `logs`, of the run in `folder`, of which so many epochs and environment steps had ended."""
     makers: dict[str, Callable[[], Sink]] = {
         "jsonl": lambda: JsonlSink(folder / "metrics.jsonl", epochs),
         "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
-        "wandb": lambda: WandbSink(folder, read_content(folder)),
+        "wandb": lambda: WandbSink(folder, run_folder.read_content(folder)),
     }
     return [CsvSink(folder / METRICS_FILE, epochs), *(makers[log]() for log in dict.fromkeys(logs))]
 
 
-class ConsoleSink:
-    """A live line on a terminal; elsewhere a plain line an epoch."""
-
-    def __init__(self, console: Console, num_epochs: int):
-        self._console = console
-        self._num_epochs = num_epochs
-        self._live: Progress | None = None
-        if console.is_terminal:
-            self._live = Progress(SpinnerColumn(), BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
-            self._task = self._live.add_task("first epoch ...", total=num_epochs)
-            self._live.start()
-
-    def write(self, row: dict[str, Any]) -> None:
-        remaining = self._num_epochs - row["epoch"]
-        eta = remaining * row["wall_seconds"] / row["epoch"]
-        line = (
-            f"epoch {row['epoch']}/{self._num_epochs}  {row['env_steps']:,} steps"
-            f"  {row['steps_per_second']:,.0f} steps/s  {row['updates_per_second']:,.0f} updates/s"
-            f"  success {row['success_rate']:.2f}  return {row['return_mean']:.1f}  ETA {clock(eta)}"
-        )
-        if self._live is None:
-            self._console.print(line, soft_wrap=True, highlight=False)
-        else:
-            self._live.update(self._task, completed=row["epoch"], description=line)
-
-    def close(self) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-
-def clock(seconds: float) -> str:
-    """For a reader: "1:02:03"."""
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+def row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
+    """Returns what the sinks take of an epoch: a `loop.Progress` and the metrics of one run, in the order of metrics.csv."""
+    steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
+    first = {name: metrics[name] for name in FIRST_COLUMNS if name in metrics}
+    return {
+        **{name: getattr(progress, name) for name in COUNTS},
+        **first,
+        **metrics,
+        "steps_per_second": steps / progress.epoch_seconds,
+        "updates_per_second": updates / progress.epoch_seconds,
+        "memory_bytes": memory.used_bytes() or math.nan,
+    }

@@ -1,8 +1,9 @@
-"""What a sweep shows: its settings beside one another, with intervals, and against a baseline."""
+"""Comparison of a sweep's settings with one another and with a baseline, with intervals."""
 
 from __future__ import annotations
 
 import csv
+import functools
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,84 +11,93 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import config as config_lib
 from mjx_dher import stats
 from mjx_dher.host import files
-from mjx_dher.sweeps.sweep import reads
+from mjx_dher.runs.run_folder import DIVERGED
+from mjx_dher.spec import SAMPLERS, reads
 
 COMPARISON = "comparison.csv"
 
 
 class Group(NamedTuple):
-    """All seeds of one setting."""
+    """Results of all seeds of one setting."""
 
     env: str
-    label: str  # the sampler, and whatever else differs between the settings of this environment
+    label: str  # the sampler, and the other values that differ between the settings of this environment
     sampler: str
-    others: dict[str, Any]  # what else differs, of the settings that this sampler reads
+    others: dict[str, Any]  # the other values that differ and that this sampler reads
     seeds: tuple[int, ...]  # S of them
+    diverged: int  # runs of which the learner did not stay finite
     epoch: NDArray  # [P]
     env_steps: NDArray  # [P]
     seconds: NDArray  # [P] the mean over the seeds
     success: NDArray  # [S, P] success rate after each epoch
     final: NDArray  # [S] success rate of the last policy
-    at_reset: float  # share of the final episodes whose goal was reached at the reset
+    at_reset: float  # fraction of the final episodes whose goal was reached at the reset
 
 
-def groups(cells: list[dict[str, Any]]) -> dict[str, list[Group]]:
-    """The cells of a sweep, as `sweep.read` gives them, by environment and setting."""
+def groups(trials: list[dict[str, Any]]) -> dict[str, list[Group]]:
+    """Returns the trials of a sweep, as `tables.read` gives them, by environment and setting."""
     by_env: dict[str, list[dict[str, Any]]] = {}
-    for cell in cells:
-        by_env.setdefault(cell["config"]["env"], []).append(cell)
-    return {env: _groups_of(env, found) for env, found in by_env.items()}
+    for trial in trials:
+        by_env.setdefault(trial["settings"]["env"], []).append(trial)
+    return {env: _groups_of(env, own) for env, own in by_env.items()}
 
 
-def _groups_of(env: str, cells: list[dict[str, Any]]) -> list[Group]:
-    settings = [{**cell["config"], **cell["hparams"]} for cell in cells]
+def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
+    settings = [trial["settings"] for trial in trials]
     varying = [name for name in settings[0] if name not in ("sampler", "env") and len({str(s[name]) for s in settings}) > 1]
     by_label: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
-    for cell, setting in zip(cells, settings):
+    for trial, setting in zip(trials, settings):
         own = {name: setting[name] for name in varying if reads(setting["sampler"], name)}
-        label = ", ".join([setting["sampler"], *(_say(name, value) for name, value in own.items())])
-        by_label.setdefault(label, (own, []))[1].append(cell)
-    order = {name: number for number, name in enumerate(config_lib.SAMPLERS)}
-    found = [_group(env, label, *rest) for label, rest in by_label.items()]
+        label = ", ".join([setting["sampler"], *(_format(name, value) for name, value in own.items())])
+        by_label.setdefault(label, (own, []))[1].append(trial)
+    order = {name: number for number, name in enumerate(SAMPLERS)}
+    result = [_group(env, label, *rest) for label, rest in by_label.items()]
     # Numbers in rising order; names of one setting are all strings.
-    return sorted(found, key=lambda group: (order.get(group.sampler, len(order)), list(group.others.values())))
+    return sorted(result, key=lambda group: (order.get(group.sampler, len(order)), list(group.others.values())))
 
 
-def _say(name: str, value: Any) -> str:
+def _format(name: str, value: Any) -> str:
     return (
         str(value) if isinstance(value, str) else f"{name} {value:g}" if isinstance(value, (int, float)) else f"{name} {value}"
     )
 
 
-def _group(env: str, label: str, others: dict[str, Any], cells: list[dict[str, Any]]) -> Group:
-    cells = sorted(cells, key=lambda cell: cell["seed"])
-    curves = [cell["curve"] for cell in cells]
+def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, Any]]) -> Group:
+    """Returns the group of one setting's trials. A run that diverged has a success of 0 from then on."""
+    trials = sorted(trials, key=lambda trial: trial["seed"])
+    longest = max((trial["curve"] for trial in trials), key=lambda curve: len(curve.get("epoch", ())))
+    longest = longest or {"epoch": [1], "env_steps": [0], "wall_seconds": [0.0]}
+    length = len(longest["epoch"])
+    whole = [trial["curve"]["wall_seconds"] for trial in trials if len(trial["curve"].get("epoch", ())) == length]
+    success = [trial["curve"].get("success_rate", []) for trial in trials]
+    at_reset = [trial["final"]["reset_success_rate"] for trial in trials if trial["final"]]
     return Group(
         env=env,
         label=label,
-        sampler=cells[0]["config"]["sampler"],
+        sampler=trials[0]["settings"]["sampler"],
         others=others,
-        seeds=tuple(cell["seed"] for cell in cells),
-        epoch=np.array(curves[0]["epoch"]),
-        env_steps=np.array(curves[0]["env_steps"]),
-        seconds=np.mean([curve["wall_seconds"] for curve in curves], axis=0),
-        success=np.array([curve["success_rate"] for curve in curves]),
-        final=np.array([cell["final"]["success_rate"] for cell in cells]),
-        at_reset=float(np.mean([cell["final"]["reset_success_rate"] for cell in cells])),
+        seeds=tuple(trial["seed"] for trial in trials),
+        diverged=sum(trial["status"] == DIVERGED for trial in trials),
+        epoch=np.array(longest["epoch"]),
+        env_steps=np.array(longest["env_steps"]),
+        seconds=np.mean(whole or [longest["wall_seconds"]], axis=0),
+        success=np.array([rates + [0.0] * (length - len(rates)) for rates in success]),
+        final=np.array([trial["final"].get("success_rate", 0.0) for trial in trials]),
+        at_reset=float(np.mean(at_reset)) if at_reset else math.nan,
     )
 
 
 class Row(NamedTuple):
-    """A setting against the baseline. Intervals are of 95 %, over seeds; see `compare`."""
+    """Comparison of a setting with the baseline. Intervals are at 95 %, over seeds; see `compare`."""
 
     env: str
     setting: str
     seeds: int
+    diverged: int  # seeds whose learner did not stay finite; their success is 0 from then on
     final: float  # mean success rate of the last policies
-    final_iqm: float  # interquartile mean of it
+    final_iqm: float  # interquartile mean of these rates
     final_low: float
     final_high: float
     at_reset: float
@@ -95,31 +105,31 @@ class Row(NamedTuple):
     area_low: float
     area_high: float
     reached: int  # seeds with an epoch at the threshold or above
-    epochs: float  # median of the first such epoch; infinite where half of the seeds have none
+    epochs: float  # median of the first such epoch; infinite if half of the seeds or more have none
     epochs_low: float
     epochs_high: float
-    env_steps: float  # as many environment steps
-    better: float  # probability that a seed has a larger area than one of the baseline; nan for the baseline itself
+    env_steps: float  # environment steps until that epoch
+    better: float  # probability that a seed has a larger area than one of the baseline; NaN for the baseline itself
     better_low: float
     better_high: float
-    area_gain: float  # mean difference of the areas to the baseline's, seed by seed
-    p_value: float  # of that difference, two-sided, before correction
-    p_corrected: float  # by Holm's method, over the settings of this environment
+    area_gain: float  # mean difference of the areas to the baseline's, paired by seed
+    p_value: float  # two-sided p-value of that difference, before correction
+    p_corrected: float  # p-value corrected by Holm's method over the settings of this environment
 
 
-def compare(found: list[Group], baseline: str, threshold: float) -> list[Row]:
-    """Each of an environment's settings, and its difference to the baseline.
+def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]:
+    """Compares each setting of an environment with the baseline.
 
-    Success, area and epochs have bootstrap intervals over seeds; `better` is the probability of improvement; the p value is of
-    a paired permutation test by seed, where both have the same seeds.
+    Success, area and epochs have bootstrap intervals over seeds; `better` is the probability of improvement. If both
+    settings have the same seeds, the p-value is that of a permutation test paired by seed.
 
     Args:
-      found: settings of one environment.
-      baseline: label of one of them, or a sampler: then each is compared with that sampler's setting that shares its other
-        numbers. Where there is none, nothing is compared.
-      threshold: success rate.
+      settings: settings of one environment.
+      baseline: label of one of them, or a sampler. Then each setting is compared with that sampler's setting of the same
+        other values; without such a setting, it is not compared.
+      threshold: success rate that `reached` and `epochs` refer to.
     """
-    rows = [_row(group, _baseline_of(group, found, baseline), threshold) for group in found]
+    rows = [_row(group, _baseline_of(group, settings, baseline), threshold) for group in settings]
     tested = [i for i, row in enumerate(rows) if not math.isnan(row.p_value)]
     corrected = stats.holm([rows[i].p_value for i in tested]) if tested else []
     for i, p in zip(tested, corrected):
@@ -127,22 +137,22 @@ def compare(found: list[Group], baseline: str, threshold: float) -> list[Row]:
     return rows
 
 
-def _baseline_of(group: Group, found: list[Group], baseline: str) -> Group | None:
-    """The setting to compare `group` with; None where there is none, or it is the baseline itself."""
+def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | None:
+    """Returns the setting to compare `group` with; None if there is none, or `group` is the baseline itself."""
 
     def fits(other: Group) -> bool:
         return all(group.others.get(name, value) == value for name, value in other.others.items())
 
-    labelled = [other for other in found if other.label == baseline]
-    likely = labelled or [other for other in found if other.sampler == baseline and fits(other)]
+    labelled = [other for other in settings if other.label == baseline]
+    likely = labelled or [other for other in settings if other.sampler == baseline and fits(other)]
     return likely[0] if len(likely) == 1 and likely[0] is not group else None
 
 
 def _row(group: Group, base: Group | None, threshold: float) -> Row:
     areas = _areas(group)
     reach = stats.first_reach(group.epoch, group.success, threshold)
-    median = lambda x: float(np.quantile(x, 0.5, method="inverted_cdf"))  # noqa: E731
-    epochs = median(reach)
+    median = functools.partial(np.quantile, q=0.5, method="inverted_cdf")
+    epochs = float(median(reach))
     steps_per_epoch = group.env_steps[0] / group.epoch[0]
     nan = math.nan
     better, gain, p_value = (nan, nan, nan), nan, nan
@@ -155,6 +165,7 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
         group.env,
         group.label,
         len(group.seeds),
+        group.diverged,
         float(group.final.mean()),
         stats.interquartile_mean(group.final),
         *stats.bootstrap_interval(group.final),
@@ -179,7 +190,7 @@ def _areas(group: Group) -> NDArray:
 
 
 def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of `rows`, for a reader."""
+    """Formats `rows` as a table for the screen: its head and its cells."""
     head = ["env", "setting", "seeds", "final success (IQM)", "mean over epochs", "epochs to threshold", "P(better)", "p"]
     cells = []
     for r in rows:
@@ -188,7 +199,7 @@ def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
             [
                 r.env,
                 r.setting,
-                str(r.seeds),
+                f"{r.seeds} ({r.diverged} diverged)" if r.diverged else str(r.seeds),
                 f"{r.final_iqm:.3f} ({r.final_low:.3f}-{r.final_high:.3f})",
                 f"{r.area:.3f} ({r.area_low:.3f}-{r.area_high:.3f})",
                 epochs,
@@ -200,7 +211,7 @@ def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def write(folder: Path, rows: list[Row]) -> None:
-    """Writes comparison.csv."""
+    """Writes the rows to comparison.csv in `folder`."""
     with files.atomic_write(folder / COMPARISON) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(Row._fields)

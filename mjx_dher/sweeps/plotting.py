@@ -1,4 +1,4 @@
-"""Pictures of a sweep, with Matplotlib (extra `plot`): readable without colour, too."""
+"""Figures of a sweep, drawn with Matplotlib (extra `plot`) and readable without colour."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import stats
+from mjx_dher import names, stats
 from mjx_dher.runs import run_folder
 from mjx_dher.sweeps.comparison import Group, Row
 
-# Okabe and Ito's colours, which colour-blind readers tell apart, from dark to light; each with a line and a marker of its own.
+# Okabe and Ito's palette, which colour-blind readers can tell apart, from dark to light; each with its own line and marker.
 _STYLES = (
     ("#000000", "-", "o"),
     ("#0072B2", "--", "s"),
@@ -26,18 +26,15 @@ FORMATS = ("png", "svg", "pdf")
 
 
 def check(formats: Sequence[str]) -> None:
-    """Raises ValueError where Matplotlib is not installed or a format is not one of FORMATS."""
-    import importlib.util
-
+    """Raises ValueError if Matplotlib is not installed or a format is not one of FORMATS."""
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ValueError('plot needs Matplotlib: pip install -e ".[plot]"')
+    names.require_extra("plot", "matplotlib", "plot")
 
 
 def curves(groups: Sequence[Group], threshold: float) -> Any:
-    """Success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
+    """Draws success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
     plt = _pyplot()
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True, layout="constrained")
     for group, (color, line, marker) in zip(groups, _styles(len(groups))):
@@ -60,7 +57,10 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
 
 
 def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> Any:
-    """Epochs to the threshold: a mark a seed, the median with its interval; seeds that never got there lie above the line."""
+    """Draws the epochs to the threshold of each seed, and their median with its interval.
+
+    Seeds that never reach the threshold lie above the dashed line.
+    """
     plt = _pyplot()
     figure, axis = plt.subplots(figsize=(1.6 + 1.3 * len(groups), 3.8), layout="constrained")
     last = max(float(group.epoch[-1]) for group in groups)
@@ -83,7 +83,7 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
 
 
 def comparison(rows: Sequence[Row]) -> Any:
-    """Final success, mean success over all epochs, and the probability of improvement on the baseline, with intervals."""
+    """Draws final success, mean success over all epochs, and probability of improvement on the baseline, with intervals."""
     plt = _pyplot()
     figure, axes = plt.subplots(1, 3, figsize=(11, 1.2 + 0.45 * len(rows)), sharey=True, layout="constrained")
     panels = (
@@ -107,18 +107,18 @@ def comparison(rows: Sequence[Row]) -> Any:
 
 
 def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
-    """Writes the three pictures of an environment into `folder`; returns their files."""
+    """Writes the three figures of an environment into `folder` and returns their paths."""
     plt = _pyplot()
     written = []
-    pictures = {
+    figures = {
         "curves": curves(groups, threshold),
         "thresholds": thresholds(groups, rows, threshold),
         "comparison": comparison(rows),
     }
-    for name, figure in pictures.items():
+    for name, figure in figures.items():
         for ending in formats:
             path = folder / f"{run_folder.in_a_path(groups[0].env)}_{name}.{ending}"
-            # Without a date and with fixed names within, so that the same sweep draws the same file.
+            # No date and fixed ids, so that the same sweep gives the same file.
             with plt.rc_context({"svg.hashsalt": "mjx-dher"}):
                 figure.savefig(path, dpi=130, metadata={"Date": None} if ending == "svg" else None)
             written.append(path)

@@ -1,130 +1,136 @@
-"""What a report of a fault needs to say of the machine: versions, devices, and which engines and ways to draw work here.
+"""The report for a bug report: versions, devices, folders, and which engines and drawing backends work on this machine.
 
-Whatever loads JAX or MuJoCo runs in a process of its own, for a limited time: a driver that hangs or crashes costs one line.
-Such a process is this file, run as a program:
+JAX and MuJoCo are loaded in child processes with a time limit, so a driver that hangs or crashes costs one line of the report.
+A child process is this file, run as a program:
 
     python -m mjx_dher.tools.doctor machine|native|jax|warp
 """
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
-import functools
 import json
 import os
 import platform
-import subprocess
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import __version__, config, presets
-from mjx_dher.host import caches, memory
+from mjx_dher import __version__, presets, spec
+from mjx_dher.host import caches, memory, subprocesses
 from mjx_dher.tools import originals, render
 
-LONGEST_SECONDS = 3600.0  # that one process can be given
-ENGINES = tuple(name for name in config.ENGINES if name != "auto")
+LONGEST_SECONDS = 3600.0  # longest time limit of a child process
+ENGINES = tuple(name for name in spec.ENGINES if name != "auto")
 NOT_STEPPED = "jax"  # its step takes some 20 s to compile on two cores, that of native 1 s
-MACHINE = "machine"
-PROCESSES = 4  # at once, at most
+MACHINE = ("cores", "devices", "memory", "auto", "preset")  # parts of the section `machine`
+PROCESSES = 4  # most child processes at once
 LONGEST_ERROR = 400  # characters
 
-# Packages to name the version of -> the extra that installs them; None: none does.
-PACKAGES = {
-    "jax": None,
-    "jaxlib": None,
-    "mujoco": None,
-    "mujoco-mjx": None,
-    "flax": None,
-    "optax": None,
-    "orbax-checkpoint": None,
-    "numpy": None,
-    "jax-cuda12-plugin": "cuda",
-    "warp-lang": "cuda",
-    "gymnasium": "gym",
-    "matplotlib": "plot",
-    "imageio-ffmpeg": "video",
-    "onnx": "export",
-    "safetensors": "export",
-    "tensorboardX": "tensorboard",
-    "tensorboard": "tensorboard",
-    "wandb": "wandb",
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
+EXTRAS = {  # extra: packages that only it installs
+    "cuda": ("jax-cuda12-plugin", "warp-lang"),
+    "gym": ("gymnasium",),
+    "plot": ("matplotlib",),
+    "video": ("imageio-ffmpeg",),
+    "export": ("onnx", "safetensors"),
+    "tensorboard": ("tensorboardX", "tensorboard"),
+    "wandb": ("wandb",),
+    "docs": ("pdoc",),
 }
+EXTRA_OF = {package: extra for extra, packages in EXTRAS.items() for package in packages}
+
+# Texts for None in the report, by name; "unknown" for the others.
+_NONE = {"MUJOCO_GL": "not set", "step": "not tried, because it takes long to compile", "bytes": "no such folder"}
 
 Report = dict[str, dict[str, Any]]
 
 
 def check(seconds: float) -> None:
-    """Raises ValueError where a process cannot be given so many seconds."""
+    """Raises ValueError unless `seconds` is an allowed time limit of a child process."""
     if not 0 < seconds <= LONGEST_SECONDS:
         raise ValueError(f"seconds must lie in (0, {LONGEST_SECONDS:g}]; got {seconds:g}")
 
 
 def examine(seconds: float) -> Report:
-    """Looks at everything; leaves nothing behind but, on a GPU, the kernels that Warp compiles and keeps.
+    """Examines the machine; on a GPU, Warp keeps the kernels that it compiles, and nothing else is left behind.
 
     Args:
-      seconds: that each process may take.
+      seconds: time limit of each child process.
 
     Returns:
-      For each section its parts, as JSON takes them. A part that could not be found out is {"error": ONE LINE}.
-      versions: strings, None where a package is not installed.
-      machine: cores; memory, bytes that can be allocated; devices that JAX has, a list of {platform, kind, memory in bytes};
+      Sections of named parts, as JSON takes them. A part that could not be determined is {"error": ONE LINE}.
+      versions: strings, None for a package that is not installed.
+      machine: cores; memory, bytes that can be allocated; devices of JAX, a list of {platform, kind, memory in bytes};
         auto, the engine that it stands for; preset.
-      engines: {works, import, build, step in s}, where step is None if it was not tried, or {works, error}.
-      drawing: MUJOCO_GL as the user has set it; for each value that it can have (where there is but one way, for "system")
-        {works} or {works, error}; ffmpeg, its path.
-      folders: cache: {path, bytes}; originals: {path, ready}. Bytes are None where there is no such folder.
+      engines: {works, import, build, step in s}, where step is None if it was not tried, or {works, error, ...}.
+      drawing: MUJOCO_GL as the user has set it; {works} or {works, error} for each of its values ("system" where there is
+        only one backend); ffmpeg, its path.
+      folders: cache: {path, bytes}; originals: {path, ready}. Bytes are None if there is no such folder.
     """
-    asked = os.environ.get("MUJOCO_GL")
-    ways = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([asked] if asked else [])])
-    with concurrent.futures.ThreadPoolExecutor(min(PROCESSES, os.cpu_count() or 1)) as pool:
-        engines = {name: pool.submit(_engine, name, seconds) for name in ENGINES}
-        machine = pool.submit(ask, _command(MACHINE), seconds)
-        drawing = {name or "system": pool.submit(_drawing, name, seconds) for name in ways}
-        parts: dict[str, dict[str, Callable[[], Any]]] = {
-            "versions": {
-                "mjx_dher": lambda: __version__,
-                "python": platform.python_version,
-                "platform": platform.platform,
-                **{name: functools.partial(version, name) for name in PACKAGES},
-            },
-            "machine": {name: functools.partial(_answer, machine, name) for name in _PARTS},
-            "engines": {name: found.result for name, found in engines.items()},
-            "drawing": {
-                "MUJOCO_GL": lambda: asked,
-                **{name: found.result for name, found in drawing.items()},
-                "ffmpeg": lambda: _brief(render.ffmpeg()),
-            },
-            "folders": {"cache": _cache, "originals": _originals},
-        }
-        return {section: {name: guarded(part) for name, part in found.items()} for section, found in parts.items()}
+    requested = os.environ.get("MUJOCO_GL")
+    backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])
+    with ThreadPoolExecutor(min(PROCESSES, os.cpu_count() or 1)) as pool:
+        engines = {name: pool.submit(ask, _command(name), seconds) for name in ENGINES}
+        machine = pool.submit(ask, _command("machine"), seconds)
+        drawing = {name or "system": pool.submit(render.try_gl, name, seconds) for name in backends}
+    answer = machine.result()
+    versions = {"mjx_dher": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    return {
+        "versions": {**versions, **{name: version(name) for name in (*PACKAGES, *EXTRA_OF)}},
+        "machine": {name: answer[name] if name in answer else {"error": answer["error"]} for name in MACHINE},
+        "engines": {name: _trial(future.result()) for name, future in engines.items()},
+        "drawing": {
+            "MUJOCO_GL": requested,
+            **{name: _trial({"error": future.result()} if future.result() else {}) for name, future in drawing.items()},
+            "ffmpeg": guarded(lambda: _brief(render.ffmpeg())),
+        },
+        "folders": {"cache": guarded(_cache), "originals": guarded(_originals)},
+    }
 
 
 def some_engine_works(report: Report) -> bool:
-    """Whether anything can be trained here."""
+    """Returns whether anything can be trained on this machine."""
     return any(engine.get("works") for engine in report["engines"].values())
 
 
 def lines(report: Report) -> list[str]:
-    """What `examine` found, for a reader."""
+    """Formats the report of `examine` as text."""
     width = max(len(name) for parts in report.values() for name in parts)
-    shown = []
+    text = []
     for section, parts in report.items():
-        shown.append(section)
+        text.append(section)
         for name, value in parts.items():
-            text = f"error: {value['error']}" if _failed(value) else (_SHOWN.get(name) or _SHOWN[section])(name, value)
-            shown.append(f"  {name:{width}}  {text}")
-    return shown
+            shown = _missing(name) if section == "versions" and value is None else _text(name, value)
+            text.append(f"  {name:{width}}  {shown}")
+    return text
+
+
+def _missing(package: str) -> str:
+    return f"not installed (extra {EXTRA_OF[package]})" if package in EXTRA_OF else "not installed"
+
+
+def _text(name: str, value: Any) -> str:
+    if value is None:
+        return _NONE.get(name, "unknown")
+    if isinstance(value, dict):
+        return ", ".join(f"{key}: {_text(key, inner)}" for key, inner in value.items())
+    if isinstance(value, list):
+        return "; ".join(_text(name, inner) for inner in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.1f} s"
+    return memory.format_bytes(value) if name in ("memory", "bytes") else str(value)
 
 
 def version(package: str) -> str | None:
-    """Of an installed package; None where it is not installed."""
+    """Returns the version of a package, None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -132,7 +138,7 @@ def version(package: str) -> str | None:
 
 
 def guarded(part: Callable[[], Any]) -> Any:
-    """What `part` returns; {"error": ONE LINE} where it fails."""
+    """Calls `part` and returns its result, or {"error": ONE LINE} if it raises."""
     try:
         return part()
     except Exception as error:
@@ -140,7 +146,7 @@ def guarded(part: Callable[[], Any]) -> Any:
 
 
 def one_line(error: BaseException) -> str:
-    """A caught error without line breaks, and with its kind and place where it is not a ValueError, which says enough."""
+    """Formats a caught error in one line, with its type and place unless it is a ValueError, whose text is enough."""
     text = str(error)
     if type(error) is not ValueError:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -150,53 +156,60 @@ def one_line(error: BaseException) -> str:
 
 
 def ask(command: Sequence[str], seconds: float) -> dict[str, Any]:
-    """What a process finds: it prints a JSON object a line, which are put together.
+    """Runs a child process that prints one JSON object per line, and returns their union.
 
-    Under "error" stands, in one line, why it did not come to its end.
+    If it fails, "error" says why in one line, beside the results from before the failure.
     """
-    package = str(Path(__file__).resolve().parent.parent)
+    root = str(subprocesses.PACKAGE.parent)
     variables = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")])),
-        # Else the first of these processes would take three quarters of a GPU's memory, which a run may be using.
+        "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
+        # Otherwise JAX would reserve three quarters of a GPU's memory, which a training run may be using.
         "XLA_PYTHON_CLIENT_PREALLOCATE": os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "false"),
     }
-    with subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        failed = {}
-        try:
-            out, err = process.communicate(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            out, err = process.communicate()
-            failed = {"error": f"did not end within {seconds:g} s"}
-    if process.returncode and not failed:
-        last = (err.strip().splitlines() or [""])[-1]
-        failed = {"error": f"crashed with exit status {process.returncode}: {last}"}
-    found: dict[str, Any] = {}
-    for line in out.splitlines():
-        with contextlib.suppress(ValueError):  # half a line, of a process that was killed
-            found |= json.loads(line)
-    return found | failed
+    answer = subprocesses.ask(command, variables, seconds)
+    results: dict[str, Any] = {}
+    for line in answer.out.splitlines():
+        with contextlib.suppress(ValueError):  # an unfinished line of a killed process
+            results |= json.loads(line)
+    return results | ({"error": answer.failure} if answer.failure else {})
 
 
 def main(argv: Sequence[str]) -> None:
-    """One of the processes: prints what it finds as soon as it has, a JSON object a line."""
+    """Runs a child process: prints each result as soon as it is known, one JSON object per line."""
     (topic,) = argv
-    results = sys.stdout
+    out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # for what libraries print
-        if topic == MACHINE:
-            for name, part in _PARTS.items():
-                print(json.dumps({name: guarded(part)}), file=results, flush=True)
-        else:
-            try:
-                for stage, seconds in _stages(topic):
-                    print(json.dumps({stage: seconds}), file=results, flush=True)
-            except Exception as error:
-                print(json.dumps({"error": one_line(error)}), file=results, flush=True)
+        try:
+            for name, value in _examine_machine() if topic == "machine" else _try_engine(topic):
+                print(json.dumps({name: value}), file=out, flush=True)
+        except Exception as error:
+            print(json.dumps({"error": one_line(error)}), file=out, flush=True)
 
 
-def _stages(engine: str) -> Iterator[tuple[str, float | None]]:
-    """Tries an engine, by one step of `reach`; yields how long each stage took, s."""
+def _examine_machine() -> Iterator[tuple[str, Any]]:
+    """Yields the name and the value of each part of the section `machine`."""
+    import jax
+
+    from mjx_dher.envs import engines
+    from mjx_dher.envs.engines import native
+
+    def devices() -> list[dict[str, Any]]:
+        limit = lambda device: (device.memory_stats() or {}).get("bytes_limit")  # noqa: E731
+        return [{"platform": d.platform, "kind": d.device_kind, "memory": limit(d)} for d in jax.devices()]
+
+    functions: list[Callable[[], Any]] = [
+        native.usable_cores,
+        devices,
+        memory.available_bytes,
+        lambda: engines.resolve_engine("auto"),
+        presets.machine_preset,
+    ]
+    for name, function in zip(MACHINE, functions):
+        yield name, guarded(function)
+
+
+def _try_engine(engine: str) -> Iterator[tuple[str, float | None]]:
+    """Tries an engine with one step of `reach`; yields the name and the duration in s of each stage."""
     start = time.perf_counter()
     import jax
     import jax.numpy as jnp
@@ -213,7 +226,8 @@ def _stages(engine: str) -> Iterator[tuple[str, float | None]]:
         return
     start = time.perf_counter()
     action = jnp.ones(env.action_size)
-    before, after = jax.device_get(jax.jit(lambda key: _first_step(env, key, action))(jax.random.key(0)))
+    first_step = jax.jit(lambda key: (state := env.reset(key), env.step(state, action)))
+    before, after = jax.device_get(first_step(jax.random.key(0)))
     env.check()
     moved = after.obs["achieved_goal"] - before.obs["achieved_goal"]
     if after.failed or not (moved > 0).all():
@@ -221,63 +235,13 @@ def _stages(engine: str) -> Iterator[tuple[str, float | None]]:
     yield "step", time.perf_counter() - start
 
 
-def _first_step(env: Any, key: Any, action: Any) -> tuple[Any, Any]:
-    state = env.reset(key)
-    return state, env.step(state, action)
-
-
-def _engine(name: str, seconds: float) -> dict[str, Any]:
-    found = ask(_command(name), seconds)
-    return {"works": "error" not in found, **found}
-
-
-def _drawing(name: str, seconds: float) -> dict[str, Any]:
-    why_not = render.try_gl(name, seconds)
-    return {"works": True} if why_not is None else {"works": False, "error": why_not}
-
-
-def _answer(machine: concurrent.futures.Future[dict[str, Any]], name: str) -> Any:
-    found = machine.result()
-    return found[name] if name in found else {"error": found["error"]}
+def _trial(answer: dict[str, Any]) -> dict[str, Any]:
+    return {"works": "error" not in answer, **answer}
 
 
 def _command(topic: str) -> list[str]:
-    # -P: no file of the folder that it is called from takes a library's place.
+    # -P: a file in the current folder must not take a library's place.
     return [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]
-
-
-def _cores() -> int:
-    from mjx_dher.envs.engines.native import usable_cores
-
-    return usable_cores()
-
-
-def _devices() -> list[dict[str, Any]]:
-    import jax
-
-    return [
-        {
-            "platform": device.platform,
-            "kind": device.device_kind,
-            "memory": (device.memory_stats() or {}).get("bytes_limit"),
-        }
-        for device in jax.devices()
-    ]
-
-
-def _auto() -> str:
-    from mjx_dher.envs.engines import resolve_engine
-
-    return resolve_engine("auto")
-
-
-_PARTS: dict[str, Callable[[], Any]] = {
-    "cores": _cores,
-    "devices": _devices,
-    "memory": memory.available_bytes,
-    "auto": _auto,
-    "preset": presets.machine_preset,
-}
 
 
 def _cache() -> dict[str, Any]:
@@ -292,57 +256,9 @@ def _originals() -> dict[str, Any]:
 
 
 def _brief(path: str | Path) -> str:
-    """A path as it may be shown to others: without the name of the user's folder."""
+    """Returns a path that can be shown to others: without the user's home folder."""
     path = Path(path)
     return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else str(path)
-
-
-def _failed(value: Any) -> bool:
-    return isinstance(value, dict) and value.keys() == {"error"}
-
-
-def _show_version(name: str, value: str | None) -> str:
-    extra = PACKAGES.get(name)
-    return value or "not installed" + (f" (extra {extra})" if extra else "")
-
-
-def _show_bytes(name: str, value: int | None) -> str:
-    return "unknown" if value is None else memory.format_bytes(value)
-
-
-def _show_devices(name: str, value: list[dict[str, Any]]) -> str:
-    return ", ".join(f"{d['platform']} {d['kind']} (memory {_show_bytes(name, d['memory'])})" for d in value)
-
-
-def _show_trial(name: str, value: dict[str, Any]) -> str:
-    stages = ", ".join(f"{stage} {value[stage]:.1f} s" for stage in ("import", "build", "step") if value.get(stage))
-    if not value["works"]:
-        return f"does not work: {value['error']}" + (f" ({stages})" if stages else "")
-    untried = "; a step was not tried, because it takes long to compile" if "step" in value and value["step"] is None else ""
-    return "works" + (f" ({stages}{untried})" if stages else "")
-
-
-def _show_cache(name: str, value: dict[str, Any]) -> str:
-    return f"{value['path']}, {'not there' if value['bytes'] is None else memory.format_bytes(value['bytes'])}"
-
-
-def _show_originals(name: str, value: dict[str, Any]) -> str:
-    return f"{value['path']}, {'set up' if value['ready'] else 'not set up'}"
-
-
-# How a part, or else a part of a section, is shown.
-_SHOWN: dict[str, Callable[[str, Any], str]] = {
-    "versions": _show_version,
-    "machine": lambda name, value: str(value),
-    "memory": _show_bytes,
-    "devices": _show_devices,
-    "engines": _show_trial,
-    "drawing": _show_trial,
-    "MUJOCO_GL": lambda name, value: value or "not set",
-    "ffmpeg": lambda name, value: value,
-    "cache": _show_cache,
-    "originals": _show_originals,
-}
 
 
 if __name__ == "__main__":

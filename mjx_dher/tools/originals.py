@@ -1,6 +1,6 @@
-"""The original Fetch tasks, which need a MuJoCo older than ours: zero-shot transfer in an environment of its own.
+"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo and so a virtual environment of their own.
 
-Run as a program in that environment, this file plays episodes and prints their outcomes; it needs gymnasium-robotics and
+Run as a program in that environment, this file plays episodes and prints their outcomes. It needs gymnasium-robotics and
 NumPy, but neither JAX nor this library's MuJoCo:
 
     python -m mjx_dher.tools.originals RUN EPISODES FIRST_SEED
@@ -12,7 +12,6 @@ import contextlib
 import itertools
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import venv
@@ -23,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher.host import subprocesses
 from mjx_dher.host.caches import user_cache
 from mjx_dher.runs.load import load_policy
-from mjx_dher.runs.run_folder import read_config
+from mjx_dher.runs.run_folder import read_spec
 
 ORIGINALS = {
     "push": "FetchPush-v4",
@@ -38,33 +38,32 @@ REACHED = 0.05  # m
 
 
 def default_environment() -> Path:
-    """Where `set_up` makes the originals' environment: in the user's cache folder."""
+    """Returns the folder of the virtual environment that `set_up` creates, in the user's cache folder."""
     return user_cache() / "fetch-originals"
 
 
 def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
-    """Makes a virtual environment with the original tasks, from the package index; leaves a whole one as it is.
+    """Creates a virtual environment with the original tasks, from the package index, unless it is complete already.
 
     Raises:
-      ValueError: pip failed, with what it said.
+      ValueError: pip failed; the message has its output.
     """
     if is_ready(interpreter(environment), requirements):
         return
     venv.create(environment, with_pip=True, clear=True)
-    python = str(interpreter(environment))
-    command = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise ValueError(f"{environment} could not be set up: {done.stderr.strip()}")
+    pip = (str(interpreter(environment)), "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+    answer = subprocesses.ask((*pip, *requirements))
+    if answer.failure:
+        raise ValueError(f"{environment} could not be set up: {answer.err.strip() or answer.failure}")
 
 
 def interpreter(environment: Path) -> Path:
-    """The Python of a virtual environment."""
+    """Returns the Python of a virtual environment."""
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
 def check(env_name: str, python: Path) -> str:
-    """The original's name.
+    """Returns the gymnasium id of the original of a task.
 
     Raises:
       ValueError: the task has no original, or `python` does not have the original tasks.
@@ -73,8 +72,8 @@ def check(env_name: str, python: Path) -> str:
         raise ValueError(f"{env_name} has no original to transfer to; the tasks that have: {', '.join(ORIGINALS)}")
     if not is_ready(python):
         raise ValueError(
-            f"the original tasks need {' and '.join(REQUIREMENTS)} in an environment of their own, and {python} does not have"
-            " them: --set-up makes one there (a download of 200 MB), or name the Python of yours with --python"
+            f"the original tasks need {' and '.join(REQUIREMENTS)} in a virtual environment of their own, and {python} does"
+            " not have them: create one with --set-up (a download of 200 MB), or name the Python of yours with --python"
         )
     return ORIGINALS[env_name]
 
@@ -83,41 +82,38 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
     """Plays a run's policy in its original task, in `workers` processes of another Python.
 
     Returns:
-      success and reset_success, bool, and ret, the undiscounted sum of rewards; all [episodes].
+      Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.
 
     Raises:
-      ValueError: a process failed, with what it said.
+      ValueError: a process failed; the message has the end of its output.
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
-        # Only this package is to be seen there, not what lies beside it: that environment has another NumPy and MuJoCo.
-        (Path(folder) / "mjx_dher").symlink_to(Path(__file__).resolve().parent, target_is_directory=True)
-        variables = {**os.environ, "PYTHONPATH": folder}
+        # A folder with this package only, without its neighbours: the other Python has its own NumPy and MuJoCo.
+        (Path(folder) / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
         processes = []
         for first, end in itertools.pairwise(bounds):
-            arguments = [str(run.resolve()), str(end - first), str(seed + first)]
-            command = [str(python), "-m", "mjx_dher.tools.originals", *arguments]
-            process = subprocess.Popen(command, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-            stack.callback(process.kill)
-            processes.append(process)
+            arguments = (str(run.resolve()), str(end - first), str(seed + first))
+            command = (str(python), "-m", "mjx_dher.tools.originals", *arguments)
+            processes.append(stack.enter_context(subprocesses.started(command, {"PYTHONPATH": folder})))
         outcomes = []
         for process in processes:
-            out, err = process.communicate()
-            if process.returncode:
-                raise ValueError(f"{python} failed to play the original task: {err.strip()[-2000:]}")
-            outcomes.append(json.loads(out.splitlines()[-1]))
+            answer = subprocesses.answer(process)
+            if answer.failure:
+                raise ValueError(f"{python} failed to play the original task: {answer.err.strip()[-2000:] or answer.failure}")
+            outcomes.append(answer.last_json())
     return {name: np.concatenate([np.asarray(outcome[name]) for outcome in outcomes]) for name in outcomes[0]}
 
 
 def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
-    """Plays a run's policy in its original task, here: one episode for each seed from `first_seed` on."""
+    """Plays a run's policy in its original task in this process: episode i uses the seed `first_seed` + i."""
     warnings.filterwarnings("ignore")
     import gymnasium
     import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
-    env, policy = gymnasium.make(ORIGINALS[read_config(run).config.env]), load_policy(run)
+    env, policy = gymnasium.make(ORIGINALS[read_spec(run).env]), load_policy(run)
     outcome: dict[str, list[Any]] = {"success": [], "reset_success": [], "ret": []}
     for seed in range(first_seed, first_seed + episodes):
         obs, _ = env.reset(seed=seed)
@@ -134,18 +130,14 @@ def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
 
 
 def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
-    """Whether `python` is there and has the original tasks, in the versions that they need."""
+    """Returns whether `python` exists and has the original tasks in the required versions."""
     names = [requirement.split("==")[0] for requirement in requirements]
     code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
-    try:
-        done = subprocess.run([python, "-c", code], capture_output=True, text=True, check=False)
-    except OSError:
-        return False
-    return tuple(done.stdout.split()) == requirements
+    return tuple(subprocesses.ask((str(python), "-c", code)).out.split()) == requirements
 
 
 def main(argv: Sequence[str]) -> None:
-    """Prints the outcomes of `play` as JSON, in the last line."""
+    """Prints the outcomes of `play` as JSON in the last line."""
     run, episodes, first_seed = argv
     print(json.dumps(play(Path(run), int(episodes), int(first_seed))))
 

@@ -1,6 +1,6 @@
-"""Episodes as pictures: a policy played in its environment, drawn by MuJoCo without a screen, written as a video or as stills.
+"""Rendering of episodes: a policy is played in its environment, drawn without a screen, and written as a video or as stills.
 
-The modules that draw are slow to import, so the functions import them; `choose_gl` must come before MuJoCo does.
+The modules that draw are slow to import, so the functions import them. `choose_gl` must be called before MuJoCo is imported.
 """
 
 from __future__ import annotations
@@ -17,33 +17,32 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.host import files
+from mjx_dher import names
+from mjx_dher.host import files, subprocesses
 
-FPS = 25  # an action lasts 40 ms: pictures in real time
-HOLD = 10  # frames that the end of an episode stays, so that the eye can compare object and goal
+FPS = 25  # frames per second, in real time: an action lasts 40 ms
+HOLD = 10  # repetitions of an episode's last frame, so that the eye can compare object and goal
 STILLS = 5  # pictures side by side in a .png
-SIZES = range(64, 2049, 2)  # even, as H.264 takes nothing else
-GL = ("egl", "osmesa", "glfw")  # ways to draw on Linux, as MUJOCO_GL names them, in the order in which they are tried
-GL_SECONDS = 60.0  # that trying one may take
-GOAL_RADIUS = 0.03  # m, so that it shows through an object that has reached it
+SIZES = range(64, 2049, 2)  # allowed widths and heights, pixels; H.264 requires even ones
+GL = ("egl", "osmesa", "glfw")  # values of MUJOCO_GL on Linux, in the order in which they are tried
+GL_SECONDS = 60.0  # time limit of trying one
+GOAL_RADIUS = 0.03  # m; large enough to be seen around an object that has reached the goal
 GOAL_RGBA = (1.0, 0.1, 0.1, 0.6)
 
-# How ffmpeg writes each format. GIF: one palette for all frames and no dithering, so that what rests costs nothing.
+# Options of ffmpeg for each format. GIF: one palette for all frames and no dithering, so that pixels at rest cost nothing.
+_PALETTE = "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
 FORMATS = {
-    ".mp4": ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"],
-    ".gif": [
-        "-filter_complex",
-        "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle",
-    ],
-    ".png": ["-frames:v", "1"],
+    ".mp4": ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"],
+    ".gif": ["-filter_complex", _PALETTE, "-f", "gif"],
+    ".png": ["-frames:v", "1", "-c:v", "png", "-f", "image2"],
 }
 
 
 def check(out: Path, width: int, height: int, overwrite: bool) -> None:
-    """Refuses what cannot be written, before anything slow has happened.
+    """Raises if the arguments are not allowed, before anything slow happens.
 
     Raises:
-      ValueError: names each argument at fault and what is allowed.
+      ValueError: names each invalid argument and what is allowed.
     """
     problems = []
     try:
@@ -58,68 +57,63 @@ def check(out: Path, width: int, height: int, overwrite: bool) -> None:
 
 
 def ffmpeg() -> str:
-    """The program that writes pictures.
+    """Returns the path of ffmpeg, the program that writes pictures.
 
     Raises:
       ValueError: it is not installed.
     """
-    try:
-        from imageio_ffmpeg import get_ffmpeg_exe
+    names.require_extra("writing pictures", "imageio_ffmpeg", "video")
+    from imageio_ffmpeg import get_ffmpeg_exe
 
+    try:
         return get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
-        raise ValueError(f'writing pictures needs the extra "video": pip install -e ".[video]" ({error})') from error
+    except RuntimeError as error:
+        raise ValueError(f"writing pictures needs ffmpeg: {error}") from error
 
 
 def choose_gl() -> str:
-    """Makes MuJoCo draw with what works here without a screen, by setting MUJOCO_GL; returns its name.
+    """Sets MUJOCO_GL to the first backend that can draw without a screen on this machine, and returns its name.
 
-    A MUJOCO_GL that the user has set is taken, if it works.
+    If the user has set MUJOCO_GL, only that backend is tried.
 
     Raises:
-      ValueError: none works, or MuJoCo was imported before anything was chosen.
+      ValueError: no backend works, or MuJoCo was imported before a backend was chosen.
     """
-    asked = os.environ.get("MUJOCO_GL")
-    if not asked and "mujoco" in sys.modules:
+    requested = os.environ.get("MUJOCO_GL")
+    if not requested and "mujoco" in sys.modules:
         raise ValueError("MuJoCo has been imported already: set MUJOCO_GL (egl or osmesa) before the program starts")
-    if not asked and sys.platform != "linux":
-        return "system"  # macOS and Windows have one way to draw, and it needs no screen
-    tried = []
-    for name in [asked] if asked else GL:
-        why_not = try_gl(name)
-        if why_not is None:
+    if not requested and sys.platform != "linux":
+        return "system"  # macOS and Windows have one backend, and it needs no screen
+    failed = []
+    for name in [requested] if requested else GL:
+        failure = try_gl(name)
+        if failure is None:
             os.environ["MUJOCO_GL"] = name
             return name
-        tried.append(f"{name} ({why_not})")
+        failed.append(f"{name} ({failure})")
     raise ValueError(
-        f"MuJoCo cannot draw here; tried MUJOCO_GL={', '.join(tried)}. Install EGL or OSMesa"
+        f"MuJoCo cannot draw here; tried MUJOCO_GL={', '.join(failed)}. Install EGL or OSMesa"
         " (Debian, Ubuntu: apt install libegl1 libgl1-mesa-dri, or libosmesa6)"
     )
 
 
 def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
-    """Why MuJoCo cannot draw here with MUJOCO_GL=`name`, in one line; None where it can.
+    """Returns in one line why MuJoCo cannot draw with MUJOCO_GL=`name`; None if it can.
 
-    Tried in a process of its own, because MuJoCo decides once, at its import, and a failed attempt may crash.
+    A child process tries it, because MuJoCo chooses only once, when it is imported, and a failed attempt may crash.
     """
     probe = "import mujoco as m\nwith m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 16, 16) as r: r.render()"
-    environment = {**os.environ, "MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # nothing is worth keeping
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", probe], env=environment, capture_output=True, text=True, check=False, timeout=seconds
-        )
-    except subprocess.TimeoutExpired:
-        return f"did not end within {seconds:g} s"
-    return None if done.returncode == 0 else (done.stderr.strip().splitlines() or ["crashed"])[-1]
+    variables = {"MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # nothing is worth keeping
+    return subprocesses.ask([sys.executable, "-P", "-c", probe], variables, seconds).failure
 
 
 def check_drawable(env: Any) -> None:
-    """Raises ValueError unless `env` has what `play` and `draw` need."""
+    """Raises ValueError unless `env` has the attributes that `play` and `draw` need."""
     import jax
 
     start = jax.eval_shape(env.reset, jax.random.key(0))
-    places = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
-    if not (hasattr(env, "model") and places):
+    has_positions = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
+    if not (hasattr(env, "model") and has_positions):
         name = getattr(env, "name", type(env).__name__)
         raise ValueError(
             f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`), states with `physics.qpos` and goals of"
@@ -128,12 +122,12 @@ def check_drawable(env: Any) -> None:
 
 
 def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whole episodes side by side, as what is needed to draw them.
+    """Plays whole episodes in a batch and returns the data to draw them.
 
     Args:
-      env: an environment with a MuJoCo `model`, whose states have `physics.qpos`, and whose goals are places.
-      act: (observations leading with [N], key) -> actions [N, A].
-      seed: of starts, goals and the keys of `act`.
+      env: an environment with a MuJoCo `model`, states with `physics.qpos`, and positions as goals.
+      act: (observations [N, ...], key) -> actions [N, A].
+      seed: seed of starts, goals and the keys of `act`.
       num_episodes: N.
 
     Returns:
@@ -163,7 +157,7 @@ def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int)
 
 
 def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
-    """The frames [height, width, 3] uint8 of all episodes, N * (T + 1 + HOLD). Arguments as in `stills`."""
+    """Yields the N * (T + 1 + HOLD) frames [height, width, 3] uint8 of all episodes. Arguments as in `stills`."""
     for episode, goal in zip(qpos, goals):
         for frame in draw(model, episode, goal, width, height):
             yield frame
@@ -172,31 +166,31 @@ def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: in
 
 
 def stills(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Pictures of the first episode, its start to its end, side by side: [height, STILLS * width, 3] uint8.
+    """Draws pictures of the first episode, from start to end, side by side: [height, STILLS * width, 3] uint8.
 
     Args:
       model: the environment's `mujoco.MjModel`.
       qpos: [N, T+1, nq].
       goals: [N, 3] m.
-      width, height: of one picture, pixels.
+      width, height: size of one picture, pixels.
     """
-    # Closer together at first, when a trained policy does most of what it does.
+    # Closer together at first, when a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)
     return np.concatenate(list(draw(model, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
 def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Generator[np.ndarray]:
-    """A picture [height, width, 3] uint8 of each configuration, with the goal as a red ball.
+    """Yields a picture [height, width, 3] uint8 of each configuration, with the goal as a red ball.
 
     Args:
       model: the environment's `mujoco.MjModel`, with a camera "front".
       qpos: [nq] each.
       goal: [3] m.
-      width, height: pixels.
+      width, height: size of a picture, pixels.
     """
     import mujoco
 
-    model = copy.copy(model)  # its buffer's size is set below; the environment keeps its own
+    model = copy.copy(model)  # the buffer size is set below; that of the environment's model must not change
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, height, width) as renderer:
@@ -221,30 +215,26 @@ def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, h
 
 
 def write(out: Path, frames: Iterable[np.ndarray]) -> None:
-    """Writes `frames`, [height, width, 3] uint8 each, in the format that `out` ends in.
+    """Writes `frames`, [height, width, 3] uint8 each, in the format given by the suffix of `out`.
 
-    What was there stays whole until the new file is.
+    On error, an existing file stays as it was. (imageio_ffmpeg.write_frames reports no error when ffmpeg fails at the end.)
 
     Raises:
-      ValueError: it cannot be written.
+      ValueError: the file cannot be written; the message has ffmpeg's.
     """
-    partial = out.with_name(f".{out.stem}.partial{out.suffix}")
     frames = iter(frames)
     first = next(frames)
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(FPS), "-i", "-"]
-    command = [ffmpeg(), "-v", "error", *source, *FORMATS[out.suffix.lower()], "-y", str(partial)]
-    try:
+    with files.atomic_write(out) as partial:
+        command = [ffmpeg(), "-v", "error", *source, *FORMATS[out.suffix.lower()], "-y", str(partial)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdin is not None
             try:
-                with contextlib.suppress(BrokenPipeError):  # it gave up, and says why
+                with contextlib.suppress(BrokenPipeError):  # ffmpeg has failed; the reason is in its output
                     for frame in itertools.chain([first], frames):
                         process.stdin.write(np.ascontiguousarray(frame).data)
-                _, complaint = process.communicate()
+                _, message = process.communicate()
             finally:
-                process.kill()  # still there only if a frame could not be drawn
+                process.kill()  # still running only if a frame could not be drawn
         if process.returncode != 0:
-            raise ValueError(f"out: cannot write {out} ({complaint.decode(errors='replace').strip()})")
-        partial.replace(out)
-    finally:
-        partial.unlink(missing_ok=True)
+            raise ValueError(f"out: cannot write {out} ({message.decode(errors='replace').strip()})")

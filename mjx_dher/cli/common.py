@@ -1,0 +1,124 @@
+"""What commands share: flags, progress on the screen, the summary of an evaluation."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+from mjx_dher.names import check_name
+from mjx_dher.spec import ENGINES, RunSpec
+
+SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
+
+# Flags that other libraries have, and earlier ones of this one, with the names here.
+FOREIGN_FLAGS = {
+    "--learning-rate": "--actor-lr and --critic-lr",
+    "--lr": "--actor-lr and --critic-lr",
+    "--buffer-size": "--replay-size",
+    "--replay-buffer-size": "--replay-size",
+    "--tau": "--polyak, which is 1 - tau",
+    "--discount": "--gamma",
+    "--n-envs": "--num-envs",
+    "--total-timesteps": "--total-steps",
+    "--n-sampled-goal": "--her-k",
+    "--eventful-share": "--priority-fraction",
+    "--share": "--shard",
+}
+
+
+def refuse_foreign_flags(argv: Sequence[str]) -> None:
+    """Raises ValueError for a flag of another library, and names ours."""
+    for argument in argv:
+        flag = argument.partition("=")[0].replace("_", "-")
+        if flag in FOREIGN_FLAGS:
+            raise ValueError(f"{flag} is called {FOREIGN_FLAGS[flag]} here")
+
+
+def check_engine(engine: str | None) -> None:
+    """Raises ValueError for a name that is no engine."""
+    if engine is not None:
+        check_name("engine", engine, ENGINES)
+
+
+def print_summary(summary: dict[str, Any], console: Console) -> None:
+    """Prints what `play.summarize` gave."""
+    console.print(
+        f"success {summary['success_rate']:.3f} (95 % interval {summary['success_low']:.3f} to {summary['success_high']:.3f},"
+        f" {summary['episodes']} episodes); already at reset {summary['reset_success_rate']:.3f};"
+        f" mean return {summary['return_mean']:.2f}",
+        soft_wrap=True,
+    )
+
+
+class Screen:
+    """Progress over one run or many: a live bar on a terminal; elsewhere lines, of a sweep one now and then."""
+
+    def __init__(self, console: Console, specs: Sequence[RunSpec]):
+        self._console, self._single = console, len(specs) == 1
+        self._total = sum(spec.config.total_steps for spec in specs)
+        self._done = 0.0  # environment steps, of all runs
+        self._done_before = 0.0  # before those that train now
+        self._present: Sequence[RunSpec] = ()
+        self._trained = 0.0  # since this start of the program, in `_seconds`
+        self._seconds = 0.0
+        self._printed = time.monotonic()
+        self._bar: Bar | None = None
+        if console.is_terminal:
+            self._bar = Bar(BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
+            self._task = self._bar.add_task("...", total=self._total)
+            self._bar.start()
+
+    def show(self, specs: Sequence[RunSpec], progress: Any) -> None:
+        """Shows an epoch of those side by side; `progress` is a `loop.Progress`."""
+        total = specs[0].config.total_steps
+        if list(specs) != list(self._present):
+            self._present, self._done_before = specs, self._done
+        per_epoch = len(specs) * total / progress.num_epochs
+        self._done = self._done_before + per_epoch * progress.epoch
+        self._trained += per_epoch
+        self._seconds += progress.epoch_seconds
+        eta = clock(self._seconds * (self._total - self._done) / self._trained)
+        last = progress.epoch == progress.num_epochs
+        line = self._line_of_one(progress, eta) if self._single else self._line_of_many(specs, progress, eta)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=self._done, description=line)
+        elif self._single or last or time.monotonic() - self._printed > SECONDS_PER_LINE:
+            self._console.print(line, soft_wrap=True, highlight=False)
+            self._printed = time.monotonic()
+
+    def _line_of_one(self, progress: Any, eta: str) -> str:
+        per_second = 1 / (progress.epoch * progress.epoch_seconds)  # all epochs are alike
+        return (
+            f"epoch {progress.epoch}/{progress.num_epochs}  {progress.env_steps:,} steps"
+            f"  {progress.env_steps * per_second:,.0f} steps/s  {progress.updates * per_second:,.0f} updates/s"
+            f"  success {float(progress.metrics['success_rate']):.2f}"
+            f"  return {float(progress.metrics['return_mean']):.1f}  ETA {eta}"
+        )
+
+    def _line_of_many(self, specs: Sequence[RunSpec], progress: Any, eta: str) -> str:
+        by_sampler: dict[str, list[float]] = {}
+        rates = progress.metrics["success_rate"]
+        for lane, spec in enumerate(specs):
+            by_sampler.setdefault(spec.sampler, []).append(float(rates[lane] if rates.ndim else rates))
+        means = "  ".join(f"{name} {sum(rates) / len(rates):.2f}" for name, rates in by_sampler.items())
+        return (
+            f"{self._done / self._total:.0%}  {specs[0].env}, {len(specs)} runs: epoch {progress.epoch}/{progress.num_epochs}"
+            f"  success {means}  ETA {eta}"
+        )
+
+    def close(self) -> None:
+        """Ends the live bar."""
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def clock(seconds: float) -> str:
+    """Returns seconds for a reader: "1:02:03"."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

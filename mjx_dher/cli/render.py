@@ -1,0 +1,83 @@
+"""The command `render`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import envs
+from mjx_dher.cli.common import check_engine
+from mjx_dher.config import check_count
+from mjx_dher.names import check_name
+from mjx_dher.runs import run_folder
+from mjx_dher.spec import RunSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderArgs:
+    """Play the policy of a run folder, or a task with random actions, and draw it: a video, or stills side by side.
+
+    Needs no screen (EGL or OSMesa draw; MUJOCO_GL chooses) but the extra: `pip install -e ".[video]"`.
+    """
+
+    out: Path
+    """File to write: .mp4, .gif or .png (stills of the first episode). Its folder must exist."""
+    run: tyro.conf.Positional[Path | None] = None
+    """Run folder; or else give --env."""
+    env: str | None = None
+    """Environment (a name, or module:attribute), played with uniformly random actions, where there is no run folder."""
+    episodes: int = 4
+    """Episodes to play, one after the other."""
+    seed: int = 1
+    """Seed of the starts, the goals and the random actions."""
+    engine: str | None = None
+    """Physics: native, jax, warp or auto; the run's own unless given."""
+    width: int = 640
+    """Width of a picture, pixels."""
+    height: int = 480
+    """Height of a picture, pixels."""
+    overwrite: bool = False
+    """Replacement of an existing `out`."""
+
+
+def render_command(argv: list[str], console: Console) -> int:
+    """Draws episodes of a run's policy, or of random actions."""
+    from mjx_dher.tools import render
+
+    args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
+    render.check(args.out, args.width, args.height, args.overwrite)
+    check_count("episodes", args.episodes)
+    check_engine(args.engine)
+    if args.run is not None and args.env is None:
+        from mjx_dher.runs.load import load_policy
+
+        played, policy = run_folder.read_spec(args.run), load_policy(args.run)
+    elif args.env is not None and args.run is None:
+        check_name("env", args.env, envs.list_envs(), own=True)
+        played, policy = RunSpec(env=args.env), None
+    else:
+        raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
+    render.ffmpeg()
+    gl = render.choose_gl()
+    env: Any = envs.make(played.env, engine=args.engine or played.engine)  # Any: a GoalEnv need not have a model
+    import jax
+    import jax.numpy as jnp
+
+    def act(obs, key):
+        if policy is None:
+            return jax.random.uniform(key, (args.episodes, env.action_size), minval=-1.0, maxval=1.0)
+        return policy.forward(obs["observation"], obs["desired_goal"], jnp)
+
+    console.print(
+        f"{played.env}: {args.episodes} episodes{'' if policy else ' of random actions'}, seed {args.seed},"
+        f" physics {run_folder.engine_name(env)}, drawn with {gl} ..."
+    )
+    qpos, goals, success = render.play(env, act, args.seed, args.episodes)
+    pictures = (env.model, qpos, goals, args.width, args.height)
+    render.write(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
+    console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)
+    return 0

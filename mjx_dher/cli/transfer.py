@@ -1,0 +1,74 @@
+"""The command `transfer`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import envs
+from mjx_dher.cli.common import check_engine, print_summary
+from mjx_dher.config import check_count
+from mjx_dher.host.caches import keep_compiled_programs
+from mjx_dher.runs import run_folder
+
+
+@dataclasses.dataclass(frozen=True)
+class TransferArgs:
+    """Play the policy of a run folder, unchanged, in the original task of gymnasium-robotics and here, and compare.
+
+    The original needs an older MuJoCo, and so an environment of its own: --set-up makes it once.
+    """
+
+    run: tyro.conf.Positional[Path]
+    """Run folder."""
+    episodes: int = 500
+    """Episodes to play, there and here."""
+    seed: int = 1000
+    """Seed of the first original episode (episode i uses seed + i) and of the episodes played here."""
+    set_up: bool = False
+    """Make the originals' environment in the user's cache folder, if it is not there yet (a download of 200 MB)."""
+    python: Path | None = None
+    """The Python of an environment that has the original tasks; the one that --set-up makes unless given."""
+    engine: str | None = None
+    """Physics here: native, jax, warp or auto; the run's own unless given."""
+
+
+def transfer_command(argv: list[str], console: Console) -> int:
+    """Plays the policy of a run folder in the original task."""
+    args = tyro.cli(TransferArgs, prog="train.py transfer", args=argv)
+    check_engine(args.engine)
+    check_count("episodes", args.episodes)
+    run = run_folder.read_spec(args.run)
+    from mjx_dher.envs.engines.native import usable_cores
+    from mjx_dher.runs.load import check_plain, load_policy
+    from mjx_dher.runs.play import play, summarize
+    from mjx_dher.stats import difference_interval
+    from mjx_dher.tools import originals
+
+    policy = load_policy(args.run)
+    check_plain(policy, run, "transfer")
+    environment = originals.default_environment()
+    if args.set_up:
+        console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
+        originals.set_up(environment)
+    python = args.python or originals.interpreter(environment)
+    name = originals.check(run.env, python)
+    env = envs.make(run.env, engine=args.engine or run.engine)
+    console.print(f"{name}, {args.episodes} episodes ...")
+    theirs = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
+    summary_original = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
+    print_summary(summary_original, console)
+    console.print(f"{run.env} here, {args.episodes} episodes, physics {run_folder.engine_name(env)} ...")
+    keep_compiled_programs()
+    here = play(env, policy, args.episodes, args.seed)
+    summary_here = summarize(*here)
+    print_summary(summary_here, console)
+    low, high = difference_interval(
+        int(theirs["success"].sum()), len(theirs["success"]), int(here.success.sum()), len(here.success)
+    )
+    difference = summary_original["success_rate"] - summary_here["success_rate"]
+    console.print(f"there minus here {difference:+.3f} (95 % interval {low:+.3f} to {high:+.3f})")
+    return 0

@@ -1,0 +1,58 @@
+"""Programs run in processes of their own: their output, and in one line why they failed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+PACKAGE = Path(__file__).resolve().parents[1]  # the folder mjx_dher
+
+
+class Answer(NamedTuple):
+    """Output of a program that has ended."""
+
+    out: str
+    err: str
+    failure: str | None  # one line; None if the program succeeded
+
+    def last_json(self) -> Any:
+        """Returns the JSON value in the last line of `out`."""
+        return json.loads(self.out.splitlines()[-1])
+
+
+@contextlib.contextmanager
+def started(command: Sequence[str], variables: Mapping[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
+    """Starts a program, with `variables` added to this one's environment, and kills it at the end of the block."""
+    environment = {**os.environ, **(variables or {})}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def answer(process: subprocess.Popen[str], seconds: float | None = None) -> Answer:
+    """Waits for a program to end, and kills it after that many `seconds`."""
+    try:
+        out, err = process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return Answer(*process.communicate(), f"did not end within {seconds:g} s")
+    last = (err.strip().splitlines() or [""])[-1]
+    return Answer(out, err, f"exit status {process.returncode}: {last}" if process.returncode else None)
+
+
+def ask(command: Sequence[str], variables: Mapping[str, str] | None = None, seconds: float | None = None) -> Answer:
+    """Runs a program to its end; see `started` and `answer`. A program that cannot be started is a failure, too."""
+    try:
+        with started(command, variables) as process:
+            return answer(process, seconds)
+    except OSError as error:
+        return Answer("", "", str(error))

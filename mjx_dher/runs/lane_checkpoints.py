@@ -1,0 +1,101 @@
+"""Checkpoints of runs that are trained side by side."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import checkpoint, run_folder
+from mjx_dher.runs.loop import Progress, Start
+from mjx_dher.trainer import TrainState
+
+NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
+class LaneCheckpoints:
+    """Checkpoints of runs side by side: in a folder named after them in `shared`, or, of one run, in its own."""
+
+    folders: Sequence[Path]  # of the runs
+    lanes: int
+    shared: Path
+    keep: int
+    restart: bool  # begin anew where no checkpoint can be used, rather than raise
+    report: Callable[[str], None]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the run folders."""
+        return [folder.name for folder in self.folders]
+
+    @property
+    def folder(self) -> Path:
+        """Folder that holds `checkpoints/`."""
+        shared = self.shared / checkpoint.digest_of([self.lanes, *self.names])[:10]
+        return shared if self.lanes > 1 or shared.exists() else self.folders[0]
+
+    def restore(self, init: Callable[[], TrainState]) -> Start:
+        """Returns the point from which the runs go on: what `init` makes, if there is no checkpoint.
+
+        Raises:
+          FolderError: no checkpoint can be used, unless `restart`.
+        """
+        state = init()
+        if not run_folder.checkpoints(self.folder):
+            return Start(state)
+        template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+        hparams: Any = jax.tree.map(jnp.copy, state.hparams)
+        del state  # there may be no memory for two
+        try:
+            restored = checkpoint.restore(self.folder, template)
+        except FolderError as error:
+            if not self.restart:
+                raise
+            self.report(f"{error}; training these runs from their start")
+            return Start(init())
+        for why in restored.refused:
+            self.report(f"not used: {why}")
+        self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
+        # A lane's number for its sampler depends on which others are left.
+        return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
+
+    def save(self, progress: Progress) -> Path:
+        """Writes a checkpoint and returns its path.
+
+        Raises:
+          CheckpointError: it cannot be written.
+        """
+        folder = self.folder
+        if folder not in self.folders:
+            folder.mkdir(parents=True, exist_ok=True)
+            files.write_json(folder / NAMES_FILE, {"cells": self.names})
+        return checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep)
+
+    def try_save(self, progress: Progress) -> None:
+        """Writes a checkpoint. One that cannot be written is reported, and costs nothing else."""
+        try:
+            self.save(progress)
+        except (OSError, checkpoint.CheckpointError) as error:
+            self.report(str(error))
+
+    def clear(self) -> None:
+        """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay."""
+        shutil.rmtree(self.folders[0] / run_folder.CHECKPOINTS, ignore_errors=True)
+        ended = {folder.name for folder in self.folders}
+        for path in self.shared.glob(f"*/{NAMES_FILE}"):
+            names = json.loads(path.read_text())["cells"]
+            ended |= {name for name in names if (self.folders[0].parent / name / run_folder.RESULT_FILE).exists()}
+            if ended.issuperset(names):
+                shutil.rmtree(path.parent, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty, or never made
+            self.shared.rmdir()

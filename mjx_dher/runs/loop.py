@@ -1,0 +1,201 @@
+"""The host's side of a training loop: compile it, call it epoch by epoch, see that it fits into memory."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+
+from mjx_dher import config as config_lib
+from mjx_dher.config import Config, HParams
+from mjx_dher.host import memory
+from mjx_dher.rollout import check_steps
+from mjx_dher.trainer import Train, TrainState, as_arrays, make_train
+from mjx_dher.types import Env, Metrics, PRNGKey
+
+
+class Start(NamedTuple):
+    """Point from which a run, or L side by side, goes on."""
+
+    state: TrainState
+    epoch: int = 0  # epochs that have ended
+    wall_seconds: float = 0.0
+
+
+class Progress(NamedTuple):
+    """Point that a run, or L side by side, has reached after an epoch."""
+
+    epoch: int  # from 1
+    num_epochs: int
+    env_steps: int  # of each run
+    updates: int  # of each run
+    wall_seconds: float  # since the first epoch began: compilation is not counted
+    epoch_seconds: float
+    metrics: dict[str, Any]  # a float each; of runs side by side an array [L] each
+    state: TrainState  # valid until the next epoch begins, which takes over its memory
+
+
+class Compiled(NamedTuple):
+    """A training loop, compiled."""
+
+    init: Callable[[PRNGKey, HParams], TrainState]
+    epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
+    nbytes: int  # memory that an epoch takes, all told, as the compiler planned it; 0 where it does not tell
+
+
+def train(
+    env: Env,
+    config: Config,
+    hparams: HParams | None = None,
+    seed: int = 0,
+    on_compile: Callable[[float | None], None] = lambda seconds: None,
+    start: Start | None = None,
+    **parts: Any,
+) -> Iterator[Progress]:
+    """Trains one run without a folder, yielding after every epoch. Stop by not asking for more.
+
+    `train_runs` adds folders, checkpoints, logs and runs side by side.
+
+    Args:
+      env: the environment.
+      config: sizes.
+      hparams: numbers; the defaults where None.
+      seed: random seed.
+      on_compile: called with None when compilation begins and with its seconds when it has ended.
+      start: point to go on from, as `checkpoint.restore` gives it; a new run where None.
+      **parts: sampler, priority and learner, as `make_train` takes them.
+
+    Raises:
+      ValueError: a Config or HParams that cannot run, memory that does not suffice, or what `env.check` raises, where the
+        environment has one, before the first epoch or after any.
+    """
+    hparams = HParams() if hparams is None else hparams
+    config_lib.validate(config, hparams, env.episode_length)
+    program = make_train(env, config, **parts)
+    key = jax.random.key(seed)
+    check_memory(program, config)
+    on_compile(None)
+    started = time.perf_counter()
+    compiled = compile_program(program, key, hparams)
+    check_program(compiled, config)
+    check_steps(env)
+    on_compile(time.perf_counter() - started)
+    for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
+        yield progress._replace(metrics={name: to_float(value) for name, value in progress.metrics.items()})
+
+
+def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:
+    """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays.
+
+    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way.
+
+    Raises:
+      ValueError: what `env.check` raises, where the environment has one, after an epoch.
+    """
+    num_epochs = config_lib.num_epochs(config, env.episode_length)
+    state = jax.block_until_ready(start.state)
+    previous = time.perf_counter()
+    started = previous - start.wall_seconds
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        for number in range(start.epoch + 1, num_epochs + 1):
+            running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
+            while not running.done():
+                concurrent.futures.wait([running], timeout=0.1)
+            state, metrics = running.result()
+            check_steps(env)
+            now = time.perf_counter()
+            yield Progress(
+                epoch=number,
+                num_epochs=num_epochs,
+                env_steps=number * config_lib.steps_per_epoch(config, env.episode_length),
+                updates=number * config.cycles_per_epoch * config.updates_per_cycle,
+                wall_seconds=now - started,
+                epoch_seconds=now - previous,
+                metrics=jax.device_get(metrics),
+                state=state,
+            )
+            previous = time.perf_counter()
+
+
+def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
+    """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
+
+    Their values do not matter.
+    """
+    init, epoch = (jax.vmap(program.init), jax.vmap(program.epoch)) if key.ndim else (program.init, program.epoch)
+    hparams = as_arrays(hparams)
+    state = jax.eval_shape(init, key, hparams)
+    lowered_init = jax.jit(init).lower(key, hparams)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        compiling = pool.submit(compile_lowered, lowered_init)
+        lowered = jax.jit(epoch, donate_argnums=0).lower(state)
+        compiled = compile_lowered(lowered)
+        compiled_init = compiling.result()
+    sizes = compiled.memory_analysis()
+    nbytes = 0
+    if sizes is not None:
+        nbytes = (
+            sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
+        )
+    memory.release()
+    return Compiled(init=lambda key, hparams: compiled_init(key, as_arrays(hparams)), epoch=compiled, nbytes=nbytes)
+
+
+def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+    """Compiles what `jax.jit(...).lower` gave, on a GPU without a pass that can take half the time and gains a learner nothing.
+
+    The pass makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many
+    tilings each, what else could go into them.
+    """
+    options: dict[str, str | bool] = {}
+    if jax.default_backend() == "gpu":
+        options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
+    return lowered.compile(compiler_options=options)
+
+
+def state_template(program: Train) -> TrainState:
+    """Returns the shapes and types of a run's TrainState, for `checkpoint.restore`."""
+    return jax.eval_shape(program.init, jax.random.key(0), as_arrays(HParams()))
+
+
+def check_memory(program: Train, config: Config) -> None:
+    """Refuses a replay ring, or networks, that cannot fit, before anything is compiled.
+
+    Raises:
+      ValueError: says what is needed, what is free and, for the ring, which replay_size would fit.
+    """
+    available = memory.available_bytes()
+    if available is None:
+        return
+    free = f"but only {memory.format_bytes(available)} of memory is free"
+    if program.replay_bytes > available:
+        fitting = int(config.replay_size * available / program.replay_bytes)
+        needed = memory.format_bytes(program.replay_bytes)
+        raise ValueError(f"replay_size {config.replay_size} needs {needed}, {free}; at most {fitting} transitions fit")
+    shapes = jax.tree.leaves(jax.eval_shape(program.learner.init, jax.random.key(0)))
+    nbytes = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
+    if nbytes > available:
+        raise ValueError(f"hidden_sizes {config.hidden_sizes}: the learner needs {memory.format_bytes(nbytes)}, {free}")
+
+
+def check_program(compiled: Compiled, config: Config) -> None:
+    """Refuses a program that cannot fit, by the compiler's figure, before it runs.
+
+    Raises:
+      ValueError: says what is needed, what is free and which settings decide it.
+    """
+    available = memory.available_bytes()
+    if available is not None and compiled.nbytes > available:
+        settings = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes")
+        raise ValueError(
+            f"an epoch needs {memory.format_bytes(compiled.nbytes)}, but only {memory.format_bytes(available)} of memory"
+            f" is free; what decides it: {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
+        )
+
+
+def to_float(value: Any) -> float:
+    """Returns a float32 to the digits that it has: 95 of 100 are 0.95, which float(float32) is not."""
+    return float(f"{value:.6g}")

@@ -1,0 +1,29 @@
+"""Options of training that do not change what a run computes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from mjx_dher.config import check_count, check_number
+from mjx_dher.runs import sinks
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Evaluation, checkpoints and logs of runs."""
+
+    final_episodes: int = 500
+    """Episodes of the last evaluation."""
+    checkpoint_every: int = 10
+    """Epochs between checkpoints, from which a run goes on; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
+    keep: int = 2
+    """Checkpoints to keep, the newest (of runs side by side: one); they are deleted when the run has ended."""
+    log: tuple[str, ...] = ()
+    """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
+
+    def check(self) -> None:
+        """Raises ValueError where an option cannot be used."""
+        check_count("final_episodes", self.final_episodes)
+        check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
+        check_count("keep", self.keep)
+        sinks.check(self.log)

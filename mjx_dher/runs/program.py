@@ -1,0 +1,154 @@
+"""A compiled program for runs side by side: lanes of one `vmap`, or one run without a lane axis."""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import functools
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher import learners, priorities, samplers, trainer
+from mjx_dher.config import HParams
+from mjx_dher.host import memory
+from mjx_dher.learners import Learner
+from mjx_dher.rollout import Outcome, check_steps
+from mjx_dher.runs import loop, play, run_folder
+from mjx_dher.runs.loop import Compiled
+from mjx_dher.spec import RunSpec
+from mjx_dher.trainer import Train, TrainState
+from mjx_dher.types import Env, PRNGKey, Sizes
+
+# HParams, and which of a program's samplers a lane uses; see samplers.one_of.
+Lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))  # type: ignore[misc]
+Choice = tuple[str, str, str]  # arguments of samplers.make
+EvaluateFn = Callable[[TrainState, PRNGKey], Outcome]
+
+
+class Program(NamedTuple):
+    """A compiled program for runs side by side."""
+
+    lanes: int
+    choices: list[Choice]
+    learner: Learner
+    sizes: Sizes
+    compiled: Compiled
+    evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
+
+
+def make_loop(env: Env, spec: RunSpec, choices: Sequence[Choice]) -> Train:
+    """Makes the training loop of runs that share a program, with the parts that they name."""
+    return trainer.make_train(
+        env,
+        spec.config,
+        sampler=samplers.one_of([samplers.make(*choice) for choice in choices]),
+        priority=priorities.make(spec.priority),
+        learner=learners.make(spec.learner, spec.config, trainer.env_sizes(env), spec.networks),
+    )
+
+
+def compile_runs(
+    env: Env, specs: Sequence[RunSpec], max_lanes: int | None, final_episodes: int, report: Callable[[str], None]
+) -> Program:
+    """Compiles for as many lanes as there may be and memory holds, by the compiler's figure.
+
+    The last evaluation may still be compiling, in a thread, while the runs are trained.
+
+    Raises:
+      ValueError: memory does not suffice for one run.
+    """
+    spec, choices = specs[0], list(dict.fromkeys(spec.sampler_choice for spec in specs))
+    train = make_loop(env, spec, choices)
+    loop.check_memory(train, spec.config)
+    lanes = min(len(specs), max_lanes or len(specs))
+    available = memory.available_bytes()
+    if available is not None:  # the rings alone must fit before the compiler is asked
+        lanes = max(1, min(lanes, int(available / train.replay_bytes)))
+    while True:
+        lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))  # chunks of equal size
+        keys, hparams = stack(specs, choices, lanes)
+        compiled = _compile(env, spec, train, keys, hparams, _title(env, specs, train, lanes), report)
+        if available is None or compiled.nbytes <= available or lanes == 1:
+            loop.check_program(compiled, spec.config)
+            beside = available is not None and compiled.nbytes <= available / 2
+            evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside)
+            return Program(lanes, choices, train.learner, trainer.env_sizes(env), compiled, evaluate)
+        lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
+
+
+def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int) -> str:
+    together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
+    return (
+        f"{'one run' if len(specs) == 1 else together}; physics {run_folder.engine_name(env)}, learner on"
+        f" {jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
+    )
+
+
+def _compile(
+    env: Env, spec: RunSpec, train: Train, keys: PRNGKey, hparams: Any, title: str, report: Callable[[str], None]
+) -> Compiled:
+    report(f"{spec.env}: compiling for {title} ...")
+    started = time.perf_counter()
+    compiled = loop.compile_program(train, keys, hparams)
+    check_steps(env)
+    seconds = time.perf_counter() - started
+    report(f"{spec.env}: compiled in {seconds:.1f} s; {memory.format_bytes(compiled.nbytes)} of memory")
+    return compiled
+
+
+def _compile_evaluation(
+    env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool
+) -> concurrent.futures.Future[EvaluateFn]:
+    """Compiles the last evaluation, which is not needed before the runs have ended: `beside` their training, in a thread.
+
+    Compiling takes memory, too, to try kernels in.
+    """
+    episodes = min(final_episodes, play.CHUNK)
+
+    def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
+        return trainer.evaluate_state(env, train.learner, state, key, episodes)
+
+    init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
+    lowered = jax.jit(evaluate_all).lower(jax.eval_shape(init, keys, hparams), keys)
+    pool = concurrent.futures.ThreadPoolExecutor(1)
+    compiling = pool.submit(loop.compile_lowered, lowered)
+    pool.shutdown(wait=not beside)
+    return cast("concurrent.futures.Future[EvaluateFn]", compiling)
+
+
+def stack(specs: Sequence[RunSpec], choices: Sequence[Choice], lanes: int) -> tuple[PRNGKey, Any]:
+    """Returns the keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
+    padded = [specs[min(i, len(specs) - 1)] for i in range(lanes)]
+    numbers: list[Any] = [spec.hparams for spec in padded]
+    if len(choices) > 1:
+        numbers = [Lane._make((*spec.hparams, choices.index(spec.sampler_choice))) for spec in padded]
+    if lanes == 1:
+        return jax.random.key(padded[0].seed), trainer.as_arrays(numbers[0])
+    keys = jnp.stack([jax.random.key(spec.seed) for spec in padded])
+    return keys, jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *numbers)
+
+
+def lane_of(tree: Any, lane: int, lanes: int) -> Any:
+    """Returns one run's part of a pytree that `lanes` runs share; one lane has no axis."""
+    return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
+
+
+def evaluate(env: Env, program: Program, state: TrainState, keys: PRNGKey, episodes: int) -> Outcome:
+    """Plays the last evaluation of each lane; returns the outcomes [lanes, episodes] as NumPy arrays.
+
+    `keys` are those of the runs; the i-th `play.CHUNK` episodes of a run follow `fold_in(key, i)`, i from 1.
+    """
+    play_chunk = program.evaluate.result()
+    outcomes = []
+    for number in range(1, 1 + math.ceil(episodes / play.CHUNK)):
+        fold_in = functools.partial(jax.random.fold_in, data=number)
+        outcome = jax.device_get(play_chunk(state, jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)))
+        outcomes.append(jax.tree.map(np.atleast_2d, outcome))
+    check_steps(env)
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :episodes], *outcomes)

@@ -1,0 +1,107 @@
+"""A run's description: its parts by name, its sizes, its numbers and its seed. Loads neither JAX nor MuJoCo."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Any, Literal, get_args
+
+from mjx_dher import config as config_lib
+from mjx_dher.config import Config, HParams, ReadBy
+from mjx_dher.names import check_name, is_import_path
+
+Engine = Literal["auto", "native", "jax", "warp"]
+ENGINES = get_args(Engine)
+SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
+# Parts by name, and where they are; an own one is named by its place alone.
+WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
+METRICS = {"position": "mjx_dher.samplers:position"}
+PRIORITIES = {"eventful": "mjx_dher.priorities:eventful"}
+LEARNERS = {"ddpg": "mjx_dher.learners.ddpg:make"}
+NETWORKS = {"mlp": "mjx_dher.networks:mlp"}
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSpec:
+    """Everything that decides what a run computes. Each part is a name, or an own one as module:attribute."""
+
+    env: str = "push"
+    """Environment: a name from `envs.list_envs()`, or module:attribute."""
+    engine: Engine = "auto"
+    """Physics: native (MuJoCo C on all cores), warp (MuJoCo Warp on an NVIDIA GPU), jax (MJX) or auto, which picks."""
+    sampler: str = "future"
+    """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest or weighted, or
+    module:attribute."""
+    weight_kernel: Annotated[str, ReadBy("weighted")] = "linear"
+    """Fall of the weights with distance, for the sampler weighted: linear, inverse or softmax, or module:attribute."""
+    metric: Annotated[str, ReadBy("closest", "epsilon_closest", "weighted")] = "position"
+    """Distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by: position, or
+    module:attribute."""
+    priority: str = "eventful"
+    """Priority of an episode in replay, for priority_fraction of each batch: eventful, or module:attribute."""
+    learner: str = "ddpg"
+    """Learner: ddpg, or module:attribute."""
+    networks: str = "mlp"
+    """Networks of the learner: mlp, or module:attribute."""
+    seed: int = 0
+    """Random seed."""
+    config: Config = dataclasses.field(default_factory=Config)
+    """Sizes that shape the program."""
+    hparams: HParams = dataclasses.field(default_factory=HParams)
+    """Numbers of the algorithm."""
+
+    @property
+    def sampler_choice(self) -> tuple[str, str, str]:
+        """Arguments of `samplers.make`."""
+        return self.sampler, self.weight_kernel, self.metric
+
+    @property
+    def program(self) -> RunSpec:
+        """Description of the compiled program that the run can share: all that its lanes must agree in."""
+        return dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0, hparams=HParams())
+
+
+PARTS = {  # by field, the names that are built in; each field takes module:attribute, too
+    "sampler": SAMPLERS,
+    "weight_kernel": WEIGHT_KERNELS,
+    "metric": METRICS,
+    "priority": PRIORITIES,
+    "learner": LEARNERS,
+    "networks": NETWORKS,
+}
+
+
+def reads(sampler: str, field: str) -> bool:
+    """Returns whether a setting makes a difference to runs with this sampler; an own sampler may read any."""
+    read_by = {**config_lib.metadata(RunSpec, ReadBy), **config_lib.metadata(HParams, ReadBy)}
+    return sampler not in SAMPLERS or field not in read_by or sampler in read_by[field]
+
+
+def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | None = None) -> None:
+    """Refuses a description that cannot run, without importing a part.
+
+    Args:
+      spec: the run.
+      env_names: the environments known by name.
+      episode_length: of the environment, where it is known; else that of the tasks here, and 1 for an environment of the
+        user's own, of which nothing is assumed.
+
+    Raises:
+      ValueError: names every field at fault, its value and what is allowed.
+    """
+    if episode_length is None:
+        episode_length = 1 if is_import_path(spec.env) else 50
+    problems: list[str] = []
+    checks: list[tuple[Any, ...]] = [
+        (check_name, "env", spec.env, env_names, True),
+        *((check_name, field, getattr(spec, field), names, True) for field, names in PARTS.items()),
+        (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]"),
+        (config_lib.validate, spec.config, spec.hparams, episode_length),
+    ]
+    for check, *arguments in checks:
+        try:
+            check(*arguments)
+        except ValueError as error:
+            problems.append(str(error))
+    problems += config_lib.choice_problems(spec)
+    if problems:
+        raise ValueError("\n".join(problems))

@@ -1,0 +1,195 @@
+"""The run driver: one run or many, alike on the command line and as a library call."""
+
+import csv
+import dataclasses
+import json
+import tarfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import EXAMPLES, ROOT
+
+import mjx_dher
+from mjx_dher import HParams, Options, RunSpec, cli
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.learners import ddpg
+from mjx_dher.runs import driver, run_folder
+from mjx_dher.sweeps import comparison, grid, tables
+from point_mass import PointMass
+
+CONFIG = mjx_dher.Config(
+    num_envs=2,
+    cycles_per_epoch=2,
+    updates_per_cycle=4,
+    target_period=1,
+    batch_size=16,
+    total_steps=120,
+    replay_size=100,
+    hidden_sizes=(8,),
+    eval_episodes=4,
+)
+SPEC = RunSpec(env="point_mass:PointMass", config=CONFIG)
+FLAGS = [
+    *("--env", "point_mass:PointMass", "--sampler", "weighted", "--preset", "cpu", "--num-envs", "2", "--hidden-sizes", "8"),
+    *("--cycles-per-epoch", "2", "--updates-per-cycle", "4", "--batch-size", "16", "--total-steps", "120"),
+    *("--replay-size", "100", "--eval-episodes", "4", "--final-episodes", "600"),
+]
+TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
+
+
+def rows_of(folder):
+    with (folder / "metrics.csv").open() as file:
+        return [{name: value for name, value in row.items() if name not in TIMES} for row in csv.DictReader(file)]
+
+
+def result_of(folder):
+    content = json.loads((folder / "result.json").read_text())
+    return {name: value for name, value in content.items() if name not in TIMES}
+
+
+def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    assert cli.main([*FLAGS, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
+    sweep = ["--first-seed", "3", "--seeds", "1", "--lanes", "1", "--out", str(tmp_path / "sweep")]
+    assert cli.main(["sweep", *FLAGS, *sweep]) == 0
+    trial = next((tmp_path / "sweep" / "cells").glob("*/result.json")).parent
+    assert rows_of(trial) == rows_of(tmp_path / "run")
+    assert len(rows_of(trial)) == 3
+    assert result_of(trial) == result_of(tmp_path / "run")
+    assert result_of(trial)["episodes"] == 600
+    with np.load(trial / "policy.npz") as ours, np.load(tmp_path / "run" / "policy.npz") as other:
+        assert set(ours.files) == set(other.files)
+        assert all(np.array_equal(ours[name], other[name]) for name in ours.files)
+    assert run_folder.read_spec(trial) == run_folder.read_spec(tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Three runs side by side by a library call; the second one's learner is not finite from its second epoch on."""
+    folder = tmp_path_factory.mktemp("runs")
+    update = ddpg.DDPG.update
+
+    def break_one(self, state, batch, hparams):
+        state, losses = update(self, state, batch, hparams)
+        broken = (hparams.her_k == 7) & (state.num_updates > 8)
+        return state.replace(params=jax.tree.map(lambda x: jnp.where(broken, jnp.nan, x), state.params)), losses
+
+    specs = [dataclasses.replace(SPEC, seed=seed, hparams=HParams(her_k=k)) for seed, k in ((0, 4.0), (1, 7.0), (2, 4.0))]
+    seen, said = [], []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ddpg.DDPG, "update", break_one)
+        results = mjx_dher.train_runs(
+            PointMass(),
+            specs,
+            [folder / "cells" / run_folder.trial_name(spec) for spec in specs],
+            options=Options(final_episodes=20, log=("jsonl",)),
+            lanes=3,
+            report=said.append,
+            on_epoch=lambda specs, progress: seen.append(progress.epoch),
+        )
+    return folder, specs, results, seen, said
+
+
+def test_a_library_call_trains_runs_side_by_side(trained):
+    folder, specs, results, seen, said = trained
+    assert [result.status for result in results] == ["finished", "diverged", "finished"]
+    assert seen == [1, 2, 3]
+    assert "compiling for 3 runs side by side, of 3" in said[0]
+    assert run_folder.read_spec(results[2].folder) == specs[2]
+    assert len((results[0].folder / "metrics.jsonl").read_text().splitlines()) == 3
+    assert mjx_dher.load_policy(results[0].folder)({"observation": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
+    assert not (folder / "cells" / "unfinished").exists()
+
+
+def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
+    """In its result, its curve, the tables and the comparison; the others are what they were without it."""
+    folder, _, results, _, _ = trained
+    diverged = results[1].folder
+    content = json.loads((diverged / "result.json").read_text())
+    assert (content["status"], content["epochs"], content["env_steps"]) == ("diverged", 2, 80)
+    assert "success_rate" not in content
+    assert [row["epoch"] for row in rows_of(diverged)] == ["1"]
+    assert not (diverged / "policy.npz").exists()
+    trials = tables.read(folder)
+    tables.write(folder, trials)
+    with (folder / "finals.csv").open() as file:
+        finals = {row["seed"]: row for row in csv.DictReader(file)}
+    assert {seed: row["status"] for seed, row in finals.items()} == {"0": "finished", "1": "diverged", "2": "finished"}
+    assert finals["1"]["success_rate"] == ""
+    for group in comparison.groups(trials)["point_mass:PointMass"]:
+        assert group.diverged == (1 if group.others["her_k"] == 7 else 0)
+        if group.diverged:
+            assert group.final.tolist() == [0.0]
+            assert group.success.shape == (1, 1)
+    assert any("(1 diverged)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
+
+
+def _rows(trials):
+    return [row for groups in comparison.groups(trials).values() for row in comparison.compare(groups, "future", 0.9)]
+
+
+def test_a_run_that_diverged_counts_as_a_failure_from_then_on():
+    curve = {"epoch": [1, 2, 3], "env_steps": [1, 2, 3], "wall_seconds": [1.0, 2.0, 3.0], "success_rate": [0.5, 0.6, 0.7]}
+    settings = {"env": "e", "sampler": "future", "gamma": 0.9}
+    whole = {"settings": settings, "seed": 0, "status": "finished", "curve": curve}
+    whole["final"] = {"success_rate": 0.8, "reset_success_rate": 0.1}
+    cut = {name: values[:1] for name, values in curve.items()}
+    (group,) = comparison.groups([whole, {**whole, "seed": 1, "status": "diverged", "curve": cut, "final": {}}])["e"]
+    np.testing.assert_array_equal(group.success, [[0.5, 0.6, 0.7], [0.5, 0.0, 0.0]])
+    np.testing.assert_array_equal(group.final, [0.8, 0.0])
+    assert (group.diverged, group.at_reset) == (1, 0.1)
+    np.testing.assert_array_equal(group.seconds, [1.0, 2.0, 3.0])
+
+
+def test_runs_that_cannot_share_a_program_are_refused(tmp_path):
+    other = dataclasses.replace(SPEC, config=dataclasses.replace(CONFIG, batch_size=17))
+    for specs, folders in (([SPEC, other], ["a", "b"]), ([SPEC], ["a", "b"]), ([], [])):
+        with pytest.raises(ValueError, match=r"agree in RunSpec\.program"):
+            mjx_dher.train_runs(PointMass(), specs, [tmp_path / name for name in folders])
+    with pytest.raises(ValueError, match="gamma must lie in"):
+        mjx_dher.train_runs(PointMass(), [dataclasses.replace(SPEC, hparams=HParams(gamma=1.0))], [tmp_path / "a"])
+    with pytest.raises(ValueError, match="final_episodes must lie in"):
+        mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "a"], options=Options(final_episodes=0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_another_program_trains_in_is_refused_before_anything_is_compiled(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))
+    (tmp_path / "a").mkdir()
+    with files.lock(tmp_path / "a", run_folder.LOCK), pytest.raises(FolderError, match="being trained by another program"):
+        mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "a"])
+
+
+@pytest.fixture
+def earlier(tmp_path, monkeypatch):
+    """A run that 0.1.0 was stopped in after two of four epochs, how it went on there, and a sweep's finished runs."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    with tarfile.open(ROOT / "tests" / "data" / "runs_0.1.0.tar.gz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    return tmp_path
+
+
+def test_a_run_of_an_earlier_version_is_resumed(earlier):
+    """Half of each batch is drawn by priority. Rows, and with them draws and updates, are those that 0.1.0 went on with."""
+    assert cli.main(["resume", str(earlier / "run")]) == 0
+    ours, theirs = rows_of(earlier / "run"), rows_of(earlier / "run_resumed")
+    assert [row["epoch"] for row in ours] == ["1", "2", "3", "4"]
+    for a, b in zip(ours, theirs, strict=True):
+        assert {name: float(value) for name, value in a.items()} == pytest.approx(
+            {name: float(value) for name, value in b.items()}, rel=1e-3
+        )
+    mjx_dher.load_policy(earlier / "run")
+
+
+def test_a_sweep_of_an_earlier_version_is_read_and_gone_on_with(earlier):
+    trials = tables.read(earlier / "sweep")
+    assert [(t["settings"]["sampler"], t["seed"], t["status"]) for t in trials] == [
+        (sampler, seed, "finished") for sampler in ("future", "weighted") for seed in (0, 1)
+    ]
+    assert trials[0]["settings"]["priority_fraction"] == 0.5
+    assert trials[0]["curve"]["priority_mean"] == [1, 1]
+    specs = [run_folder.read_spec(path) for path in (earlier / "sweep" / "cells").iterdir() if path.is_dir()]
+    assert all(grid.is_done(earlier / "sweep", spec) for spec in specs)

@@ -1,0 +1,273 @@
+"""Learners and networks of one's own: what is taken, what is refused, how they train, and their policies as files."""
+
+import dataclasses
+import functools
+import sys
+import types
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mjx_dher
+from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
+from mjx_dher.learners import common, ddpg, stored
+from mjx_dher.networks import Actor, Critic, Networks
+from mjx_dher.policy import Policy
+from mjx_dher.runs import run_folder
+from mjx_dher.types import Sizes
+from point_mass import PointMass
+
+SIZES = Sizes(2, 2, 2)
+SMALL = Config(
+    num_envs=16,
+    cycles_per_epoch=5,
+    updates_per_cycle=20,
+    target_period=1,
+    batch_size=128,
+    replay_size=20_000,
+    hidden_sizes=(32, 32),
+    eval_episodes=200,
+    total_steps=8_000,
+)
+HP = HParams(gamma=0.9, polyak=0.9, action_l2=0.1)
+METHODS = ("init", "update_normalizers", "act", "noise", "explore", "update", "update_target", "summary", "export")
+
+
+class Straight(nn.Module):
+    """An actor that goes straight for the goal, as far as it has learned to: one number."""
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        gain = self.param("gain", nn.initializers.zeros, ())
+        return jnp.tanh(gain * (goal - observation))
+
+
+class Distance(nn.Module):
+    """A critic that looks at where an action leads, relative to the goal, through one hidden layer."""
+
+    size: int
+    dtype: str
+
+    @nn.compact
+    def __call__(self, observation, goal, action):
+        inputs = jnp.concatenate([goal - observation, action], axis=-1)
+        hidden = nn.relu(nn.Dense(self.size, dtype=jnp.dtype(self.dtype))(inputs))
+        return nn.Dense(1, dtype=jnp.float32)(hidden)[..., 0]
+
+
+def own_networks(action_size, hidden_sizes, dtype):
+    return Networks(Straight(), Distance(hidden_sizes[0], dtype))
+
+
+def own_learner(config, sizes, make_networks):
+    """DDPG with a step size of its own and a metric more."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Quick(ddpg.DDPG):
+        def update(self, state, batch, hparams):
+            state, losses = super().update(state, batch, hparams._replace(actor_lr=0.01))
+            return state, losses | {"reward_mean": jnp.mean(batch.reward)}
+
+    both = make_networks(sizes.action, config.hidden_sizes, "float32")
+    return Quick(sizes, both, both)
+
+
+@pytest.fixture
+def mine(monkeypatch):
+    """A module of the user's."""
+    module = types.ModuleType("mine")
+    module.networks, module.learner, module.two = own_networks, own_learner, 2
+    monkeypatch.setitem(sys.modules, "mine", module)
+    return module
+
+
+def test_the_default_is_ddpg_with_the_paper_s_networks():
+    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="xla"), SIZES)
+    assert isinstance(learner, ddpg.DDPG)
+    assert learner.sizes == SIZES
+    assert learner.networks == networks.mlp(2, (32, 32), "float32") == Networks(Actor(2, (32, 32)), Critic((32, 32)))
+    assert learner.learning == networks.mlp(2, (32, 32), "bfloat16")
+    assert learner.compute_gradients is ddpg.compute_gradients
+
+
+def test_a_learner_is_a_function_or_a_place(mine):
+    for name in ("mine:learner", own_learner):
+        learner = learners.make(name, SMALL, SIZES, "mine:networks")
+        assert type(learner).__name__ == "Quick"
+        assert learner.networks == own_networks(2, (32, 32), "float32")
+
+
+def test_networks_are_a_function_or_a_place(mine):
+    assert networks.make("mlp") is networks.mlp
+    assert networks.make("mine:networks") is networks.make(own_networks) is own_networks
+    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16"), SIZES, "mine:networks")
+    assert learner.networks.critic == Distance(32, "float32")
+    assert learner.learning.critic == Distance(32, "bfloat16")
+
+
+@pytest.mark.parametrize(
+    ("field", "make", "parameters"),
+    [
+        ("learner", functools.partial(learners.make, config=SMALL, sizes=SIZES), "(config, sizes, networks)"),
+        ("networks", networks.make, "(action_size, hidden_sizes, dtype)"),
+        ("networks", lambda name: learners.make("ddpg", SMALL, SIZES, name), "(action_size, hidden_sizes, dtype)"),
+    ],
+)
+def test_names_and_functions_that_cannot_be_used_are_refused(mine, field, make, parameters):
+    known = {"learner": "ddpg", "networks": "mlp"}[field]
+    for name, parts in {
+        known[:-1]: [repr(known[:-1]), f"did you mean {known!r}", "module:attribute"],
+        f"mine:{field}s": [f"'mine:{field}s'", "mine", f"did you mean {field!r}"],
+        "mine:two": [parameters, " 2"],
+        "no_such_module:x": ["'no_such_module'", "no module"],
+    }.items():
+        with pytest.raises(ValueError, match=field) as error:
+            make(name)
+        assert all(part in str(error.value) for part in parts), error.value
+    with pytest.raises(ValueError, match=field) as error:
+        make(lambda one: one)
+    assert parameters in str(error.value)
+
+
+def test_methods_are_those_of_the_protocol():
+    assert {name for name in vars(learners.Learner) if not name.startswith("_")} == set(METHODS)
+
+
+@pytest.mark.parametrize("missing", [METHODS, METHODS[-1:], ("act", "summary")])
+def test_a_learner_without_methods_is_refused_by_their_names(mine, missing):
+    methods = {name: (lambda *args: None) for name in METHODS if name not in missing}
+    mine.part = lambda config, sizes, networks: types.SimpleNamespace(**methods)
+    absent = ", ".join(name for name in METHODS if name in missing)
+    for name in ("mine:part", mine.part):
+        with pytest.raises(ValueError, match=f"it has no {absent} ") as error:
+            learners.make(name, SMALL, SIZES)
+        assert repr(name) in str(error.value)
+
+
+def test_what_is_no_method_is_missing():
+    methods = {name: (lambda *args: None) for name in METHODS} | {"act": 3}
+    with pytest.raises(ValueError, match="it has no act "):
+        learners.make(lambda config, sizes, networks: types.SimpleNamespace(**methods), SMALL, SIZES)
+
+
+class Wide(nn.Module):
+    """Gives one number too many."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self, observation, goal, *action):
+        return nn.Dense(self.size + 1)(jnp.concatenate([observation, goal, *action], axis=-1))
+
+
+@pytest.mark.parametrize(
+    ("made", "parts"),
+    [
+        (Networks(Wide(2), Critic((8,))), ["actor", "[2, 2]", "(2, 3)"]),
+        (Networks(Actor(3, (8,)), Critic((8,))), ["actor", "[2, 2]", "(2, 3)"]),
+        (Networks(Actor(2, (8,)), Wide(0)), ["critic", "[2]", "(2, 1)"]),
+    ],
+)
+def test_networks_of_the_wrong_output_shape_are_refused(made, parts):
+    with pytest.raises(ValueError, match="networks") as error:
+        learners.make("ddpg", SMALL, SIZES, lambda action_size, hidden_sizes, dtype: made)
+    assert all(part in str(error.value).replace("float32[2,3]", "(2, 3)") for part in parts), error.value
+
+
+def test_kernels_know_the_default_networks_alone():
+    hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
+    with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
+        learners.make("ddpg", hopper, SIZES, own_networks)
+    auto = dataclasses.replace(hopper, learner_kernels="auto")
+    assert learners.make("ddpg", auto, SIZES, own_networks).compute_gradients is ddpg.compute_gradients
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """(the learner with own actor and critic, its states before and after training, metrics of each epoch)."""
+    learner = learners.make(own_learner, SMALL, SIZES, own_networks)
+    program = make_train(PointMass(), SMALL, learner=learner)
+    assert program.learner is learner
+    state = jax.jit(program.init)(jax.random.key(0), HP)
+    before, epoch, metrics = state.learner, jax.jit(program.epoch), []
+    for _ in range(5):
+        state, found = epoch(state)
+        metrics.append(jax.device_get(found))
+    return learner, before, state.learner, metrics
+
+
+def test_an_actor_and_a_critic_of_one_s_own_learn_the_point_mass(trained):
+    _, before, after, metrics = trained
+    assert float(before.params.actor["params"]["gain"]) == 0
+    assert float(after.params.actor["params"]["gain"]) > 0.5
+    assert metrics[-1]["success_rate"] > 0.95
+    assert metrics[0]["reset_success_rate"] < 0.3
+
+
+def test_what_the_learner_reports_is_logged(trained):
+    *_, metrics = trained
+    assert metrics[0].keys() >= {"reward_mean", "critic_loss", "actor_norm", "success_rate", "priority_mean"}
+    assert all(-1 < found["reward_mean"] < 0 for found in metrics)
+    np.testing.assert_allclose(metrics[-1]["actor_norm"], trained[2].params.actor["params"]["gain"], rtol=1e-6)
+
+
+def test_networks_of_one_s_own_are_not_exported_and_the_default_ones_are(trained):
+    learner, _, state, _ = trained
+    assert learner.export(state, HP) is None
+    default = learners.make("ddpg", SMALL, SIZES)
+    assert isinstance(default.export(default.init(jax.random.key(0)), HP), Policy)
+
+
+OBS = {
+    "observation": np.random.default_rng(0).normal(size=(64, 2)).astype(np.float32),
+    "desired_goal": np.random.default_rng(1).normal(size=(64, 2)).astype(np.float32),
+    "achieved_goal": np.zeros((64, 2), np.float32),
+}
+SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="mine:networks", config=SMALL, hparams=HP)
+
+
+@pytest.fixture
+def folder(tmp_path, trained, mine):
+    learner, _, state, _ = trained
+    run_folder.create(tmp_path / "run", SPEC, "none", {})
+    stored.StoredPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    return tmp_path / "run"
+
+
+def test_a_stored_policy_acts_as_the_learner_does(folder, trained):
+    learner, _, state, _ = trained
+    policy = mjx_dher.load_policy(folder)
+    actions = policy(OBS)
+    assert isinstance(actions, np.ndarray)
+    assert actions.shape == (64, 2)
+    assert actions.std() > 0.1
+    np.testing.assert_array_equal(actions, learner.act(state, OBS, HP))
+    np.testing.assert_allclose(policy({name: value[7] for name, value in OBS.items()}), actions[7], rtol=1e-5)
+    traced = jax.jit(lambda obs: policy.forward(obs["observation"], obs["desired_goal"], jnp))(OBS)
+    np.testing.assert_allclose(actions, traced, rtol=1e-5)
+    assert {path.name for path in folder.iterdir()} == {"config.json", "policy.npz"}
+
+
+def test_its_numbers_come_back_to_the_bit(folder, trained):
+    policy = mjx_dher.load_policy(folder)
+    jax.tree.map(np.testing.assert_array_equal, policy.state, trained[2])
+    assert (policy.sizes, policy.hparams) == (SIZES, HP)
+    assert isinstance(policy.state.params, common.Params)
+
+
+@pytest.mark.parametrize("changes", [{"networks": "mlp"}, {"config": dataclasses.replace(SMALL, hidden_sizes=(16,))}])
+def test_a_stored_policy_of_other_networks_is_refused(folder, changes, mine):
+    run_folder.create(folder, dataclasses.replace(SPEC, **changes), "none", {})
+    with pytest.raises(ValueError, match=r"policy\.npz") as error:
+        mjx_dher.load_policy(folder)
+    assert repr(changes.get("networks", "mine:networks")) in str(error.value)
+    assert "'mine:learner'" in str(error.value)
+
+
+def test_a_stored_policy_needs_its_module(folder, monkeypatch):
+    monkeypatch.delitem(sys.modules, "mine")
+    with pytest.raises(ValueError, match="there is no module 'mine'"):
+        mjx_dher.load_policy(folder)

@@ -1,0 +1,228 @@
+"""Each function of `private_api` is still needed: a test that fails says which one to delete."""
+
+import importlib.metadata
+import importlib.util
+import inspect
+import logging
+import re
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import orbax.checkpoint
+import pytest
+from conftest import ROOT
+from mujoco import mjx
+
+from mjx_dher.host import private_api
+from mjx_dher.host.warp_setup import wp
+
+
+def no_longer_needed(what, name):
+    return f"no longer needed: {what}; delete private_api.{name}"
+
+
+def test_importing_it_imports_no_library():
+    code = (
+        "import sys; from mjx_dher.host import private_api;"
+        "print({'jax', 'mujoco', 'warp', 'orbax', 'numpy'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert (run.stdout, run.stderr) == ("set()\n", "")
+
+
+def test_every_function_says_why_and_since_when():
+    functions = [
+        f for _, f in inspect.getmembers(private_api, callable) if getattr(f, "__module__", "") == private_api.__name__
+    ]
+    assert len(functions) == 9
+    for function in functions:
+        if function is not private_api.mujoco_warp_kernels_to_move:
+            doc = inspect.getdoc(function)
+            assert re.search(r"\nPrivate: .*\nWhy: .*\nNeeded by: (mujoco-mjx|warp-lang|orbax-checkpoint) \d", doc, re.DOTALL)
+            assert "https://github.com/" in doc or "No upstream issue known" in doc
+
+
+def chain(length):
+    link = '<body pos="0 0 .1"><joint axis="0 1 0"/><geom size=".1"/>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{link * length}{'</body>' * length}</worldbody></mujoco>")
+
+
+@pytest.mark.slow
+def test_xla_still_repeats_the_ancestors_of_a_body():
+    model = mjx.put_model(chain(8), impl="jax")
+    data = mjx.make_data(model, impl="jax")
+    angles = jnp.zeros((16, 8))
+
+    def kinematics(qpos):
+        return mjx.kinematics(model, data.replace(qpos=qpos)).xpos
+
+    def seconds(compiled):
+        times = []
+        for _ in range(20):
+            start = time.perf_counter()
+            compiled(angles).block_until_ready()
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    plain = jax.jit(jax.vmap(kinematics)).lower(angles).compile()
+    with private_api.bodies_computed_once():
+        once = jax.jit(jax.vmap(lambda qpos: kinematics(qpos))).lower(angles).compile()
+    np.testing.assert_allclose(plain(angles), once(angles), atol=1e-6)
+    what = "MJX's kinematics are as fast without barriers"  # measured: 30 times slower
+    assert seconds(plain) > 5 * seconds(once), no_longer_needed(what, "bodies_computed_once")
+
+
+WELDED = """
+<mujoco><worldbody><body mocap="true" name="hand"/>
+<body><joint axis="0 1 0"/><geom size=".1" pos=".5 0 0"/>
+<body pos="1 0 0" name="tip"><joint axis="0 0 1"/><geom size=".1" pos=".2 0 0"/></body></body></worldbody>
+<equality><weld body1="hand" body2="tip" relpose="0 0 0 1 0 0 0"/></equality></mujoco>
+"""
+
+
+def test_mjx_still_drops_the_velocity_term_of_a_weld():
+    model = mujoco.MjModel.from_xml_string(WELDED)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = [0.3, -0.2], [1.0, 2.0]
+    mujoco.mj_forward(model, data)
+    m = mjx.put_model(model, impl="jax")
+    d = mjx.make_data(model, impl="jax").replace(qpos=jnp.array(data.qpos), qvel=jnp.array(data.qvel))
+    d = jax.jit(lambda d: mjx.fwd_velocity(m, mjx.fwd_position(m, d)))(d)
+    difference = np.asarray(d._impl.efc_aref)[:6] - data.efc_aref[:6]
+    what = "MJX's reference acceleration of a weld is MuJoCo's"
+    assert np.abs(difference).max() > 0.1, no_longer_needed(what, "shift_reference_acceleration, and mjx._Weld")
+    shifted = private_api.shift_reference_acceleration(d, -difference)
+    np.testing.assert_allclose(shifted._impl.efc_aref[:6], data.efc_aref[:6], rtol=1e-5)
+    np.testing.assert_array_equal(shifted._impl.efc_aref[6:], d._impl.efc_aref[6:])
+
+
+def test_mjx_still_brings_a_mujoco_warp_of_its_own():
+    required = importlib.metadata.requires("mujoco-mjx") or []
+    assert not any(re.match(r"mujoco[-_]warp\b", line) for line in required), no_longer_needed(
+        "MJX depends on the package mujoco-warp", "mujoco_warp"
+    )
+
+
+def test_vec10_is_still_private():
+    library = private_api.mujoco_warp()
+    assert not hasattr(library, "vec10"), no_longer_needed("MuJoCo Warp exports vec10", "vec10")
+    d = library.make_data(chain(1))
+    assert d.cinert.dtype is d.crb.dtype is private_api.vec10()
+
+
+def test_mujoco_warp_still_keeps_its_kernels_in_large_modules():
+    """Those in use are less than a third; moved ones are counted, too."""
+    moved = private_api.mujoco_warp_kernels_to_move()
+    total = sum(len([x for x in vars(module).values() if isinstance(x, wp.Kernel)]) for module in moved)
+    used = sum(map(len, moved.values()))
+    what = "most kernels in MuJoCo Warp's modules are used"
+    assert used < total / 2, no_longer_needed(what, "move_mujoco_warp_kernels")
+    private_api.move_mujoco_warp_kernels()
+    for module, names in moved.items():
+        new = {getattr(module, name).module.name for name in names}
+        assert new == {f"{private_api.__name__}.{module.__name__.rpartition('.')[2]}"}
+
+
+def test_the_parts_of_mujoco_warp_s_step_are_still_private():
+    library, parts = private_api.mujoco_warp(), vars(private_api.mujoco_warp_parts())
+    public = {id(x): name for name, x in vars(library).items() if not name.startswith("_")}
+    exported = [public[id(part)] for part in parts.values() if id(part) in public]
+    assert not exported, no_longer_needed(f"MuJoCo Warp exports {exported}", "mujoco_warp_parts' fields of these names")
+
+
+@pytest.mark.slow
+def test_mujoco_warp_still_computes_constraints_before_velocities():
+    """So that a step depends on the velocities of bodies that its memory holds from before."""
+    library, model = private_api.mujoco_warp(), mujoco.MjModel.from_xml_string(WELDED)
+    stepped = []
+    for left_over in (0.0, 1.0):
+        m, d = library.put_model(model), library.make_data(model)
+        d.qvel = wp.array([[1.0, 2.0]], dtype=float)
+        d.cvel.fill_(left_over)
+        d.cdof_dot.fill_(left_over)
+        library.step(m, d)
+        stepped.append(d.qvel.numpy())
+    what = "MuJoCo Warp's step computes velocities before constraints, or takes them anew"
+    changed = np.abs(stepped[0] - stepped[1]).max()
+    assert changed > 1e-4, f"no longer needed: {what}; delete warp_substep._library_substep in favour of mujoco_warp.step"
+
+
+def test_warp_still_writes_the_number_of_a_trace_into_the_program():
+    def double(x: wp.array(dtype=float), y: wp.array(dtype=float)):
+        wp.copy(y, x)
+
+    call = wp.jax_callable(double, num_outputs=1, module_preload_mode=wp.JaxModulePreloadMode.NONE)
+
+    def program():
+        return jax.jit(lambda x: call(x)).lower(jnp.zeros(3)).as_text()
+
+    first, second = program(), program()
+    assert first != second, no_longer_needed("Warp's programs are the same at every trace", "reset_call_id")
+    private_api.reset_call_id(call)
+    assert program() == first
+
+
+def test_orbax_still_has_its_older_interface_only():
+    """Outside of `experimental`; and OCDBT is the default format, about which the older one warns."""
+    name = "array_checkpointer: write its arrays by orbax.checkpoint.v1"
+    assert importlib.util.find_spec("orbax.checkpoint.v1") is None, no_longer_needed("orbax's new interface is stable", name)
+    default = inspect.signature(orbax.checkpoint.PyTreeCheckpointHandler).parameters["use_ocdbt"].default
+    assert default is True, no_longer_needed("OCDBT is not orbax's default any more", "array_checkpointer")
+
+
+def test_orbax_still_warns_in_the_older_format(tmp_path):
+    records = []
+    handler = logging.Handler()
+    handler.emit = records.append
+    logger = logging.getLogger("absl")
+    with private_api.array_checkpointer() as checkpointer:
+        level = logger.level
+        logger.addHandler(handler)
+        try:
+            checkpointer.save(tmp_path / "silent", {"a": np.zeros(3)})
+            assert not records
+            assert not list(tmp_path.rglob("manifest.ocdbt"))
+            logger.setLevel(logging.WARNING)
+            checkpointer.save(tmp_path / "loud", {"a": np.zeros(3)})
+        finally:
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+    assert records, "no longer needed: orbax does not warn; delete the line of private_api.array_checkpointer that silences it"
+
+
+GROWTH = """
+import logging, shutil, sys
+import numpy as np, orbax.checkpoint
+from mjx_dher.host import memory
+memory.keep_heap_small()
+logging.getLogger("absl").setLevel(logging.CRITICAL)
+held = []
+for index in range(600):
+    handler = orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=sys.argv[1] == "ocdbt")
+    with orbax.checkpoint.Checkpointer(handler) as checkpointer:
+        checkpointer.save(f"{sys.argv[2]}/{index}", {f"{i:04d}": np.full(100, i, np.float32) for i in range(60)})
+    shutil.rmtree(f"{sys.argv[2]}/{index}")
+    memory.release()
+    if index in (199, 599):
+        held.append(memory.used_bytes())
+print((held[1] - held[0]) / 400)
+"""
+
+
+@pytest.mark.slow
+def test_a_process_still_keeps_memory_of_every_checkpoint_in_ocdbt(tmp_path):
+    """Measured: 19 kB for each, and 6 kB in the older format."""
+
+    def kept(form):
+        command = [sys.executable, "-c", GROWTH, form, str(tmp_path)]
+        return float(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
+
+    what = "OCDBT keeps no more memory than the older format"
+    assert kept("ocdbt") > 2 * max(kept("older"), 1e3), no_longer_needed(
+        what, "array_checkpointer, for orbax's default handler"
+    )
