@@ -20,6 +20,7 @@ from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.host.files import FolderError
+from mjx_dher.runs import run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import Engine, RunSpec
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
 GRID = ("env", "sampler", "weight_kernel", "metric", "priority", "learner", "networks")
-LOCK = "lock"
 
 
 def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
@@ -225,7 +225,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
 def _write_tables(args: SweepArgs, console: Console) -> None:
     from mjx_dher.sweeps import comparison, tables
 
-    with files.lock(args.out / grid.CELLS, LOCK, wait=True):  # another shard's program may be writing them
+    with files.lock(args.out / grid.CELLS, run_folder.LOCK, wait=True):  # another shard's program may be writing them
         trials = tables.read(args.out)
         tables.write(args.out, trials)
         _compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)

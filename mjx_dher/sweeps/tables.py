@@ -51,7 +51,6 @@ def _read_trial(path: Path) -> dict[str, Any]:
             "seed": spec.seed,
             "status": status,
             "lanes": result["lanes"],
-            "epochs": result["epochs"],
             "final": {name: _short(result[name]) for name in _FINAL} if status != DIVERGED else {},
             "curve": {OLD_NAMES.get(name, name): [_number(row[name]) for row in rows] for name in columns},
         }
