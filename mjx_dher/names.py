@@ -14,6 +14,7 @@ import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 
@@ -61,6 +62,15 @@ def load_import_path(field: str, value: str) -> Any:
         hint = _hint(attribute, [name for name in dir(module) if not name.startswith("_")])
         raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{hint}")
     return getattr(module, attribute)
+
+
+def module_file(value: str) -> Path | None:
+    """Returns the file of the module that "module:attribute" names, without importing it; None where it has none."""
+    try:
+        spec = importlib.util.find_spec(value.partition(":")[0])
+    except Exception:  # a package above it cannot be imported, as whoever imports the module will be told
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin and Path(spec.origin).is_file() else None
 
 
 def resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:

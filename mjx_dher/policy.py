@@ -77,9 +77,9 @@ class Policy:
         arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
         return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, **extra: Any) -> None:
         """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
-        arrays: dict[str, Any] = self.arrays()
+        arrays: dict[str, Any] = {**self.arrays(), **extra}
         with files.atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, get_args
 
 from mjx_dher import config as config_lib
@@ -76,6 +77,16 @@ def reads(sampler: str, field: str) -> bool:
     return sampler not in SAMPLERS or field not in read_by or sampler in read_by[field]
 
 
+def validate_values(spec: RunSpec) -> None:
+    """Refuses a description with a value that no run has, whatever its environment and its parts are.
+
+    Raises:
+      ValueError: names every field at fault, its value and what is allowed.
+    """
+    names = [(_check_text, name, getattr(spec, name)) for name in ("env", *PARTS)]
+    _check_all(spec, [*names, (config_lib.validate, spec.config, spec.hparams, 1)])
+
+
 def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | None = None) -> None:
     """Refuses a description that cannot run, without importing a part.
 
@@ -90,14 +101,14 @@ def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | No
     """
     if episode_length is None:
         episode_length = 1 if is_import_path(spec.env) else 50
+    names = [(check_name, field, getattr(spec, field), known, True) for field, known in (("env", env_names), *PARTS.items())]
+    _check_all(spec, [*names, (config_lib.validate, spec.config, spec.hparams, episode_length)])
+
+
+def _check_all(spec: RunSpec, checks: Sequence[tuple[Any, ...]]) -> None:
+    """Makes the calls in `checks`, and those of what any spec must be; raises ValueError with all that they found."""
     problems: list[str] = []
-    checks: list[tuple[Any, ...]] = [
-        (check_name, "env", spec.env, env_names, True),
-        *((check_name, field, getattr(spec, field), names, True) for field, names in PARTS.items()),
-        (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]"),
-        (config_lib.validate, spec.config, spec.hparams, episode_length),
-    ]
-    for check, *arguments in checks:
+    for check, *arguments in (*checks, (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]")):
         try:
             check(*arguments)
         except ValueError as error:
@@ -105,3 +116,8 @@ def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | No
     problems += config_lib.choice_problems(spec)
     if problems:
         raise ValueError("\n".join(problems))
+
+
+def _check_text(field: str, value: Any) -> None:
+    if not isinstance(value, str):
+        raise ValueError(f"{field} must be a name; got {value!r}")

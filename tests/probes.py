@@ -1,13 +1,23 @@
-"""Environments whose answers are known."""
+"""Environments whose answers are known, and another program's lock."""
 
 from __future__ import annotations
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
+from filelock import FileLock
 from flax import struct
 
 from mjx_dher.types import Array
 from point_mass import PointMass, PointState
+
+
+@contextlib.contextmanager
+def held(folder):
+    """Has the lock of a folder as another program would."""
+    with FileLock(folder / ".lock", timeout=0):
+        yield
 
 
 class Clock(PointMass):

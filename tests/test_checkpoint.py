@@ -19,7 +19,7 @@ from test_trainer import SMALL
 from mjx_dher import HParams, RunSpec, cli, trainer
 from mjx_dher.host.files import write_json
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import checkpoint, loop, run_folder
+from mjx_dher.runs import checkpoint, identity, loop, run_folder
 from mjx_dher.runs.checkpoint import CheckpointError
 from probes import PointMass
 
@@ -70,7 +70,7 @@ def restore(folder, program):
 def test_a_resumed_run_is_the_uninterrupted_one_to_the_bit(program, saved):
     folder, rows, last = saved
     found = restore(folder, program)
-    assert (found.path.name, found.epoch, found.refused) == ("epoch-000003", 3, ())
+    assert (found.path.name, found.epoch, found.refused) == ("epoch-000003", 3, {})
     again, end = train(program, start=loop.Start(found.state, found.epoch, found.wall_seconds))
     assert again == rows[3:]
     assert end == last
@@ -135,7 +135,7 @@ def cut(path):
 def change_manifest(path, **changes):
     content = json.loads((path / "manifest.json").read_text()) | changes
     del content["sha256"]
-    digest = checkpoint.digest_of(content)
+    digest = identity.sha256_of(content)
     (path / "manifest.json").write_text(json.dumps({**content, "sha256": digest}))
 
 
@@ -297,7 +297,7 @@ def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "keep must lie in" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")
     assert "checkpoint_every must lie in" in refusal(capsys, "resume", tmp_path / "run", "--checkpoint-every", "-1")
     assert "checkpoint_every must lie in" in refusal(capsys, "--env", "push", "--checkpoint-every", "-1")
-    write_json(tmp_path / "run" / "result.json", {"status": "finished"})
+    write_json(tmp_path / "run" / "result.json", {"status": "finished", "epochs": 4})
     assert "has ended" in refusal(capsys, "resume", tmp_path / "run")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_dher import RunSpec, stats
-from mjx_dher.runs import run_folder
+from mjx_dher.runs import identity
 from mjx_dher.sweeps import comparison
 
 
@@ -16,7 +16,7 @@ def cell(sampler, seed, success, env="push", final=None, **numbers):
         "success_rate": list(success),
     }
     final = {"success_rate": success[-1] if final is None else final, "reset_success_rate": 0.07}
-    settings = {**run_folder.settings(RunSpec(env=env, sampler=sampler)), **numbers}
+    settings = {**identity.settings(RunSpec(env=env, sampler=sampler)), **numbers}
     return {"settings": settings, "seed": seed, "status": "finished", "curve": curve, "final": final}
 
 

@@ -13,12 +13,12 @@ from conftest import EXAMPLES, ROOT
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
-from mjx_dher.host import files
 from mjx_dher.host.files import FolderError
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import driver, run_folder
+from mjx_dher.runs import driver, identity, run_folder
 from mjx_dher.sweeps import comparison, grid, tables
 from point_mass import PointMass
+from probes import held
 
 CONFIG = mjx_dher.Config(
     num_envs=2,
@@ -84,7 +84,7 @@ def trained(tmp_path_factory):
         results = mjx_dher.train_runs(
             PointMass(),
             specs,
-            [folder / "cells" / run_folder.trial_name(spec) for spec in specs],
+            [folder / "cells" / identity.trial_name(spec) for spec in specs],
             options=Options(final_episodes=20, log=("jsonl",)),
             lanes=3,
             report=said.append,
@@ -95,7 +95,7 @@ def trained(tmp_path_factory):
 
 def test_a_library_call_trains_runs_side_by_side(trained):
     folder, specs, results, seen, said = trained
-    assert [result.status for result in results] == ["finished", "diverged", "finished"]
+    assert [result.status for result in results] == ["finished", "failed", "finished"]
     assert seen == [1, 2, 3]
     assert "compiling for 3 runs side by side, of 3" in said[0]
     assert run_folder.read_spec(results[2].folder) == specs[2]
@@ -109,7 +109,7 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
     folder, _, results, _, _ = trained
     diverged = results[1].folder
     content = json.loads((diverged / "result.json").read_text())
-    assert (content["status"], content["epochs"], content["env_steps"]) == ("diverged", 2, 80)
+    assert (content["status"], content["epochs"], content["env_steps"]) == ("failed", 2, 80)
     assert "success_rate" not in content
     assert [row["epoch"] for row in rows_of(diverged)] == ["1"]
     assert not (diverged / "policy.npz").exists()
@@ -117,7 +117,7 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
     tables.write(folder, trials)
     with (folder / "finals.csv").open() as file:
         finals = {row["seed"]: row for row in csv.DictReader(file)}
-    assert {seed: row["status"] for seed, row in finals.items()} == {"0": "finished", "1": "diverged", "2": "finished"}
+    assert {seed: row["status"] for seed, row in finals.items()} == {"0": "finished", "1": "failed", "2": "finished"}
     assert finals["1"]["success_rate"] == ""
     for group in comparison.groups(trials)["point_mass:PointMass"]:
         assert group.diverged == (1 if group.others["her_k"] == 7 else 0)
@@ -137,7 +137,7 @@ def test_a_run_that_diverged_counts_as_a_failure_from_then_on():
     whole = {"settings": settings, "seed": 0, "status": "finished", "curve": curve}
     whole["final"] = {"success_rate": 0.8, "reset_success_rate": 0.1}
     cut = {name: values[:1] for name, values in curve.items()}
-    (group,) = comparison.groups([whole, {**whole, "seed": 1, "status": "diverged", "curve": cut, "final": {}}])["e"]
+    (group,) = comparison.groups([whole, {**whole, "seed": 1, "status": "failed", "curve": cut, "final": {}}])["e"]
     np.testing.assert_array_equal(group.success, [[0.5, 0.6, 0.7], [0.5, 0.0, 0.0]])
     np.testing.assert_array_equal(group.final, [0.8, 0.0])
     assert (group.diverged, group.at_reset) == (1, 0.1)
@@ -159,7 +159,7 @@ def test_runs_that_cannot_share_a_program_are_refused(tmp_path):
 def test_a_folder_that_another_program_trains_in_is_refused_before_anything_is_compiled(tmp_path, monkeypatch):
     monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))
     (tmp_path / "a").mkdir()
-    with files.lock(tmp_path / "a", run_folder.LOCK), pytest.raises(FolderError, match="being trained by another program"):
+    with held(tmp_path / "a"), pytest.raises(FolderError, match="being trained by another program"):
         mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "a"])
 
 

@@ -12,7 +12,7 @@ import pytest
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
 from mjx_dher.cli import sweep as cli_sweep
-from mjx_dher.runs import play, run_folder
+from mjx_dher.runs import identity, play, run_folder
 from point_mass import PointMass, soon
 
 TINY = """
@@ -194,7 +194,7 @@ def test_a_sweep_takes_them(folder, monkeypatch):
     monkeypatch.chdir(folder)
     _, (trial,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
     assert (trial.env, trial.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
-    assert run_folder.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
+    assert identity.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
     _, trials = cli_sweep.parse_sweep_args(
         [*OWN_PARTS, "--learner", "ddpg", "my_tasks:learner", "--seeds", "1", "--out", "sweep"]
     )
@@ -220,8 +220,8 @@ def test_what_has_no_model_is_not_rendered():
 
 def test_a_fresh_run_folder_s_name_is_one_of_a_file(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    path = run_folder.choose(None, RunSpec(env="my.Tasks:Mine", sampler="my.tasks:soon", seed=3))
-    assert path.name.startswith("my-tasks-mine-my-tasks-soon-s3-")
+    with run_folder.claim_new(None, RunSpec(env="my.Tasks:Mine", sampler="my.tasks:soon", seed=3)) as path:
+        assert path.name.startswith("my-tasks-mine-my-tasks-soon-s3-")
 
 
 def test_make_imports_it():

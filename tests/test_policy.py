@@ -150,15 +150,3 @@ def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, message):
 def test_no_folder(tmp_path):
     with pytest.raises(FolderError, match="nowhere is not a run folder: no such folder"):
         mjx_dher.load_policy(tmp_path / "nowhere")
-
-
-def test_a_folder_in_use_is_never_chosen(run_dir, tmp_path, monkeypatch):
-    with pytest.raises(FolderError, match=r"out: .* is there already and is never overwritten"):
-        run_folder.choose(run_dir, RunSpec())
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    assert run_folder.choose(empty, RunSpec()) == empty
-    monkeypatch.chdir(tmp_path)
-    first = run_folder.choose(None, RunSpec())
-    first.mkdir(parents=True)
-    assert run_folder.choose(None, RunSpec()) != first

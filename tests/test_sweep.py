@@ -9,16 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from filelock import Timeout
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, config
-from mjx_dher.host import files, memory
+from mjx_dher.host import memory
 from mjx_dher.host.files import FolderError
 from mjx_dher.runs import driver, loop, program
-from mjx_dher.runs.run_folder import trial_name
+from mjx_dher.runs.identity import trial_name
 from mjx_dher.sweeps import grid, tables
-from probes import PointMass
+from probes import PointMass, held
 
 OLD_NAMES = {"future": "ae61a35cbf", "weighted": "56c3ede079"}
 
@@ -41,7 +42,7 @@ def test_a_trial_s_name_is_that_of_an_earlier_version():
     sizes = {"num_envs": 2, "cycles_per_epoch": 2, "updates_per_cycle": 4, "target_period": 1, "batch_size": 16}
     static = config.Config(**sizes, total_steps=80, replay_size=100, hidden_sizes=(8, 8), eval_episodes=4)
     hparams = mjx_dher.preset("cpu", "push").hparams
-    names = [trial_name(RunSpec("point_mass:PointMass", sampler=s, config=static, hparams=hparams)) for s in OLD_NAMES]
+    names = [trial_name(RunSpec("point_mass:PointMass", sampler=s, config=static, hparams=hparams), {}) for s in OLD_NAMES]
     assert names == [f"point_mass-pointmass-{sampler}-s0-{digest}" for sampler, digest in OLD_NAMES.items()]
 
 
@@ -84,26 +85,26 @@ def test_shards_have_all_runs_between_them_and_whole_seeds_where_they_can(count)
         ]
 
 
-def test_a_run_that_another_program_trains_is_refused(tmp_path, monkeypatch):
+def test_a_run_that_another_program_trains_is_left_to_it(tmp_path, monkeypatch):
     trials = make_grid(seeds=(0, 1))
-    path = grid.folder_of(tmp_path, trials[3])
+    path = grid.folder_of(tmp_path, trials[0])
     path.mkdir(parents=True)
-    with files.lock(path, "lock"), pytest.raises(FolderError, match=f"{path.name} is being trained by another"):
-        run(tmp_path, trials, lanes=2)
-    assert not any(grid.is_done(tmp_path, trial) for trial in trials)  # refused before anything is compiled
-    held, finish = [], driver._finish
+    locked, finish = [], driver._finish
 
-    def look(session, compiled, progress, specs, folders, diverged):
+    def look(session, compiled, progress, specs, folders, *args):
         for folder in folders:
-            with pytest.raises(FolderError), files.lock(folder, "lock"):
+            with pytest.raises(Timeout), held(folder):
                 pass
-            held.append(folder)
-        return finish(session, compiled, progress, specs, folders, diverged)
+            locked.append(folder)
+        return finish(session, compiled, progress, specs, folders, *args)
 
     monkeypatch.setattr(driver, "_finish", look)
-    run(tmp_path, trials[2:], lanes=2)
-    assert held == [grid.folder_of(tmp_path, trial) for trial in trials[2:]]  # until their results are written
-    assert not list(tmp_path.glob("cells/*/lock"))
+    with held(path):
+        run(tmp_path, trials, lanes=2)
+    assert [grid.is_done(tmp_path, trial) for trial in trials] == [False, True, True, True]
+    assert locked == [grid.folder_of(tmp_path, trial) for trial in trials[1:]]  # until their results are written
+    run(tmp_path, trials, lanes=2)
+    assert locked[3:] == [path]
 
 
 def test_another_program_s_checkpoints_stay(tmp_path):
@@ -289,9 +290,13 @@ def test_what_is_no_sweep_is_named(tmp_path):
     run(tmp_path, trials)
     cell = grid.folder_of(tmp_path, trials[0])
     for name, content, message in (
-        ("metrics.csv", "epoch,success_rate\n", "is not a finished run of a sweep"),
-        ("result.json", "{", "is not a finished run of a sweep"),
+        (
+            "metrics.csv",
+            "epoch,success_rate\n",
+            "whole lines of 0 of 5 epochs; the sweep's command trains it again",
+        ),
         ("config.json", json.dumps({"schema": 0}), "is not of this program's schema 2"),
+        ("result.json", "{", r"result\.json is damaged"),
     ):
         (cell / name).write_text(content)
         with pytest.raises(FolderError, match=message):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -20,7 +19,6 @@ from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs import run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import Engine, RunSpec
@@ -185,16 +183,27 @@ def _parse_shard(text: str) -> tuple[int, int]:
 def sweep_command(argv: list[str], console: Console) -> int:
     """Trains a grid of runs."""
     args, trials = parse_sweep_args(argv)
+    files.make_folder(args.out / grid.CELLS)
+    for text in grid.changed_files(args.out, trials):
+        console.print(text, soft_wrap=True)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     done = f"; {len(trials) - len(todo)} of them are done already" if len(todo) < len(trials) else ""
     shard = "" if args.shard == "1/1" else f", shard {args.shard} of the sweep"
     console.print(f"{len(trials)} runs{shard}{done}; writing to {args.out}", soft_wrap=True)
-    if todo:
-        signum = _train(args, todo, console)
-        if left := sum(not grid.is_done(args.out, trial) for trial in trials):
-            console.print(f"stopped; {len(trials) - left} runs are done, and the same command goes on with the other {left}")
-            return 128 + (signum or signal.SIGINT)
+    signum = _train(args, todo, console) if todo else None
+    left = [trial for trial in todo if not grid.is_done(args.out, trial)]
+    if left and signum is not None:
+        ended = len(trials) - len(left)
+        console.print(f"stopped; {ended} runs are done, and the same command goes on with the other {len(left)}")
+        return 128 + signum
+    if len(left) == len(trials):
+        raise files.BusyError(f"{args.out}: all {len(left)} runs are being trained by another program")
     _write_tables(args, console)
+    if left:
+        raise files.BusyError(
+            f"{args.out}: {len(left)} of the {len(trials)} runs are being trained by another program, and not in the tables;"
+            " the same command writes them when that has ended"
+        )
     return 0
 
 
@@ -202,7 +211,6 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
     """Trains what is left; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
 
-    (args.out / grid.CELLS).mkdir(parents=True, exist_ok=True)
     prepare()
     stop, screen = Stop(console, args.out), Screen(console, todo)
     try:
@@ -225,7 +233,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
 def _write_tables(args: SweepArgs, console: Console) -> None:
     from mjx_dher.sweeps import comparison, tables
 
-    with files.lock(args.out / grid.CELLS, run_folder.LOCK, wait=True):  # another shard's program may be writing them
+    with files.lock(args.out / grid.CELLS, wait=True):  # another shard's program may be writing them
         trials = tables.read(args.out)
         tables.write(args.out, trials)
         _compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,11 +12,12 @@ from rich.console import Console
 
 from mjx_dher import envs, presets, spec
 from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags
+from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.host.files import FolderError
 from mjx_dher.names import check_name
 from mjx_dher.presets import PRESETS
-from mjx_dher.runs import run_folder
+from mjx_dher.runs import identity, results, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import RunSpec
@@ -52,6 +52,8 @@ class ResumeArgs:
     """Run folder."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
+    total_steps: int | None = None
+    """Environment steps of the whole run, those that were made included; as the run was started with unless given."""
     final_episodes: int | None = None
     """Episodes of the last evaluation; as the run was started with unless given."""
     checkpoint_every: int | None = None
@@ -65,10 +67,10 @@ class ResumeArgs:
 def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
     args = parse_train_args(argv)
-    folder = run_folder.choose(args.out, args.spec)
-    prepare()
-    env = envs.make(args.spec.env, engine=args.spec.engine)
-    return _train(env, args.spec, folder, args.options, console)
+    with run_folder.claim_new(args.out, args.spec) as folder:
+        prepare()
+        env = envs.make(args.spec.env, engine=args.spec.engine)
+        return _train(env, args.spec, folder, args.options, console)
 
 
 def resume_command(argv: list[str], console: Console) -> int:
@@ -77,20 +79,40 @@ def resume_command(argv: list[str], console: Console) -> int:
     args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
     check_engine(args.engine)
     content = run_folder.read_content(args.run)
+    with files.lock(args.run):
+        run, options = _to_resume(args, content, console)
+        prepare()
+        ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
+        return _train(envs.make(run.env, engine=args.engine or ran), run, args.run, options, console)
+
+
+def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
+    """Returns the run in a folder, which is locked, with what may be other than it was; refuses other changes by name.
+
+    Raises:
+      FolderError: the run has ended, has no checkpoint, or its settings were edited.
+      ValueError: an option that cannot be used.
+    """
     run = run_folder.to_spec(args.run, content)
+    edits = run_folder.edited(args.run, content, run)
+    if refused := [text for name, text in edits.items() if name not in identity.MAY_CHANGE]:
+        raise FolderError(
+            f"{args.run / run_folder.CONFIG_FILE} is not as the run wrote it, and a run goes on with what it began with:"
+            f" {'; '.join(refused)}"
+        )
+    if args.total_steps is not None:
+        run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
+    spec.validate(run, envs.list_envs())
     names = [field.name for field in dataclasses.fields(Options)]
     given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     options = Options(**{**{name: content[name] for name in names if name in content}, **given})
-    options = dataclasses.replace(options, log=tuple(options.log))
     options.check()
-    result = args.run / run_folder.RESULT_FILE
-    if result.exists() and json.loads(result.read_text()).get("status") != run_folder.DIVERGED:
+    if results.exists(args.run) and results.read(args.run)["status"] != run_folder.FAILED:
         raise FolderError(f"{args.run} has ended; there is nothing to go on with")
     run_folder.checkpoints_to_resume(args.run)
-    result.unlink(missing_ok=True)
-    prepare()
-    ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
-    return _train(envs.make(run.env, engine=args.engine or ran), run, args.run, options, console)
+    told = "; ".join(f"{name} {getattr(options, name)}" for name in names if name != "log")
+    console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}", soft_wrap=True)
+    return run, dataclasses.replace(options, log=tuple(options.log))
 
 
 def parse_train_args(argv: list[str]) -> TrainArgs:
@@ -129,6 +151,7 @@ def _parse(argv: list[str], preset: Any, env: str) -> TrainArgs:
 def _train(env: Any, run: RunSpec, folder: Path, options: Options, console: Console) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
     from mjx_dher.runs import driver
+    from mjx_dher.runs.claims import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
     stop, screen = Stop(console, folder), Screen(console, [run])
@@ -152,11 +175,8 @@ def _train(env: Any, run: RunSpec, folder: Path, options: Options, console: Cons
             soft_wrap=True,
         )
         return 128 + (stop.asked or 0)
-    if result.status == run_folder.DIVERGED:
-        raise ValueError(
-            f"epoch {result.epoch}: the networks or normalizers hold numbers that are not finite, so training"
-            f" was stopped (smaller actor_lr and critic_lr may help); {driver.last_checkpoint(folder)}"
-        )
+    if result.status == run_folder.FAILED:
+        raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")
     print_summary(result.content, console)
     console.print(f"run folder: {folder}", soft_wrap=True)
     return 0

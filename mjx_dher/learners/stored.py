@@ -38,11 +38,11 @@ class StoredPolicy:
         obs: Any = {"observation": observation, "desired_goal": goal}
         return self.learner.act(self.state, obs, self.hparams)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path, **extra: Any) -> None:
         """Writes the policy to `path`; what was there stays whole until the new file is."""
         arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
-            np.savez(file, sizes=np.array(self.sizes), **arrays)
+            np.savez(file, sizes=np.array(self.sizes), **arrays, **extra)
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> StoredPolicy:
@@ -55,7 +55,7 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> StoredPolicy
     learner = learners.make(spec.learner, spec.config, sizes, spec.networks)
     template = jax.eval_shape(learner.init, jax.random.key(0))
     leaves, treedef = jax.tree.flatten(template)
-    stored = [arrays[f"state{i:04d}"] for i in range(len(arrays) - 1)]
+    stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
         raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
     return StoredPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, sizes)

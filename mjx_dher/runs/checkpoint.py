@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import math
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,12 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.host import memory, private_api
+from mjx_dher.host import files, memory, private_api
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs.run_folder import CHECKPOINTS, checkpoints, checkpoints_to_resume, read_versioned
+from mjx_dher.runs.identity import sha256_of
+from mjx_dher.runs.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
 
 SCHEMA = 2
-MANIFEST = "manifest.json"
 _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
@@ -40,11 +41,22 @@ class Restored(NamedTuple):
     epoch: int  # epochs that had ended
     wall_seconds: float
     state: Any
-    refused: tuple[str, ...]  # why newer checkpoints were not used
+    runs: list[dict[str, Any]]  # `identity.identity` of each; none of an earlier version
+    refused: dict[Path, str]  # newer checkpoints that are not used, and why
 
 
-def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -> Path:
-    """Writes a checkpoint of the run in `folder`, and deletes all but the newest `keep`.
+def save(
+    folder: Path,
+    state: Any,
+    epoch: int,
+    wall_seconds: float,
+    keep: int,
+    runs: Sequence[Mapping[str, Any]] = (),
+    refused: Sequence[Path] = (),
+) -> Path:
+    """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
+
+    Those of later epochs go, too: the run did not go on from them.
 
     Args:
       folder: of the run.
@@ -52,6 +64,8 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
       epoch: epochs that have ended.
       wall_seconds: of training, so far.
       keep: at least 1.
+      runs: `identity.identity` of the run, or of each of those side by side.
+      refused: checkpoints that cannot be used, which go.
 
     Raises:
       CheckpointError: it cannot be written; earlier ones are as they were.
@@ -59,9 +73,9 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
     parent = folder / CHECKPOINTS
     target, partial = parent / f"epoch-{epoch:06d}", parent / f"{_PARTIAL}{epoch:06d}"
     try:
-        parent.mkdir(exist_ok=True)
+        files.make_folder(parent)
         for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
-            shutil.rmtree(left)
+            files.remove(left)
         leaves = _to_arrays(state)
         needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(parent).free
         if needed > free:
@@ -71,19 +85,20 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
             "schema": SCHEMA,
             "epoch": epoch,
             "wall_seconds": wall_seconds,
+            "runs": list(runs),
             "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
             "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
         }
         with (partial / MANIFEST).open("w") as file:
-            json.dump({**content, "sha256": digest_of(content)}, file, indent=1)
-        for path in _files(partial):
-            _flush(path)
-        if target.exists():
-            shutil.rmtree(target)
+            json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
+        files.flush_all(partial)
+        if target.exists() or target.is_symlink():
+            files.remove(target)
         partial.rename(target)
-        _flush(parent)
-        for old in checkpoints(folder)[keep:]:
-            shutil.rmtree(old)
+        files.flush(parent)
+        whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
+        for old in set(checkpoints(folder)) - {target, *whole[: keep - 1]}:
+            files.remove(old)
     except Exception as error:  # orbax raises errors of its own, of many kinds
         shutil.rmtree(partial, ignore_errors=True)
         kept = checkpoints(folder)
@@ -94,25 +109,28 @@ def save(folder: Path, state: Any, epoch: int, wall_seconds: float, keep: int) -
     return target
 
 
-def restore(folder: Path, template: Any) -> Restored:
+def restore(folder: Path, template: Any, last_epoch: float = math.inf) -> Restored:
     """Returns the newest checkpoint of the run in `folder` that is whole.
 
     Args:
       folder: of the run.
       template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
+      last_epoch: up to which metrics.csv goes; later checkpoints are not used.
 
     Raises:
       FolderError: there is none.
       CheckpointError: says why each that is there cannot be used.
     """
-    refused: list[str] = []
+    refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
         try:
+            if epoch_of(path) > last_epoch:
+                raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {last_epoch}")
             manifest, state = _load(path, template)
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, tuple(refused))
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest.get("runs", []), refused)
         except FolderError as error:
-            refused.append(str(error))
-    raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused))
+            refused[path] = str(error)
+    raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
 
 
 def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
@@ -124,6 +142,8 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
             raise CheckpointError(f"{path} is damaged: {name} cannot be read ({error.strerror})") from error
         if digest_now != digest:
             raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
+    if manifest["epoch"] != epoch_of(path):
+        raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
     saved = {name: [name, shape, dtype] for name, shape, dtype in manifest["leaves"]}
     arrays = dict(zip(saved, _read_arrays(path / _STATE, len(saved))))
     for name, array in arrays.items():
@@ -176,7 +196,7 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         content = read_versioned(path / MANIFEST, 1, SCHEMA)
     except FileNotFoundError:
         raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
-    if content.pop("sha256", None) != digest_of(content):
+    if content.pop("sha256", None) != sha256_of(content):
         raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
     return content
 
@@ -193,20 +213,6 @@ def _files(folder: Path) -> list[Path]:
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def digest_of(content: Any) -> str:
-    """Returns the SHA-256 of what JSON can hold."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _flush(path: Path) -> None:
-    """Flushes a file onto the disk, so that a name never stands for missing content."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _is_key(leaf: Any) -> bool:

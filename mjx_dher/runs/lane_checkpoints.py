@@ -15,7 +15,8 @@ import jax.numpy as jnp
 
 from mjx_dher.host import files
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs import checkpoint, run_folder
+from mjx_dher.runs import checkpoint, identity, run_folder, sinks
+from mjx_dher.runs.checkpoint import Restored
 from mjx_dher.runs.loop import Progress, Start
 from mjx_dher.trainer import TrainState
 
@@ -32,6 +33,8 @@ class LaneCheckpoints:
     keep: int
     restart: bool  # begin anew where no checkpoint can be used, rather than raise
     report: Callable[[str], None]
+    runs: Sequence[dict[str, Any]]  # `identity.identity` of each
+    refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
 
     @property
     def names(self) -> list[str]:
@@ -41,7 +44,7 @@ class LaneCheckpoints:
     @property
     def folder(self) -> Path:
         """Folder that holds `checkpoints/`."""
-        shared = self.shared / checkpoint.digest_of([self.lanes, *self.names])[:10]
+        shared = self.shared / identity.sha256_of([self.lanes, *self.names])[:10]
         return shared if self.lanes > 1 or shared.exists() else self.folders[0]
 
     def restore(self, init: Callable[[], TrainState]) -> Start:
@@ -57,17 +60,30 @@ class LaneCheckpoints:
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
         del state  # there may be no memory for two
         try:
-            restored = checkpoint.restore(self.folder, template)
+            restored = checkpoint.restore(self.folder, template, min(map(sinks.whole_epochs, self.folders)))
+            self._compare(restored)
         except FolderError as error:
             if not self.restart:
                 raise
             self.report(f"{error}; training these runs from their start")
+            self.refused.extend(run_folder.checkpoints(self.folder))
             return Start(init())
-        for why in restored.refused:
+        for path, why in restored.refused.items():
             self.report(f"not used: {why}")
+            self.refused.append(path)
         self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
         # A lane's number for its sampler depends on which others are left.
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
+
+    def _compare(self, restored: Restored) -> None:
+        """Reports settings that have changed since the checkpoint was made and may; raises FolderError for others."""
+        changed: dict[str, str] = {}
+        for before, now in zip(restored.runs, self.runs):
+            changed |= identity.differences(before, now)
+        if refused := [text for name, text in changed.items() if name not in identity.MAY_CHANGE]:
+            raise FolderError(f"{restored.path} is of a run with other settings: {'; '.join(refused)}")
+        for text in changed.values():
+            self.report(f"since {restored.path}: {text}")
 
     def save(self, progress: Progress) -> Path:
         """Writes a checkpoint and returns its path.
@@ -77,9 +93,14 @@ class LaneCheckpoints:
         """
         folder = self.folder
         if folder not in self.folders:
-            folder.mkdir(parents=True, exist_ok=True)
+            files.make_folder(folder)
             files.write_json(folder / NAMES_FILE, {"cells": self.names})
-        return checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep)
+        for run in self.folders:
+            sinks.flush(run)  # a checkpoint is of no use without the lines before it
+        runs, refused = self.runs, tuple(self.refused)
+        path = checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep, runs, refused)
+        self.refused.clear()
+        return path
 
     def try_save(self, progress: Progress) -> None:
         """Writes a checkpoint. One that cannot be written is reported, and costs nothing else."""
@@ -90,12 +111,19 @@ class LaneCheckpoints:
 
     def clear(self) -> None:
         """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay."""
-        shutil.rmtree(self.folders[0] / run_folder.CHECKPOINTS, ignore_errors=True)
-        ended = {folder.name for folder in self.folders}
+        for path in {self.folder, self.folders[0] / run_folder.CHECKPOINTS} - {self.folders[0]}:
+            shutil.rmtree(path, ignore_errors=True)
         for path in self.shared.glob(f"*/{NAMES_FILE}"):
-            names = json.loads(path.read_text())["cells"]
-            ended |= {name for name in names if (self.folders[0].parent / name / run_folder.RESULT_FILE).exists()}
-            if ended.issuperset(names):
+            names = _names(path)
+            if names and all((self.folders[0].parent / name / run_folder.RESULT_FILE).exists() for name in names):
                 shutil.rmtree(path.parent, ignore_errors=True)
         with contextlib.suppress(OSError):  # not empty, or never made
             self.shared.rmdir()
+
+
+def _names(path: Path) -> list[str]:
+    """Returns the names of the runs that share a checkpoint; none where another program has just removed it."""
+    try:
+        return list(json.loads(path.read_text())["cells"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

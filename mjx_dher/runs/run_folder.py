@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
-import hashlib
 import json
 import platform
-import re
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mjx_dher import __version__
+from mjx_dher import spec as spec_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.host.files import FolderError, write_json
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import identity
+from mjx_dher.runs.identity import in_a_path
 from mjx_dher.spec import RunSpec
 
 SCHEMA = 2
@@ -22,65 +29,41 @@ METRICS_FILE = "metrics.csv"
 POLICY_FILE = "policy.npz"
 RESULT_FILE = "result.json"
 CHECKPOINTS = "checkpoints"
-LOCK = "lock"
+MANIFEST = "manifest.json"  # of a checkpoint
 
 # Statuses in result.json.
 FINISHED = "finished"
-DIVERGED = "diverged"
-
-RENAMED = {"eventful_share": "priority_fraction"}  # HParams of schema 1, and what they are called now
-# Settings of schema 1. Later ones are part of a run's digest only where they differ from their defaults, so that the trials of
-# an older sweep keep their names.
-_FIRST_SETTINGS = frozenset(
-    (
-        *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
-        *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype", "learner_kernels"),
-        *("eval_episodes", "actor_lr", "critic_lr", "lr_end", "gamma", "polyak", "action_l2", "random_eps", "noise_std"),
-        *("her_k", "priority_fraction", "epsilon", "temperature", "obs_clip", "norm_clip", "norm_eps"),
-    )
-)
+FAILED = "failed"
 
 
-def choose(out: Path | None, spec: RunSpec) -> Path:
-    """Returns the folder for a new run: `out`, else a fresh one under runs/. Nothing is created.
+@contextlib.contextmanager
+def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
+    """Makes and locks the folder for a new run: `out`, else a fresh one under runs/. It goes again if nothing is written to it.
 
     Raises:
-      FolderError: `out` exists and is not an empty folder.
+      FolderError: `out` is something else than an empty folder, or another program has it.
+      OSError: it cannot be made or written to.
     """
-    if out is None:
-        now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-        name = f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{now}"
-        paths = (Path("runs") / (name + suffix) for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
-        return next(path for path in paths if not path.exists())
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FolderError(f"out: {out} is there already and is never overwritten; name a new or empty folder")
-    return out
+    if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
+        raise FolderError(f"out: {out} is there already and is no folder")
+    while True:
+        folder = _fresh(spec) if out is None else out
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(files.new_folder(folder))
+            except FolderError:
+                if out is not None:
+                    raise
+                continue  # another program has just taken it
+            yield folder
+            return
 
 
-def in_a_path(name: str) -> str:
-    """Returns the name of an environment or a sampler as a part of a file's: "Tasks:Mine" is tasks-mine."""
-    return re.sub(r"[^a-z0-9_]+", "-", name.lower())
-
-
-def trial_name(spec: RunSpec) -> str:
-    """Returns the name of a trial's folder: readable settings plus a digest of every setting."""
-    values = settings(spec)
-    defaults = settings(RunSpec())
-    kept = {name: value for name, value in values.items() if name in _FIRST_SETTINGS or value != defaults[name]}
-    old_names = {new: old for old, new in RENAMED.items()}
-    numbers = {old_names.get(name, name): kept.pop(name) for name in HParams._fields if name in kept}
-    digest = hashlib.sha256(json.dumps([1, kept, numbers, spec.seed], sort_keys=True).encode()).hexdigest()[:10]
-    return f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{digest}"
-
-
-def settings(spec: RunSpec) -> dict[str, Any]:
-    """Returns all settings of a run by name, the seed left out."""
-    parts = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
-    return {
-        **{name: value for name, value in parts.items() if name not in ("config", "hparams", "seed")},
-        **dataclasses.asdict(spec.config),
-        **spec.hparams._asdict(),
-    }
+def _fresh(spec: RunSpec) -> Path:
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    name = f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{now}"
+    paths = (Path("runs") / (name + suffix) for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
+    return next(path for path in paths if not path.exists())
 
 
 def engine_name(env: Any) -> str:
@@ -96,18 +79,14 @@ def create(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> Non
       spec: the run's description.
       engine: the physics that runs, where `spec.engine` may say auto.
       extra: written, too, for the reader and for `resume`.
-
-    Raises:
-      FolderError: the folder cannot be made or written to.
     """
     hparams = {name: float(value) for name, value in spec.hparams._asdict().items()}
     description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     description |= {"config": dataclasses.asdict(spec.config), "hparams": hparams}
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        write_json(path / CONFIG_FILE, {"schema": SCHEMA, **description, "physics": engine, **extra, "versions": _versions()})
-    except OSError as error:
-        raise FolderError(f"out: cannot create {path} ({error.strerror})") from error
+    own = identity.sources(spec)
+    run = {"physics": engine, "sources": own, "digest": identity.digest(identity.identity(spec, engine, own))}
+    files.make_folder(path)
+    files.write_json(path / CONFIG_FILE, {"schema": SCHEMA, **description, **run, **extra, "versions": _versions()})
 
 
 def _versions() -> dict[str, str]:
@@ -119,7 +98,13 @@ def _versions() -> dict[str, str]:
 
 def checkpoints(path: Path) -> list[Path]:
     """Returns the checkpoints of the run in `path`, the newest first."""
-    return sorted((path / CHECKPOINTS).glob("epoch-*"), reverse=True)
+    paths = (path / CHECKPOINTS).glob("epoch-*")
+    return sorted((path for path in paths if path.name[6:].isdecimal()), key=epoch_of, reverse=True)
+
+
+def epoch_of(checkpoint: Path) -> int:
+    """Returns the epochs that had ended when a checkpoint was made, by its name."""
+    return int(checkpoint.name[6:])
 
 
 def checkpoints_to_resume(path: Path) -> list[Path]:
@@ -175,7 +160,7 @@ def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
     """Returns the content of schema 1 in that of schema 2: the parts left `config`, and a number got another name."""
     config = dict(content["config"])
     parts = {name: config.pop(name) for name in ("env", "engine", "sampler", "weight_kernel", "metric")}
-    hparams = {RENAMED.get(name, name): value for name, value in content["hparams"].items()}
+    hparams = {identity.RENAMED.get(name, name): value for name, value in content["hparams"].items()}
     return {**content, "schema": SCHEMA, **parts, "physics": content["engine"], "config": config, "hparams": hparams}
 
 
@@ -183,9 +168,54 @@ def read_spec(path: Path) -> RunSpec:
     """Returns the description of the run in `path`.
 
     Raises:
-      FolderError: no run folder, or one of another schema; the message says which.
+      FolderError: no run folder, one of another schema, or a config.json that was edited; the message says which.
     """
-    return to_spec(path, read_content(path))
+    return read(path)[1]
+
+
+def read(path: Path) -> tuple[dict[str, Any], RunSpec]:
+    """Returns config.json of the run in `path`, and the description in it.
+
+    Raises:
+      FolderError: as for `read_spec`.
+    """
+    content = read_content(path)
+    spec = to_spec(path, content)
+    if edits := edited(path, content, spec):
+        raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
+    return content, spec
+
+
+def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
+    """Returns the `identity` of the run that config.json describes."""
+    return identity.identity(spec, content["physics"], content.get("sources", {}))
+
+
+def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
+    """Returns which settings in config.json are not those that the run was trained with, by name, as a reader is told.
+
+    Its policy knows them, or else its newest checkpoint; those of earlier versions do not.
+    """
+    now, written = identity_of(content, spec), written_identity(path)
+    changed = {} if written is None else identity.differences(written, now)
+    if content.get("digest", identity.digest(now)) == identity.digest(now):  # by `resume`, if at all
+        return {name: text for name, text in changed.items() if name not in identity.MAY_CHANGE}
+    return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {identity.digest(now)}"}
+
+
+def written_identity(path: Path) -> dict[str, Any] | None:
+    """Returns the `identity` that the run's newest checkpoint has, or else its policy; None where neither can tell."""
+    for checkpoint in checkpoints(path):
+        try:
+            (content,) = read_versioned(checkpoint / MANIFEST, 2)["runs"]
+            return dict(content)
+        except (OSError, ValueError, KeyError, TypeError):  # damaged, or of an earlier version
+            continue
+    try:
+        with np.load(path / POLICY_FILE, allow_pickle=False) as arrays:
+            return dict(json.loads(arrays["settings"].tobytes()))
+    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile):
+        return None
 
 
 def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
@@ -197,10 +227,12 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
     try:
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
-        return RunSpec(
+        spec = RunSpec(
             config=Config(**config),
             hparams=HParams(**content["hparams"]),
             **{name: content[name] for name in fields if name in content},
         )
+        spec_lib.validate_values(spec)
+        return spec
     except (KeyError, TypeError, ValueError) as error:
         raise FolderError(f"{path / CONFIG_FILE} does not describe a run ({error})") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import hashlib
+import itertools
 import json
 import math
 import os
@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mjx_dher.host import memory
-from mjx_dher.host.files import FolderError, atomic_write
+from mjx_dher.host import files, memory
+from mjx_dher.host.files import FolderError
 from mjx_dher.names import check_name, require_extra
-from mjx_dher.runs import run_folder
+from mjx_dher.runs import identity, run_folder
 from mjx_dher.runs.run_folder import METRICS_FILE
 
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
@@ -22,6 +22,8 @@ COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
 FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
 OLD_NAMES = {"eventful_share": "priority_mean"}  # metrics of earlier versions, and what they are called now
 LOGS = ("jsonl", "tensorboard", "wandb")
+JSON_FILE = "metrics.jsonl"
+DIGEST = "digest"  # the last column of metrics.csv
 
 
 class Sink(Protocol):
@@ -33,60 +35,115 @@ class Sink(Protocol):
 
 
 class CsvSink:
-    """metrics.csv: one line an epoch, on disk before the next begins.
+    """metrics.csv: one line an epoch, handed to the system before the next begins. Its last column is the run's digest.
 
     Args:
       path: of the file.
       epochs: of a run that is resumed, those that had ended; their lines stay, and later ones go.
+      digest: of the run's settings; see `identity.digest`.
 
     Raises:
       FolderError: the file has not the lines of all these epochs.
     """
 
-    def __init__(self, path: Path, epochs: int = 0):
+    def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
         self._writer: csv.DictWriter[str] | None = None
-        kept = _keep_lines(path, 1 + epochs if epochs else 0)
-        if kept and [line.split(",")[0] for line in kept] != ["epoch", *map(str, range(1, 1 + epochs))]:
-            raise FolderError(f"{path} is damaged: it has not the lines of all {epochs} epochs that had ended")
+        self._digest = digest
+        kept = _whole_lines(path)[: 1 + epochs] if epochs else []
+        if epochs and len(kept) != 1 + epochs:
+            whole = max(0, len(kept) - 1)
+            raise FolderError(f"{path} is damaged: {epochs} epochs had ended, and it has whole lines of {whole}")
+        _write(path, kept)
         self._file = path.open("a", newline="")
         if kept:
-            self._writer = csv.DictWriter(self._file, [OLD_NAMES.get(name, name) for name in kept[0].strip().split(",")])
+            self._writer = self._make_writer([OLD_NAMES.get(name, name) for name in kept[0].strip().split(",")])
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:
-            columns = [*FIRST_COLUMNS, *(name for name in row if name not in FIRST_COLUMNS)]
-            self._writer = csv.DictWriter(self._file, columns)
+            self._writer = self._make_writer([*FIRST_COLUMNS, *(name for name in row if name not in FIRST_COLUMNS), DIGEST])
             self._writer.writeheader()
-        self._writer.writerow({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()})
+        values = {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
+        self._writer.writerow({**values, DIGEST: self._digest})
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
+
+    def _make_writer(self, columns: Sequence[str]) -> csv.DictWriter[str]:
+        # The file of a run that an earlier version began goes on with the columns that it has.
+        return csv.DictWriter(self._file, columns, extrasaction="ignore")
 
 
 class JsonlSink:
-    """metrics.jsonl: an object a line, an epoch each; numbers that are not finite are null. See `CsvSink`."""
+    """metrics.jsonl: an object a line, an epoch each; numbers that are not finite are null.
+
+    Args:
+      path: of the file.
+      epochs: of a run that is resumed, those that had ended; lines that are missing are made of metrics.csv beside it.
+    """
 
     def __init__(self, path: Path, epochs: int = 0):
-        _keep_lines(path, epochs)
+        lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) if epochs and path.exists() else []
+        whole = list(itertools.takewhile(lambda line: line.endswith("}\n"), lines))[:epochs]
+        missing = read_rows(path.with_name(METRICS_FILE))[len(whole) : epochs] if epochs else []
+        _write(path, [*whole, *map(_to_json, missing)])
         self._file = path.open("a")
 
     def write(self, row: dict[str, Any]) -> None:
-        self._file.write(json.dumps({name: v if math.isfinite(v) else None for name, v in row.items()}) + "\n")
+        self._file.write(_to_json(row))
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
 
 
-def _keep_lines(path: Path, count: int) -> list[str]:
-    """Cuts a file after `count` lines, or makes it, and returns them."""
-    lines = path.read_bytes().decode().splitlines(keepends=True)[:count] if count and path.exists() else []
-    if len(lines) < count or not all(line.endswith("\n") for line in lines):
-        raise FolderError(f"{path} is damaged: it has {len(lines)} whole lines, not {count}")
-    with atomic_write(path) as partial:
+def whole_epochs(folder: Path) -> int:
+    """Returns up to which epoch metrics.csv in `folder` has whole lines; 0 where there is none."""
+    return max(0, len(_whole_lines(folder / METRICS_FILE)) - 1)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Returns the whole lines of a metrics.csv as numbers by today's names, the digest as it is."""
+    head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
+    names = [OLD_NAMES.get(name, name) for name in head]
+    return [{name: x if name == DIGEST else _to_number(x) for name, x in zip(names, line)} for line in lines]
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Returns the head of metrics.csv, and its lines up to the first that is cut, or of another epoch than is due."""
+    if not path.exists():
+        return []
+    head, *lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) or [""]
+    columns = head.count(",")
+    if not head.startswith(",".join(FIRST_COLUMNS) + ","):
+        return []
+    whole = itertools.takewhile(
+        lambda i: lines[i].startswith(f"{i + 1},") and lines[i].endswith("\n") and lines[i].count(",") == columns,
+        range(len(lines)),
+    )
+    return [head, *(lines[i] for i in whole)]
+
+
+def _write(path: Path, lines: Sequence[str]) -> None:
+    with files.atomic_write(path) as partial:
         partial.write_bytes("".join(lines).encode())
-    return lines
+        files.flush(partial)
+
+
+def _to_number(text: str) -> int | float:
+    return int(text) if text.isdigit() else float(text)
+
+
+def _to_json(row: dict[str, Any]) -> str:
+    return json.dumps({name: v if math.isfinite(v) else None for name, v in row.items() if name != DIGEST}) + "\n"
+
+
+def flush(folder: Path) -> None:
+    """Flushes what CSV and JSON lines have of the run in `folder` onto the disk."""
+    for name in (METRICS_FILE, JSON_FILE):
+        if (folder / name).exists():
+            files.flush(folder / name)
+    files.flush(folder)
 
 
 class TensorBoardSink:
@@ -119,15 +176,17 @@ class WandbSink:
         import wandb
 
         run = run_folder.to_spec(folder, content)
-        written = json.loads((folder / run_folder.CONFIG_FILE).read_text())  # as it was, whatever version wrote it
-        identity = hashlib.sha256(json.dumps([folder.absolute().name, written], sort_keys=True).encode()).hexdigest()[:16]
+        # What a run can be resumed with has no part in its name; earlier versions named it after all of config.json.
+        described = {name: x for name, x in run_folder.identity_of(content, run).items() if name not in identity.MAY_CHANGE}
+        if "digest" not in content:
+            described = json.loads((folder / run_folder.CONFIG_FILE).read_text())
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
             name=folder.absolute().name,
-            id=identity,
+            id=identity.sha256_of([folder.absolute().name, described])[:16],
             resume="allow",
             dir=folder,
-            config={**run_folder.settings(run), "seed": run.seed, "engine": content["physics"]},
+            config={**identity.settings(run), "seed": run.seed, "engine": content["physics"]},
             settings=wandb.Settings(silent=True),
         )
 
@@ -153,14 +212,14 @@ def check(logs: Sequence[str]) -> None:
             require_extra(f"log {log}", EXTRAS[log], log)
 
 
-def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0) -> list[Sink]:
+def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0, digest: str = "") -> list[Sink]:
     """Opens metrics.csv, and `logs`, of the run in `folder`, of which so many epochs and environment steps had ended."""
     makers: dict[str, Callable[[], Sink]] = {
-        "jsonl": lambda: JsonlSink(folder / "metrics.jsonl", epochs),
+        "jsonl": lambda: JsonlSink(folder / JSON_FILE, epochs),
         "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
         "wandb": lambda: WandbSink(folder, run_folder.read_content(folder)),
     }
-    return [CsvSink(folder / METRICS_FILE, epochs), *(makers[log]() for log in dict.fromkeys(logs))]
+    return [CsvSink(folder / METRICS_FILE, epochs, digest), *(makers[log]() for log in dict.fromkeys(logs))]
 
 
 def row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mjx_dher import stats
 from mjx_dher.host import files
-from mjx_dher.runs.run_folder import DIVERGED
+from mjx_dher.runs.run_folder import FAILED
 from mjx_dher.spec import SAMPLERS, reads
 
 COMPARISON = "comparison.csv"
@@ -79,7 +79,7 @@ def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, 
         sampler=trials[0]["settings"]["sampler"],
         others=others,
         seeds=tuple(trial["seed"] for trial in trials),
-        diverged=sum(trial["status"] == DIVERGED for trial in trials),
+        diverged=sum(trial["status"] == FAILED for trial in trials),
         epoch=np.array(longest["epoch"]),
         env_steps=np.array(longest["env_steps"]),
         seconds=np.mean(whole or [longest["wall_seconds"]], axis=0),

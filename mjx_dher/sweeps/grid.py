@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_dher.config import HParams
-from mjx_dher.runs import run_folder
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import identity, results, run_folder
 from mjx_dher.spec import RunSpec, reads
 
 CELLS = "cells"
@@ -47,9 +48,33 @@ def shard(specs: Sequence[RunSpec], index: int, count: int) -> list[RunSpec]:
 
 def folder_of(sweep: Path, spec: RunSpec) -> Path:
     """Returns the run folder of a trial."""
-    return sweep / CELLS / run_folder.trial_name(spec)
+    folder = sweep / CELLS / identity.trial_name(spec)
+    earlier = sweep / CELLS / identity.trial_name(spec, own_sources={})  # of a version that did not look at own code
+    return earlier if earlier.exists() and not folder.exists() else folder
 
 
 def is_done(sweep: Path, spec: RunSpec) -> bool:
-    """Returns whether the trial has ended."""
-    return (folder_of(sweep, spec) / run_folder.RESULT_FILE).exists()
+    """Returns whether the trial has ended, and its result can be believed."""
+    return results.is_whole(folder_of(sweep, spec))
+
+
+def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
+    """Returns what a reader is told of own code that is not what trials in the folder were trained with."""
+    now = {(field, getattr(spec, field)): source for spec in specs for field, source in identity.sources(spec).items()}
+    told: dict[str, int] = {}
+    for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
+        try:
+            content = run_folder.read_content(path.parent)
+        except FolderError:
+            continue  # whoever reads its result will say so
+        for (field, value), source in now.items():
+            if content.get(field) == value:
+                before = content.get("sources", {}).get(field)
+                if before is None:
+                    text = f"whether {source.split()[0]} ({field} {value}) has changed is not known of"
+                elif before != source:
+                    text = f"{source.split()[0]} ({field} {value}) has changed since"
+                else:
+                    continue
+                told[text] = told.get(text, 0) + 1
+    return [f"{text} {count} of the runs in {sweep}" for text, count in told.items()]

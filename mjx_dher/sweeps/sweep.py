@@ -44,7 +44,8 @@ def run(
       on_epoch: called after every epoch of those side by side.
 
     Returns:
-      A Result each; fewer than `specs` where the sweep was stopped before their turn.
+      A Result of each that was trained: not of those that have ended already, that another program is at work on, or whose
+      turn had not come when the sweep was stopped.
 
     Raises:
       ValueError: as `train_runs`.
@@ -61,7 +62,7 @@ def run(
             options=options,
             lanes=lanes,
             shared=folder / UNFINISHED,
-            restart=True,
+            sweep=True,
             should_stop=should_stop,
             report=report,
             on_epoch=on_epoch,

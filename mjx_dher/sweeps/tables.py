@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from mjx_dher.host.files import FolderError, atomic_write
-from mjx_dher.runs import run_folder
-from mjx_dher.runs.run_folder import DIVERGED, FINISHED
-from mjx_dher.runs.sinks import OLD_NAMES
+from mjx_dher.runs import identity, results, run_folder, sinks
+from mjx_dher.runs.run_folder import FAILED
 from mjx_dher.sweeps.grid import CELLS
 
 RESULTS = "results.csv"
@@ -24,11 +22,11 @@ _FINAL = ("success_rate", "reset_success_rate", "return_mean", "episodes")
 def read(folder: Path) -> list[dict[str, Any]]:
     """Returns the trials of a sweep that have ended.
 
-    Each has settings (by name), seed, engine (that ran), lanes, status; curve, lists by column; and final, the last evaluation,
-    empty for a run that diverged.
+    Each has its folder, settings (by name; with the engine that ran, and `source`, the files of its own code), seed, lanes,
+    status and reason; curve, lists by column; and final, the last evaluation, empty for a run that failed.
 
     Raises:
-      FolderError: no sweep, none ended, or a folder that cannot be read.
+      FolderError: no sweep, none ended, or a trial that cannot be believed (`results.problem`).
     """
     paths = sorted(path.parent for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}"))
     if not paths:
@@ -38,28 +36,29 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 
 def _read_trial(path: Path) -> dict[str, Any]:
-    content = run_folder.read_content(path)
-    spec = run_folder.to_spec(path, content)
+    if (problem := results.problem(path)) is not None:
+        raise FolderError(f"{problem}; the sweep's command trains it again, or remove the folder")
+    result, (content, spec) = results.read(path), run_folder.read(path)
+    failed = result["status"] == FAILED
     try:
-        result = json.loads((path / run_folder.RESULT_FILE).read_text())
-        with (path / run_folder.METRICS_FILE).open() as file:
-            rows = list(csv.DictReader(file))
-        status = result.get("status", FINISHED)
-        columns = rows[0] if rows or status != DIVERGED else {}
+        rows = sinks.read_rows(path / run_folder.METRICS_FILE)
+        columns = [name for name in (rows[0] if rows else ()) if name != sinks.DIGEST]
         return {
-            "settings": {**run_folder.settings(spec), "engine": content["physics"]},
+            "folder": path,
+            "settings": {
+                **identity.settings(spec),
+                "engine": content["physics"],
+                "source": ", ".join(dict.fromkeys(content.get("sources", {}).values())),
+            },
             "seed": spec.seed,
-            "status": status,
+            "status": result["status"],
+            "reason": result["reason"],
             "lanes": result["lanes"],
-            "final": {name: _short(result[name]) for name in _FINAL} if status != DIVERGED else {},
-            "curve": {OLD_NAMES.get(name, name): [_number(row[name]) for row in rows] for name in columns},
+            "final": {} if failed else {name: _short(result[name]) for name in _FINAL},
+            "curve": {name: [row[name] for row in rows] for name in columns},
         }
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise FolderError(f"{path} is not a finished run of a sweep ({type(error).__name__}: {error})") from error
-
-
-def _number(text: str) -> int | float:
-    return int(text) if text.isdigit() else float(text)
 
 
 def _short(value: float) -> float:

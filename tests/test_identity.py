@@ -1,0 +1,377 @@
+"""What is written can be believed: settings and own code that changed, damage, and what a power cut leaves."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+from sweep_helpers import LONGER, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
+from test_driver import CONFIG, rows_of
+
+import mjx_dher
+from mjx_dher import HParams, RunSpec, cli, envs
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import checkpoint, identity, run_folder, sinks
+from mjx_dher.sweeps import grid, tables
+
+SPEC = RunSpec(env="point_mass:PointMass", config=dataclasses.replace(CONFIG, total_steps=240))  # 6 epochs
+
+
+def train(folder, spec=SPEC, until=None, keep=2):
+    """Trains `spec` into `folder`, to its end or until an epoch; returns what is reported."""
+    seen, told = [], []
+    mjx_dher.train_runs(
+        envs.make(spec.env),
+        [spec],
+        [folder],
+        options=mjx_dher.Options(final_episodes=4, checkpoint_every=2, keep=keep),
+        report=told.append,
+        on_epoch=lambda specs, progress: seen.append(progress.epoch),
+        should_stop=lambda: seen[-1] == until,
+    )
+    return told
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """`run`, stopped after four of six epochs, with checkpoints of epochs 2 and 4, and `whole`, which was not stopped."""
+    folder = tmp_path_factory.mktemp("identity")
+    train(folder / "run", until=4)
+    train(folder / "whole")
+    return folder
+
+
+@pytest.fixture
+def stopped(made, tmp_path):
+    return shutil.copytree(made / "run", tmp_path / "run")
+
+
+@pytest.fixture
+def whole(made, tmp_path):
+    return shutil.copytree(made / "whole", tmp_path / "whole")
+
+
+def edit(folder, path, value, name="config.json"):
+    """Changes what `path`, names, leads to in config.json; removes it where `value` is None."""
+    content = json.loads((folder / name).read_text())
+    inner = content
+    for part in path[:-1]:
+        inner = inner[part]
+    if value is None:
+        del inner[path[-1]]
+    else:
+        inner[path[-1]] = value
+    (folder / name).write_text(json.dumps(content))
+
+
+def resume(folder, capsys, *flags):
+    status = cli.main(["resume", str(folder), *flags])
+    output = capsys.readouterr()
+    return status, output.out + output.err
+
+
+def test_all_files_of_a_run_carry_one_digest(made):
+    digests = set()
+    for folder in (made / "run", made / "whole"):
+        content, spec = run_folder.read(folder)
+        assert spec == SPEC
+        digests |= {content["digest"], identity.digest(run_folder.identity_of(content, spec))}
+        digests |= {row["digest"] for row in sinks.read_rows(folder / "metrics.csv")}
+        with np.load(folder / "policy.npz") as arrays:
+            digests.add(identity.digest(json.loads(arrays["settings"].tobytes())))
+    digests.add(json.loads((made / "whole" / "result.json").read_text())["digest"])
+    for path in run_folder.checkpoints(made / "run"):
+        (run,) = json.loads((path / "manifest.json").read_text())["runs"]
+        digests.add(identity.digest(run))
+    assert len(digests) == 1
+    other = dataclasses.replace(SPEC, hparams=HParams(gamma=0.97))
+    assert identity.digest(identity.identity(other, "none", identity.sources(other))) not in digests
+
+
+# Of each field, another value that is allowed. `wrong` below makes one of another type.
+EDITS = {
+    ("env",): "probes:Clock",
+    ("engine",): "native",
+    ("sampler",): "final",
+    ("weight_kernel",): "softmax",
+    ("metric",): "mjx_dher.samplers:position",
+    ("priority",): "mjx_dher.priorities:eventful",
+    ("learner",): "mjx_dher.learners.ddpg:make",
+    ("networks",): "mjx_dher.networks:mlp",
+    ("seed",): 7,
+    **{("config", field.name): 2 for field in dataclasses.fields(mjx_dher.Config) if field.type == "Count"},
+    ("config", "num_envs"): 3,
+    ("config", "batch_size"): 17,
+    ("config", "replay_size"): 120,
+    ("config", "hidden_sizes"): [9],
+    ("config", "learner_dtype"): "bfloat16",
+    ("config", "learner_kernels"): "xla",
+    **{("hparams", name): 0.123 for name in HParams._fields},
+}
+EDITS = {path: value for path, value in EDITS.items() if path != ("config", "cycles_per_epoch")} | {
+    ("config", "cycles_per_epoch"): 3,
+    ("config", "target_period"): 2,
+}
+
+
+@pytest.mark.parametrize("path", EDITS, ids=".".join)
+def test_a_setting_that_was_edited_is_named_and_refused(stopped, whole, capsys, path):
+    name = path[-1]
+    for value in (EDITS[path], "x" if not isinstance(EDITS[path], str) else 3, [], None):
+        shutil.copy(whole / "config.json", whole / "kept")
+        edit(stopped, path, value)
+        edit(whole, path, value)
+        if value is None and run_folder.to_spec(whole, run_folder.read_content(whole)) == SPEC:
+            continue  # it was the default, and so it is
+        status, text = resume(stopped, capsys)
+        assert (status, name in text, "Traceback" in text) == (2, True, False), (value, text)
+        assert cli.main(["eval", str(whole)]) == 2
+        text = capsys.readouterr().err
+        assert name in text, (value, text)
+        with pytest.raises(FolderError, match=name):
+            mjx_dher.load_policy(whole)
+        shutil.copy(whole / "kept", whole / "config.json")
+        shutil.copy(whole / "kept", stopped / "config.json")
+        edit(stopped, ("lanes",), 1)
+
+
+def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_path, capsys):
+    longer = dataclasses.replace(SPEC, config=dataclasses.replace(SPEC.config, total_steps=320))
+    edited = shutil.copytree(stopped, tmp_path / "edited")
+    edit(edited, ("config", "total_steps"), 320)
+    assert cli.main(["eval", str(edited)]) == 2  # as long as the run itself does not know
+    assert "total_steps was 240 and is 320" in capsys.readouterr().err
+    for folder, flags in ((stopped, ["--total-steps", "320"]), (edited, [])):
+        status, text = resume(folder, capsys, *flags)
+        assert (status, "total_steps was 240 and is 320" in text) == (0, True), text
+        assert run_folder.read_spec(folder) == longer
+        assert [row["epoch"] for row in rows_of(folder)] == [str(epoch) for epoch in range(1, 9)]
+    train(tmp_path / "long", longer)
+    ours, theirs = (
+        [{k: v for k, v in row.items() if k != "digest"} for row in rows_of(f)] for f in (edited, tmp_path / "long")
+    )
+    assert ours == theirs
+
+
+def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, capsys):
+    before = (stopped / "config.json").read_bytes()
+    status, text = resume(stopped, capsys, "--total-steps", "160")
+    assert (status, "nothing is left to train: 4 epochs have ended, and total_steps 160 takes 4" in text) == (2, True)
+    assert (stopped / "config.json").read_bytes() == before
+    assert resume(stopped, capsys)[0] == 0
+
+
+@pytest.mark.parametrize("flags", [["--log", "jsonl"], ["--keep", "1"], ["--final-episodes", "7"], ["--checkpoint-every", "0"]])
+def test_options_may_change(stopped, whole, capsys, flags):
+    status, text = resume(stopped, capsys, *flags)
+    assert (status, f"{flags[0][2:].replace('-', '_')} {flags[1]}" in text or flags[0] == "--log") == (0, True), text
+    assert rows_of(stopped) == rows_of(whole)
+    if flags[0] == "--log":
+        lines = [json.loads(line) for line in (stopped / "metrics.jsonl").read_text().splitlines()]
+        assert [line["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
+        assert [f"{line['critic_loss']:.6g}" for line in lines] == [row["critic_loss"] for row in rows_of(whole)]
+
+
+@pytest.mark.parametrize(("name", "value"), [("checkpoint_every", "x"), ("log", None), ("log", "jsonl"), ("keep", [1])])
+def test_an_option_of_another_type_is_refused(stopped, capsys, name, value):
+    edit(stopped, (name,), value if value is not None else 3)
+    status, text = resume(stopped, capsys)
+    assert (status, name in text, "Traceback" in text) == (2, True, False), text
+
+
+@pytest.mark.parametrize("lines", [3, 4])
+def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(stopped, whole, capsys, lines):
+    """As a power cut leaves them, the last line cut."""
+    content = (stopped / "metrics.csv").read_text().splitlines(keepends=True)
+    (stopped / "metrics.csv").write_text("".join(content[:lines]) + content[lines][:-5])
+    status, text = resume(stopped, capsys)
+    assert f"epoch-000004 is of a later epoch than the last whole line of metrics.csv, {lines - 1}" in text
+    assert (status, "epoch-000002, after epoch 2" in text) == (0, True)
+    assert rows_of(stopped) == rows_of(whole)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00", b"epoch,x\n1,2\n", b"epoch,env_steps\n"])
+def test_metrics_that_are_damaged_are_named(stopped, capsys, content):
+    (stopped / "metrics.csv").write_bytes(content)
+    status, text = resume(stopped, capsys)
+    assert (status, "later epoch than the last whole line of metrics.csv, 0" in text) == (2, True)
+    assert (stopped / "metrics.csv").read_bytes() == content
+    assert len(run_folder.checkpoints(stopped)) == 2
+
+
+def damage(path):
+    (path / "manifest.json").write_text("{")
+
+
+@pytest.mark.parametrize("keep", [1, 2])
+def test_a_damaged_checkpoint_costs_no_whole_one(stopped, keep, capsys):
+    """Neither the ones written after it, nor the one that the run goes on from before there is a newer one."""
+    newest, older = run_folder.checkpoints(stopped)
+    damage(newest)
+    shutil.move(newest, newest.with_name("epoch-000061"))
+    train(stopped, until=3, keep=keep)
+    expected = ["epoch-000003"] if keep == 1 else ["epoch-000003", "epoch-000002"]
+    assert [path.name for path in run_folder.checkpoints(stopped)] == expected
+    assert checkpoint._read_manifest(run_folder.checkpoints(stopped)[0])["epoch"] == 3
+    assert older.exists() == (keep == 2)
+
+
+def test_a_damaged_older_one_is_not_kept_for_a_whole_one(made, tmp_path):
+    folder = shutil.copytree(made / "run", tmp_path / "run")
+    newest, older = run_folder.checkpoints(folder)
+    damage(newest)
+    train(folder, until=5)
+    assert [path.name for path in run_folder.checkpoints(folder)] == ["epoch-000005", "epoch-000004"]
+    assert [checkpoint._read_manifest(path)["epoch"] for path in run_folder.checkpoints(folder)] == [5, 4]
+    assert not older.exists()
+
+
+def test_checkpoints_sort_by_number_and_strays_are_none(tmp_path):
+    for name in ("epoch-999999", "epoch-1000000", "epoch-000010", "epoch-x", "epoch-", ".partial-000001"):
+        (tmp_path / "checkpoints" / name).mkdir(parents=True)
+    assert [path.name for path in run_folder.checkpoints(tmp_path)] == ["epoch-1000000", "epoch-999999", "epoch-000010"]
+
+
+def test_links_in_the_way_are_removed_and_not_followed(stopped, tmp_path):
+    elsewhere = tmp_path / "mine"
+    elsewhere.mkdir()
+    (elsewhere / "file").write_text("mine")
+    (stopped / "checkpoints" / "epoch-000001").symlink_to(elsewhere)
+    (stopped / "checkpoints" / ".partial-000009").symlink_to(elsewhere)
+    (stopped / "policy.npz.partial").symlink_to(elsewhere / "file")
+    (stopped / "metrics.csv.partial").symlink_to(elsewhere / "file")
+    train(stopped, until=5)
+    assert [path.name for path in run_folder.checkpoints(stopped)] == ["epoch-000005", "epoch-000004"]
+    assert (elsewhere / "file").read_text() == "mine"
+
+
+def test_what_must_survive_a_power_cut_is_flushed_before_what_relies_on_it(tmp_path, monkeypatch):
+    """Metrics before the checkpoint, all of a checkpoint before its name, the policy and metrics before the result."""
+    flushed = []
+    flush = files.flush
+    monkeypatch.setattr(files, "flush", lambda path: (flushed.append(path.relative_to(tmp_path).as_posix()), flush(path))[1])
+    folder = tmp_path / "run"
+    train(folder)
+    assert flushed[0] == "."  # that the run's folder is in it
+
+    def last(name):
+        return len(flushed) - 1 - flushed[::-1].index(name)
+
+    names = [name for name in flushed if name.startswith("run/checkpoints")]
+    partial = [name for name in names if ".partial-000004" in name]
+    in_place = [i for i, name in enumerate(flushed) if name == "run/checkpoints"]
+    first, end = flushed.index(partial[0]), flushed.index("run/checkpoints", flushed.index(partial[-1]))
+    assert "run/metrics.csv" in flushed[in_place[1] : first]
+    assert partial[-1] == "run/checkpoints/.partial-000004"  # the folder itself, after what is in it
+    assert {name.rpartition("/")[2] for name in partial} >= {"manifest.json", "state"}
+    assert end > first
+    assert last("run/policy.npz") < last("run/result.json.partial")
+    assert last("run/metrics.csv") < last("run/result.json.partial")
+    assert flushed[-1] == "run"
+
+
+# Own code.
+
+TASK = """
+from point_mass import *  # noqa: F403
+
+class Mine(PointMass):
+    pass
+
+def near(achieved, desired):
+    return jnp.linalg.norm(achieved - desired, axis=-1)
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A module of the user's own; a function that edits it, as between two programs."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def write(text):
+        (tmp_path / "own_task.py").write_text(TASK + text)
+        identity._source.cache_clear()
+
+    write("")
+    yield write
+    identity._source.cache_clear()
+
+
+def flags_of(out):
+    sizes = [
+        "--num-envs",
+        "2",
+        "--cycles-per-epoch",
+        "2",
+        "--updates-per-cycle",
+        "4",
+        "--batch-size",
+        "16",
+        "--hidden-sizes",
+        "8",
+    ]
+    sizes += ["--replay-size", "100", "--eval-episodes", "4", "--final-episodes", "4", "--total-steps", "80"]
+    return ["--env", "own_task:Mine", *sizes, "--sampler", "closest", "--metric", "own_task:near", "--out", str(out)]
+
+
+def test_a_sweep_of_own_code_that_changed_trains_it_anew_and_says_so(own, tmp_path, capsys):
+    command = ["sweep", *flags_of(tmp_path / "sweep"), "--seeds", "2"]
+    assert cli.main(command) == 0
+    before = tables.read(tmp_path / "sweep")
+    assert cli.main(command) == 0
+    assert "2 of them are done already" in capsys.readouterr().out
+    own("# another reading")
+    assert cli.main(command) == 0
+    text = capsys.readouterr().out
+    assert "own_task.py (env own_task:Mine) has changed since 2 of the runs in" in text
+    assert "own_task.py (metric own_task:near) has changed since 2 of the runs in" in text
+    trials = tables.read(tmp_path / "sweep")
+    assert len(trials) == 4
+    assert {trial["settings"]["source"] for trial in before} < {trial["settings"]["source"] for trial in trials}
+    assert len({trial["settings"]["source"] for trial in trials}) == 2
+
+
+def test_eval_and_resume_say_which_file_changed_since(own, tmp_path, capsys):
+    spec = dataclasses.replace(SPEC, env="own_task:Mine")
+    train(tmp_path / "run", spec, until=2)
+    own("# another task")
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert "own_task.py has changed (env)" in capsys.readouterr().out
+    status, text = resume(tmp_path / "run", capsys)
+    assert (status, "own_task.py has changed (env)" in text) == (0, True), text
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
+    assert "has changed" not in capsys.readouterr().out
+
+
+def test_trials_of_a_version_that_did_not_look_at_own_code_stay(own, tmp_path, capsys):
+    command = ["sweep", *flags_of(tmp_path / "sweep"), "--seeds", "1"]
+    assert cli.main(command) == 0
+    (cell,) = (path for path in (tmp_path / "sweep" / "cells").iterdir() if path.is_dir())
+    spec = run_folder.read_spec(cell)
+    for name in ("digest", "sources"):
+        edit(cell, (name,), None)
+    with np.load(cell / "policy.npz") as arrays:
+        kept = {name: arrays[name] for name in arrays.files if name != "settings"}
+    np.savez(cell / "policy.npz", **kept)
+    cell.rename(cell.with_name(identity.trial_name(spec, {})))
+    capsys.readouterr()
+    assert cli.main(command) == 0
+    text = capsys.readouterr().out
+    assert "1 of them are done already" in text
+    assert "whether own_task.py (env own_task:Mine) has changed is not known of 1 of the runs" in text
+
+
+def test_lanes_share_a_checkpoint_of_their_own_settings(tmp_path):
+    trials = make_grid(("future",), (0, 1), static=LONGER)
+    cut_short(tmp_path, trials, 2, lanes=2)
+    (manifest,) = tmp_path.glob("unfinished/*/checkpoints/*/manifest.json")
+    runs = json.loads(manifest.read_text())["runs"]
+    assert [identity.digest(run) for run in runs] == [identity.digest(identity.identity(trial, "none", {})) for trial in trials]
+    (tmp_path / grid.CELLS / "stray").mkdir()
+    (tmp_path / "unfinished" / "stray").mkdir()
+    (tmp_path / "unfinished" / "stray" / "cells.json").write_text("")  # as a kill leaves it
+    run(tmp_path, trials, lanes=2)
+    assert [path.name for path in (tmp_path / "unfinished").iterdir()] == ["stray"]
+    assert len(tables.read(tmp_path)) == 2
