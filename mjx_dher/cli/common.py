@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -11,6 +12,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
 from mjx_dher.names import check_name
+from mjx_dher.runs import run_folder
 from mjx_dher.spec import ENGINES, RunSpec
 
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
@@ -43,6 +45,18 @@ def check_engine(engine: str | None) -> None:
     """Raises ValueError for a name that is no engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
+
+
+def read_run(path: Path, console: Console) -> RunSpec:
+    """Returns the description of the run in `path`, and prints which files of its own code have changed since.
+
+    Raises:
+      FolderError: no run folder, or one that cannot be believed.
+    """
+    content, spec = run_folder.read(path)
+    for text in run_folder.changed_code(content, spec):
+        console.print(f"since {path} was trained: {text}", soft_wrap=True)
+    return spec
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:

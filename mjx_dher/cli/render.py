@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs
-from mjx_dher.cli.common import check_engine
+from mjx_dher.cli.common import check_engine, read_run
 from mjx_dher.config import check_count
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
@@ -55,7 +55,7 @@ def render_command(argv: list[str], console: Console) -> int:
     if args.run is not None and args.env is None:
         from mjx_dher.runs.load import load_policy
 
-        played, policy = run_folder.read_spec(args.run), load_policy(args.run)
+        played, policy = read_run(args.run, console), load_policy(args.run)
     elif args.env is not None and args.run is None:
         check_name("env", args.env, envs.list_envs(), own=True)
         played, policy = RunSpec(env=args.env), None

@@ -203,6 +203,14 @@ def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]
     return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {identity.digest(now)}"}
 
 
+def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
+    """Returns what a reader is told of own code that is not what the run was trained with."""
+    if "sources" not in content:
+        return []
+    before = identity_of(content, spec)
+    return list(identity.differences(before, {**before, "sources": identity.sources(spec)}).values())
+
+
 def written_identity(path: Path) -> dict[str, Any] | None:
     """Returns the `identity` that the run's newest checkpoint has, or else its policy; None where neither can tell."""
     for checkpoint in checkpoints(path):

@@ -206,6 +206,8 @@ def check(logs: Sequence[str]) -> None:
     Raises:
       ValueError: names the log, and the extra to install.
     """
+    if not isinstance(logs, (list, tuple)):
+        raise ValueError(f"log must be names among {', '.join(LOGS)}; got {logs!r}")
     for log in logs:
         check_name("log", log, LOGS)
         if log in EXTRAS:
