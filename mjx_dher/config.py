@@ -166,6 +166,7 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
     Raises:
       ValueError: names every field at fault, its value and what is allowed.
     """
+    check_count("episode_length", episode_length)
     problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
     problems += _field_problems(hparams)
     if problems:

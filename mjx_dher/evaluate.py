@@ -25,6 +25,16 @@ def summary(outcome: Outcome) -> dict[str, Array]:
 
 
 def return_mean(outcome: Outcome) -> Array:
-    """Returns the mean return [] of the valid episodes; 0 where there is none."""
+    """Returns the mean return [] of the valid episodes; NaN where there is none."""
     count = jnp.sum(outcome.valid, dtype=outcome.ret.dtype)
-    return jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)) / jnp.maximum(count, 1.0)
+    total = jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0))
+    return jnp.where(count > 0, total / jnp.maximum(count, 1.0), jnp.nan)
+
+
+def faults(outcome: Outcome) -> dict[str, Array]:
+    """Returns the shares [] of rewards outside [-1, 0] and of successes, at the end and at the reset, that are not 0 or 1."""
+    successes = jnp.stack([outcome.success, outcome.reset_success])
+    return {
+        "bad_rewards": jnp.mean(outcome.bad_rewards),
+        "bad_success": jnp.mean((successes != 0.0) & (successes != 1.0), dtype=jnp.float32),
+    }

@@ -10,16 +10,28 @@ import jax.numpy as jnp
 from mjx_dher import replay, samplers
 from mjx_dher.config import HParams
 from mjx_dher.replay import ReplayState, Sample
-from mjx_dher.samplers import Sampler
+from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
 
 
-def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparams: HParams, key: PRNGKey) -> Array:
+def hindsight_goals(
+    state: ReplayState, sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey
+) -> Array:
     """Chooses one achieved goal for each transition of `sample` by `sampler`; returns them as [B, G].
+
+    A transition for which the sampler offers no goal (no weight is positive, or one is NaN or infinite) keeps its own.
 
     Raises:
       ValueError: its log weights are not one for each goal of an episode.
     """
+    return _choose(state, sample, sampler, hparams, key)[0]
+
+
+def _choose(
+    state: ReplayState, sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey
+) -> tuple[Array, Array]:
+    """Returns the goals [B, G] of `hindsight_goals`, and whether the sampler offered one [B]."""
+    sampler = samplers.make(sampler)
     pool_key, draw_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
     pool = sample.episode_goals
@@ -29,15 +41,18 @@ def hindsight_goals(state: ReplayState, sample: Sample, sampler: Sampler, hparam
     log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
     if log_weights.shape != pool.shape[:2]:
         raise ValueError(f"a sampler gives log weights [T+1] = [{pool.shape[1]}]; this one gives {list(log_weights.shape[1:])}")
+    if not jnp.issubdtype(log_weights.dtype, jnp.floating):
+        raise ValueError(f"a sampler gives log weights as floating-point numbers; this one gives {log_weights.dtype}")
     index = samplers.draw(draw_key, log_weights)
-    return pool[jnp.arange(batch_size), index]
+    offered = index < pool.shape[1]
+    return jnp.where(offered[:, None], pool[jnp.arange(batch_size), index], sample.desired_goal), offered
 
 
 def draw_batches(
     state: ReplayState,
     key: PRNGKey,
     shape: tuple[int, ...],
-    sampler: Sampler,
+    sampler: Sampler | LogWeightsFn,
     compute_reward: RewardFn,
     hparams: HParams,
     cumulative: Array,
@@ -58,25 +73,49 @@ def draw_batches(
 def relabel(
     state: ReplayState,
     sample: Sample,
-    sampler: Sampler,
+    sampler: Sampler | LogWeightsFn,
     compute_reward: RewardFn,
     hparams: HParams,
     key: PRNGKey,
 ) -> Batch:
     """Returns `sample` as a batch in which each transition was relabelled with probability k/(k+1), k = `hparams.her_k`.
 
-    The reward is that of the goal achieved at the transition's end: `compute_reward(achieved at step+1, goal)`.
+    The reward is that of the goal achieved at the transition's end: `compute_reward(achieved at step+1, goal)`. Of `hparams`
+    it reads her_k, and whatever the sampler reads; `draw_batches` reads priority_fraction, too.
+
+    Raises:
+      ValueError: the sampler's log weights are not [T+1], or the rewards not [B].
     """
+    return relabel_counted(state, sample, sampler, compute_reward, hparams, key)[0]
+
+
+def relabel_counted(
+    state: ReplayState,
+    sample: Sample,
+    sampler: Sampler | LogWeightsFn,
+    compute_reward: RewardFn,
+    hparams: HParams,
+    key: PRNGKey,
+) -> tuple[Batch, Array]:
+    """Returns the batch that `relabel` returns, and the share [] of transitions to be relabelled that were offered no goal."""
     coin_key, goal_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
     relabelled = jax.random.uniform(coin_key, (batch_size,)) < hparams.her_k / (hparams.her_k + 1.0)
-    goals = hindsight_goals(state, sample, sampler, hparams, goal_key)
+    goals, offered = _choose(state, sample, sampler, hparams, goal_key)
     desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
-    return Batch(
+    reward = compute_reward(achieved_goal, desired_goal)
+    if jnp.shape(reward) != (batch_size,):
+        raise ValueError(
+            f"compute_reward gives rewards [B] = [{batch_size}] of goals [B, G] = {list(desired_goal.shape)}; this one gives"
+            f" {list(jnp.shape(reward))}"
+        )
+    batch = Batch(
         observation=sample.observation,
         next_observation=sample.next_observation,
         desired_goal=desired_goal,
         action=sample.action,
-        reward=compute_reward(achieved_goal, desired_goal),
+        reward=reward,
     )
+    missed = jnp.sum(relabelled & ~offered, dtype=jnp.float32)
+    return batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0)

@@ -43,6 +43,9 @@ def init(episode: Episode, num_episodes: int) -> ReplayState:
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes must be at least 1; got {num_episodes}")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(episode):
+        if 0 in leaf.shape:
+            raise ValueError(f"leaf {jax.tree_util.keystr(path)} of an episode must not be empty; got shape {leaf.shape}")
     length = episode.action.shape[0]
     for path, leaf in jax.tree_util.tree_leaves_with_path((episode.observation, episode.achieved_goal)):
         if leaf.shape[0] != length + 1:
@@ -76,12 +79,12 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
       valid: [N] which of them to write; the others leave no trace. All, where None.
 
     Raises:
-      ValueError: more episodes at once than the ring holds.
+      ValueError: more episodes at once than the ring holds, or arrays of other shapes or types than its own.
     """
-    num_new, num_rows = episodes.action.shape[0], capacity(state)
+    num_new, num_rows = _check_new(state, episodes, priority, valid), capacity(state)
     if num_new > num_rows:
         raise ValueError(f"cannot add {num_new} episodes at once to a ring of {num_rows}")
-    valid = jnp.ones(num_new, bool) if valid is None else valid
+    valid = jnp.ones(num_new, bool) if valid is None else jnp.asarray(valid, bool)
     order = jnp.cumsum(valid, dtype=jnp.int32) - 1
     written = order[-1] + 1
     # Out of bounds where not valid, so that the write is dropped; each its own, because indices are promised to be unique.
@@ -96,6 +99,31 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
         cursor=(state.cursor + written) % num_rows,
         size=jnp.minimum(state.size + written, num_rows),
     )
+
+
+def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, valid: Array | None) -> int:
+    """Returns the number of `episodes`, N; raises ValueError for what `state` has no place for, by its name."""
+    ring = dict(jax.tree_util.tree_leaves_with_path(state.episodes))
+    new = dict(jax.tree_util.tree_leaves_with_path(episodes))
+    structure: PyTree = jax.tree.structure(state.episodes)
+    if structure != jax.tree.structure(episodes):
+        differing = [jax.tree_util.keystr(path) for path in {**ring, **new} if (path in ring) != (path in new)]
+        raise ValueError(
+            f"episodes must have the arrays of the ring's; only one of them has {', '.join(differing) or 'its type'}"
+        )
+    leading = jnp.shape(episodes.action)[:1]
+    for path, leaf in new.items():
+        own, shape, dtype = ring[path], jnp.shape(leaf), jnp.result_type(leaf)
+        if shape != (*leading, *own.shape[1:]) or jnp.promote_types(own.dtype, dtype) != own.dtype:
+            needed = ", ".join(map(str, ("N", *own.shape[1:])))
+            raise ValueError(
+                f"episodes{jax.tree_util.keystr(path)} must be {own.dtype}[{needed}] for N episodes (of which actions have"
+                f" {leading[0] if leading else 'none'}); got {dtype}{list(shape)}"
+            )
+    for name, value in (("priority", priority), ("valid", valid)):
+        if value is not None and jnp.shape(value) not in ((), leading)[name == "valid" :]:
+            raise ValueError(f"{name} must be [N] = {list(leading)}, one for each episode; got {list(jnp.shape(value))}")
+    return leading[0]
 
 
 def can_sample(state: ReplayState) -> Array:

@@ -26,7 +26,7 @@ from mjx_dher.types import Array, PRNGKey
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
 LogWeightsFn = Callable[[Array, Array, Array, HParams], Array]
-# metric(achieved [T+1, G], desired [G]) -> [T+1], not negative
+# metric(achieved [T+1, G], desired [G]) -> [T+1], finite and not negative
 MetricFn = Callable[[Array, Array], Array]
 # kernel(relative distance [T+1], temperature []) -> log weight [T+1]
 KernelFn = Callable[[Array, Array | float], Array]
@@ -63,6 +63,27 @@ def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> A
     return jnp.zeros(achieved.shape[0])
 
 
+def distances(metric: MetricFn, achieved: Array, desired: Array) -> Array:
+    """Returns the distances [T+1] of `achieved` [T+1, G] to `desired` [G] by `metric`, NaN where one is no distance.
+
+    A sampler that goes by NaN offers no goal, which training counts.
+
+    Raises:
+      ValueError: the metric does not give [T+1].
+    """
+    distance = jnp.asarray(metric(achieved, desired))
+    if distance.shape != achieved.shape[:1]:
+        raise ValueError(
+            f"a metric gives distances [T+1] = {list(achieved.shape[:1])} of goals [T+1, G] = {list(achieved.shape)} to one"
+            f" goal [G]; {_name_of(metric)} gives {list(distance.shape)}"
+        )
+    return distance if metric is position else jnp.where(distance >= 0, distance, jnp.nan)
+
+
+def _name_of(function: Any) -> str:
+    return str(getattr(function, "__name__", function))
+
+
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
     """Allows any goal after the step, each with the same probability (Andrychowicz et al. 2017, the paper's baseline)."""
     del desired, hparams
@@ -78,7 +99,7 @@ def final(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Arr
 def closest(achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position) -> Array:
     """Allows the future goal nearest to the desired one (the paper's method 1); equally near ones share."""
     del hparams
-    distance = jnp.where(future_mask(achieved.shape[0], step), metric(achieved, desired), jnp.inf)
+    distance = jnp.where(future_mask(achieved.shape[0], step), distances(metric, achieved, desired), jnp.inf)
     return _uniform(distance == jnp.min(distance))
 
 
@@ -119,11 +140,17 @@ def weighted(
     all but uniform.)
     """
     mask = future_mask(achieved.shape[0], step)
-    distance = jnp.where(mask, metric(achieved, desired), 0.0)
+    distance = jnp.where(mask, distances(metric, achieved, desired), 0.0)
     mean = jnp.sum(distance) / jnp.sum(mask, dtype=distance.dtype)
     # Where every candidate lies on the goal, all are equally near.
-    relative = jnp.where(mask & (mean > 0), distance / jnp.where(mean > 0, mean, 1.0), 1.0)
-    return jnp.where(mask, kernel(relative, hparams.temperature), -jnp.inf)
+    relative = jnp.where(mask & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
+    log_weights = jnp.asarray(kernel(relative, hparams.temperature))
+    if log_weights.shape != relative.shape:
+        raise ValueError(
+            f"a kernel gives log weights [T+1] = {list(relative.shape)} of relative distances [T+1]; {_name_of(kernel)} gives"
+            f" {list(log_weights.shape)}"
+        )
+    return jnp.where(mask, log_weights, -jnp.inf)
 
 
 def linear(relative: Array, temperature: Array | float) -> Array:
@@ -149,12 +176,12 @@ _PLAIN: dict[str, Sampler] = {
 }
 
 
-def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
+def make(name: str | Sampler | LogWeightsFn, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
     """Makes the sampler called `name`.
 
     Args:
-      name: one of `spec.SAMPLERS`, or "module:attribute" of a `Sampler` or a function like `Sampler.log_weights`. `random`
-        chooses as `episode` does, but from a random episode of the ring.
+      name: one of `spec.SAMPLERS`, "module:attribute", a `Sampler`, or a function like `Sampler.log_weights`. `random` chooses
+        as `episode` does, but from a random episode of the ring.
       kernel: for `weighted`: linear, inverse, softmax, "module:attribute", or a function (relative distance [T+1],
         temperature []) -> log weight [T+1].
       metric: for closest, epsilon_closest and weighted: position, "module:attribute", or a function (achieved [T+1, G],
@@ -164,6 +191,8 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
       ValueError: no such sampler, module, attribute, kernel or metric (the message names the nearest), or something that is no
         sampler, kernel or metric.
     """
+    if not isinstance(name, str):
+        return _to_sampler(name)
     names.check_name("sampler", name, SAMPLERS, own=True)
     kernel = names.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
     metric = names.resolve("metric", metric, METRICS, ("achieved", "desired"))
@@ -176,20 +205,24 @@ def make(name: str, kernel: str | KernelFn = "linear", metric: str | MetricFn = 
         return Sampler(by_distance[name])
     if name in _PLAIN:
         return _PLAIN[name]
-    custom = names.load_import_path("sampler", name)
-    if isinstance(custom, Sampler):
-        return custom
-    return Sampler(names.check_function("sampler", custom, ("achieved", "desired", "step", "hparams")))
+    return _to_sampler(names.load_import_path("sampler", name))
 
 
-def one_of(choices: Sequence[Sampler]) -> Sampler:
+def _to_sampler(sampler: Any) -> Sampler:
+    if isinstance(sampler, Sampler):
+        return sampler
+    return Sampler(names.check_function("sampler", sampler, ("achieved", "desired", "step", "hparams")))
+
+
+def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     """Joins several samplers in one compiled program: `hparams.choice`, a traced number, says which of them a run uses.
 
     All log weights are computed and one is kept, so that a run draws what it would have drawn with that sampler alone. A
     field `choice` is not in `HParams`: the caller, `sweep`, adds it.
     """
-    if len(choices) == 1:
-        return choices[0]
+    samplers = [make(choice) for choice in choices]
+    if len(samplers) == 1:
+        return samplers[0]
 
     def pick(values: Sequence[Any], hparams: Any) -> Array:
         kept = jnp.asarray(values[0])
@@ -198,9 +231,9 @@ def one_of(choices: Sequence[Sampler]) -> Sampler:
         return kept
 
     def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-        return pick([choice.log_weights(achieved, desired, step, hparams) for choice in choices], hparams)
+        return pick([sampler.log_weights(achieved, desired, step, hparams) for sampler in samplers], hparams)
 
-    crossing = [choice.cross_episode for choice in choices]
+    crossing = [sampler.cross_episode for sampler in samplers]
     if not any(crossing):
         return Sampler(log_weights)
     return Sampler(log_weights, cross_episode=lambda hparams: pick(crossing, hparams))
@@ -216,7 +249,8 @@ def draw(key: PRNGKey, log_weights: Array) -> Array:
 
     This takes one random number a row.
 
-    What has no weight is never drawn, whatever the rounding of the cumulative sum. At least one weight must be positive.
+    What has no weight is never drawn, whatever the rounding of the cumulative sum. A row without any weight, or with NaN or
+    +inf among its log weights, gives T+1, which is no index.
     """
     num_goals = log_weights.shape[-1]
     weights = jnp.exp(log_weights - jnp.max(log_weights, axis=-1, keepdims=True))

@@ -71,6 +71,11 @@ PARTS = {  # by field, the names that are built in; each field takes module:attr
 }
 
 
+def own_parts(spec: RunSpec) -> list[str]:
+    """Returns the fields of a run that name parts of the user's own, as module:attribute."""
+    return [field for field in ("env", *PARTS) if is_import_path(getattr(spec, field))]
+
+
 def reads(sampler: str, field: str) -> bool:
     """Returns whether a setting makes a difference to runs with this sampler; an own sampler may read any."""
     read_by = {**config_lib.metadata(RunSpec, ReadBy), **config_lib.metadata(HParams, ReadBy)}

@@ -21,10 +21,10 @@ from mjx_dher import evaluate, learners, priorities, replay, samplers
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import Learner
 from mjx_dher.priorities import PriorityFn
-from mjx_dher.relabel import draw_batches, relabel
+from mjx_dher.relabel import draw_batches, relabel_counted
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
-from mjx_dher.samplers import Sampler
+from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
@@ -92,7 +92,7 @@ def make_train(
     env: Env,
     config: Config,
     *,
-    sampler: Sampler | None = None,
+    sampler: Sampler | LogWeightsFn | None = None,
     priority: PriorityFn | None = None,
     learner: Learner | None = None,
 ) -> Train:
@@ -103,12 +103,13 @@ def make_train(
     evaluation; train_success_rate and train_return_mean of the exploring policy, and the mean of its episodes' priorities,
     priority_mean; of their transitions the relabelled_share and, over these, relabel_distance, the mean Euclidean distance
     from the episode's goal to the hindsight goal; discarded_episodes, whose physics blew up and which were not learned from;
-    and what the learner reports, for DDPG critic_loss, actor_loss, q_mean, actor_norm and critic_norm.
+    bad_rewards and bad_success (`evaluate.faults`) and no_goal_share (`relabel.relabel_counted`), which ought to be 0; and what
+    the learner reports, for DDPG critic_loss, actor_loss, q_mean, actor_norm and critic_norm.
 
     Args:
       env: the environment.
       config: sizes.
-      sampler: of hindsight goals; `future` where None.
+      sampler: of hindsight goals, or a function like `Sampler.log_weights`; `future` where None.
       priority: of episodes, for `hparams.priority_fraction` of each batch; `eventful` where None.
       learner: DDPG where None, made of `config`.
 
@@ -119,7 +120,7 @@ def make_train(
     loop = Loop(
         env=env,
         config=config,
-        sampler=samplers.make("future") if sampler is None else sampler,
+        sampler=samplers.make("future" if sampler is None else sampler),
         priority=priorities.eventful if priority is None else priority,
         learner=learners.make("ddpg", config, env_sizes(env)) if learner is None else learner,
         template=episode_template(env),
@@ -147,9 +148,11 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     state, cycles = jax.lax.scan(lambda state, _: _cycle(loop, state), state, length=loop.config.cycles_per_epoch)
     key, eval_key = jax.random.split(state.key)
     discarded = jnp.sum(cycles.pop("discarded_episodes"))
-    evaluation = evaluate.summary(evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes))
-    metrics = evaluation | jax.tree.map(jnp.mean, cycles) | loop.learner.summary(state.learner)
-    return dataclasses.replace(state, key=key), metrics | {"discarded_episodes": discarded}
+    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes)
+    means = jax.tree.map(jnp.mean, cycles)
+    faults = {name: jnp.maximum(means[name], share) for name, share in evaluate.faults(outcome).items()}
+    metrics = evaluate.summary(outcome) | means | loop.learner.summary(state.learner)
+    return dataclasses.replace(state, key=key), metrics | faults | {"discarded_episodes": discarded}
 
 
 def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -174,6 +177,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
         "priority_mean": jnp.mean(weights),
+        **evaluate.faults(outcome),
         **relabelled,
         **losses,
     }
@@ -189,9 +193,9 @@ def _update_normalizers(
     fresh = replay.add(replay.init(loop.template, num_new), episodes, valid=valid)
     sample_key, relabel_key = jax.random.split(key)
     sample = replay.sample(fresh, sample_key, num_new * num_steps)
-    batch = relabel(fresh, sample, loop.sampler, loop.env.compute_reward, hparams, relabel_key)
+    batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, loop.env.compute_reward, hparams, relabel_key)
     learner = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
-    return learner, _relabel_metrics(sample.desired_goal, batch.desired_goal)
+    return learner, {**_relabel_metrics(sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
 
 
 def _learn(loop: Loop, learner: PyTree, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[PyTree, Metrics]:
@@ -270,8 +274,10 @@ def episode_template(env: Env) -> Episode:
     """Returns the shapes and types of one episode of `env`, without running it.
 
     Raises:
-      ValueError: the observation is not a single vector.
+      ValueError: the observation is not a single vector, or an action or an episode has no size.
     """
+    for name in ("action_size", "episode_length"):
+        config_lib.check_count(name, getattr(env, name))
     obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
     observation = obs["observation"]
     if not (hasattr(observation, "shape") and len(observation.shape) == 1):

@@ -22,6 +22,7 @@ COMMANDS = {
     "export": "mjx_dher.cli.export:export_command",
     "sweep": "mjx_dher.cli.sweep:sweep_command",
     "plot": "mjx_dher.cli.sweep:plot_command",
+    "check": "mjx_dher.cli.check:check_command",
     "doctor": "mjx_dher.cli.doctor:doctor_command",
 }
 

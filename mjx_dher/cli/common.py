@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.progress import Progress as Bar
 
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
-from mjx_dher.spec import ENGINES, RunSpec
+from mjx_dher.spec import ENGINES, RunSpec, own_parts
 
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
 
@@ -45,6 +46,23 @@ def check_engine(engine: str | None) -> None:
     """Raises ValueError for a name that is no engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
+
+
+def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
+    """Tries out what is the user's own in runs of an environment, before anything is compiled or written.
+
+    Raises:
+      ValueError: names the part, and what is wrong with it.
+    """
+    tried: set[str] = set()
+    for spec in specs:
+        if own_parts(spec):
+            from mjx_dher.testing import check_parts
+
+            for line in check_parts(env, dataclasses.replace(spec, seed=0)):
+                if line not in tried:
+                    tried.add(line)
+                    console.print(line, soft_wrap=True)
 
 
 def read_run(path: Path, console: Console) -> RunSpec:

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, refuse_foreign_flags
+from mjx_dher.cli.common import Screen, refuse_foreign_flags, try_parts
 from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
@@ -212,6 +212,10 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
     from mjx_dher.sweeps import sweep
 
     prepare()
+    for _, group in itertools.groupby(todo, key=lambda run: run.env):
+        own = list({dataclasses.replace(run, seed=0): None for run in group})
+        if any(map(spec.own_parts, own)):
+            try_parts(envs.make(own[0].env, engine=own[0].engine), own, console)
     stop, screen = Stop(console, args.out), Screen(console, todo)
     try:
         with stop:

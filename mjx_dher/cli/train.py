@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags
+from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags, try_parts
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.host.files import FolderError
@@ -29,7 +29,8 @@ class TrainArgs:
 
     Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates one again, `render RUN` draws it,
     `transfer RUN` plays it in the original Fetch task, `export RUN` writes its policy for other programs, `sweep` trains and
-    compares many runs, `plot DIR` draws a sweep, `doctor` says what works on this machine (see `eval --help` and so on).
+    compares many runs, `plot DIR` draws a sweep, `check` tries out parts of your own, `doctor` says what works on this machine
+    (see `eval --help` and so on).
     """
 
     spec: RunSpec
@@ -70,6 +71,7 @@ def train_command(argv: list[str], console: Console) -> int:
     with run_folder.claim_new(args.out, args.spec) as folder:
         prepare()
         env = envs.make(args.spec.env, engine=args.spec.engine)
+        try_parts(env, [args.spec], console)
         return _train(env, args.spec, folder, args.options, console)
 
 

@@ -76,21 +76,7 @@ def save(
         files.make_folder(parent)
         for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
             files.remove(left)
-        leaves = _to_arrays(state)
-        needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(parent).free
-        if needed > free:
-            raise OSError(f"it can take {memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free")
-        _write_arrays(partial / _STATE, list(leaves.values()))
-        content = {
-            "schema": SCHEMA,
-            "epoch": epoch,
-            "wall_seconds": wall_seconds,
-            "runs": list(runs),
-            "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
-            "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
-        }
-        with (partial / MANIFEST).open("w") as file:
-            json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
+        _write(partial, state, {"schema": SCHEMA, "epoch": epoch, "wall_seconds": wall_seconds, "runs": list(runs)})
         files.flush_all(partial)
         if target.exists() or target.is_symlink():
             files.remove(target)
@@ -107,6 +93,22 @@ def save(
     finally:
         memory.release()  # the buffers of the threads that compress leave holes
     return target
+
+
+def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
+    """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and what tells damage."""
+    leaves = _to_arrays(state)
+    needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(partial.parent).free
+    if needed > free:
+        raise OSError(f"it can take {memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free")
+    _write_arrays(partial / _STATE, list(leaves.values()))
+    content = {
+        **content,
+        "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
+        "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
+    }
+    with (partial / MANIFEST).open("w") as file:
+        json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
 
 
 def restore(folder: Path, template: Any, last_epoch: float = math.inf) -> Restored:

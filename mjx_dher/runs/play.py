@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -31,11 +32,17 @@ def play(env: Env, policy: Policy, num_episodes: int, seed: int) -> Outcome:
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *outcomes)
 
 
-def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> dict[str, Any]:
+def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None, bad_rewards: Any = None) -> dict[str, Any]:
     """Returns the means of episodes' outcomes (arrays [N]), success with its 95 % interval (Wilson 1927).
 
-    An episode that is not `valid` [N] counts as a failure and has no return.
+    An episode that is not `valid` [N] counts as a failure and has no return. `bad_rewards` is not looked at.
+
+    Raises:
+      ValueError: a success that is neither 0 nor 1.
     """
+    del bad_rewards
+    if wrong := [float(x) for x in np.ravel((success, reset_success)) if x not in (0.0, 1.0)]:
+        raise ValueError(f"success must be 0 or 1; of {np.size(success)} episodes it is {wrong[0]:g} in {len(wrong)}")
     ret = np.asarray(ret, np.float64)[slice(None) if valid is None else np.asarray(valid, bool)]
     low, high = stats.wilson_interval(int(np.sum(success)), len(success))
     return {
@@ -44,5 +51,5 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
         "success_low": low,
         "success_high": high,
         "reset_success_rate": float(np.mean(reset_success, dtype=np.float64)),
-        "return_mean": float(ret.mean()) if len(ret) else 0.0,
+        "return_mean": float(ret.mean()) if len(ret) else math.nan,
     }

@@ -1,11 +1,4 @@
-"""A conformance test for environments: it tries everything that the library relies on.
-
-In a test:
-
-    from mjx_dher.testing import check_env
-
-    check_env(MyTask())
-"""
+"""A conformance test for environments: it tries everything that the library relies on."""
 
 from __future__ import annotations
 

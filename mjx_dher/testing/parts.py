@@ -1,0 +1,221 @@
+"""Trials of samplers, metrics, kernels and priorities of one's own, on random episodes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from mjx_dher import names, priorities, samplers
+from mjx_dher.config import HParams
+from mjx_dher.names import is_import_path
+from mjx_dher.priorities import PriorityFn
+from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
+from mjx_dher.spec import METRICS, RunSpec, reads
+from mjx_dher.testing.env import check_env
+from mjx_dher.testing.learner import check_learner
+from mjx_dher.testing.trial import EPISODES, PartError, attempt, random_episodes
+from mjx_dher.types import Env, Episode
+
+TOLERANCE = 1e-3
+
+
+def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
+    """Tries out the parts of a run that are named as module:attribute; yields a sentence for each that is as it should be.
+
+    Args:
+      env: the environment, made.
+      spec: of the run.
+
+    Raises:
+      ValueError: names the part, and what is wrong with it.
+    """
+    if is_import_path(spec.env):
+        check_env(env)
+        yield f"env {spec.env}: as it should be, in random episodes"
+    episodes = random_episodes(env)
+    metric_read, kernel_read = reads(spec.sampler, "metric"), reads(spec.sampler, "weight_kernel")
+    if is_import_path(spec.metric) and metric_read:
+        yield check_metric(spec.metric, env, episodes)
+    if is_import_path(spec.weight_kernel) and kernel_read:
+        yield check_kernel(spec.weight_kernel)
+    own = (spec.sampler, *([spec.metric] if metric_read else []), *([spec.weight_kernel] if kernel_read else []))
+    if any(map(is_import_path, own)):
+        yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes)}"
+    if is_import_path(spec.priority):
+        yield check_priority(spec.priority, env, spec.hparams, episodes)
+    if is_import_path(spec.learner) or is_import_path(spec.networks):
+        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks)
+        yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
+
+
+def check_sampler(
+    sampler: str | Sampler | LogWeightsFn, env: Env, hparams: HParams | None = None, episodes: Episode | None = None
+) -> str:
+    """Asks a sampler for the log weights of every step of random episodes.
+
+    They must be [T+1] floating-point numbers, below +inf and not NaN, not all -inf at every step, and the same under
+    `jax.vmap` as alone.
+
+    Args:
+      sampler: what `samplers.make` takes.
+      env: the environment.
+      hparams: numbers; the defaults where None.
+      episodes: to ask about; random ones where None.
+
+    Returns:
+      A sentence: at how many of the steps it offers no goal, and whether it offers goals of the past.
+
+    Raises:
+      PartError: names the first violation.
+    """
+    made, hparams = attempt("sampler", samplers.make, sampler), HParams() if hparams is None else hparams
+    episodes = episodes or random_episodes(env)
+    steps = jnp.arange(env.episode_length)
+
+    def of_step(achieved: Any, desired: Any, step: Any) -> Any:
+        return jnp.asarray(made.log_weights(achieved, desired, step, _as_arrays(hparams)))
+
+    of_episode = jax.vmap(of_step, in_axes=(None, None, 0))
+    log_weights = attempt(
+        "sampler", jax.jit(jax.vmap(of_episode, in_axes=(0, 0, None))), episodes.achieved_goal, episodes.desired_goal, steps
+    )
+    expected = (EPISODES, env.episode_length, env.episode_length + 1)
+    if log_weights.shape != expected:
+        raise PartError(f"sampler: log weights must be [T+1] = [{expected[2]}]; they are {list(log_weights.shape[2:])}")
+    if not jnp.issubdtype(log_weights.dtype, jnp.floating):
+        raise PartError(f"sampler: log weights must be floating-point numbers; they are {log_weights.dtype}")
+    values = np.asarray(log_weights)
+    alone = attempt("sampler, alone,", of_step, episodes.achieved_goal[0], episodes.desired_goal[0], steps[1])
+    return _check_log_weights(values, np.asarray(alone))
+
+
+def _check_log_weights(values: NDArray, alone: NDArray) -> str:
+    """Checks log weights [N, T, T+1], and those of episode 0 at step 1, computed `alone`; returns a sentence about them."""
+    for name, wrong in (("NaN", np.isnan(values)), ("+inf", values == np.inf)):
+        if wrong.any():
+            _, t, i = np.argwhere(wrong)[0]
+            raise PartError(
+                f"sampler: log weights must be finite, or -inf for what is not to be chosen; that of goal {i} at step {t} is"
+                f" {name}"
+            )
+    weights = np.exp(values - values.max(axis=-1, keepdims=True, where=np.isfinite(values), initial=-1e30))
+    offers = (values > -np.inf).any(axis=-1)
+    if not offers.any():
+        raise PartError("sampler: it offers no goal at any step: all log weights are -inf")
+    if not np.allclose(np.exp(values[0, 1]), np.exp(alone), rtol=TOLERANCE, atol=TOLERANCE):
+        raise PartError("sampler: log weights under jax.vmap must be those alone; they depend on other episodes or steps")
+    num_steps = values.shape[1]
+    past = np.tril(np.ones((num_steps, num_steps + 1), bool))[None]
+    missing = f"no goal at {1 - offers.mean():.0%} of the steps, which keep their own; " if not offers.all() else ""
+    return f"sampler as it should be: {missing}goals of the past {'too' if (weights[:, past[0]] > 0).any() else 'never'}"
+
+
+def check_metric(metric: str | MetricFn, env: Env, episodes: Episode | None = None) -> str:
+    """Asks a metric for the distances of random episodes' goals.
+
+    They must be [T+1], finite and not negative, and not all alike.
+
+    Returns:
+      A sentence: in which range they lie.
+
+    Raises:
+      PartError: names the first violation.
+    """
+    made = _resolve("metric", metric, METRICS, ("achieved", "desired"))
+    episodes = episodes or random_episodes(env)
+    compute = jax.jit(jax.vmap(lambda achieved, desired: jnp.asarray(made(achieved, desired))))
+    distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
+    expected = episodes.achieved_goal.shape[1:2]
+    if distances.shape[1:] != expected:
+        goals = list(episodes.achieved_goal.shape[1:])
+        raise PartError(
+            f"metric: distances must be [T+1] = {list(expected)} for achieved goals [T+1, G] = {goals} and one desired goal;"
+            f" they are {list(distances.shape[1:])}"
+        )
+    if distances.dtype.kind not in "fiu":
+        raise PartError(f"metric: distances must be numbers; they are {distances.dtype}")
+    if not np.isfinite(distances).all():
+        raise PartError("metric: distances must be finite; one is not")
+    if distances.min() < 0:
+        raise PartError(f"metric: distances must not be negative; the least is {distances.min():.3g}")
+    if distances.min() == distances.max():
+        raise PartError(f"metric: it tells no goals apart: all distances are {distances.min():.3g}")
+    return f"metric as it should be: distances from {distances.min():.3g} to {distances.max():.3g}"
+
+
+def check_kernel(kernel: str | KernelFn) -> str:
+    """Asks a kernel for the log weights of relative distances from 0 to 3, at temperatures of 0.3, 1 and 3.
+
+    They must be as many as the distances, below +inf and not NaN, and not all -inf.
+
+    Returns:
+      A sentence: that they are as they should be.
+
+    Raises:
+      PartError: names the first violation.
+    """
+    parameters = ("relative", "temperature")
+    made = attempt(
+        "weight_kernel", lambda: samplers.names.resolve("weight_kernel", kernel, samplers.WEIGHT_KERNELS, parameters)
+    )
+    relative = jnp.linspace(0.0, 3.0, 31)
+    for temperature in (0.3, 1.0, 3.0):
+        compute = jax.jit(lambda r, t: jnp.asarray(made(r, t)))
+        log_weights = np.asarray(attempt("weight_kernel", compute, relative, jnp.float32(temperature)))
+        if log_weights.shape != relative.shape:
+            raise PartError(f"weight_kernel: log weights must be {list(relative.shape)}; they are {list(log_weights.shape)}")
+        if log_weights.dtype.kind != "f":
+            raise PartError(f"weight_kernel: log weights must be floating-point numbers; they are {log_weights.dtype}")
+        for name, wrong in (("NaN", np.isnan(log_weights)), ("+inf", log_weights == np.inf)):
+            if wrong.any():
+                place = f"relative distance {float(relative[np.argmax(wrong)]):g} and temperature {temperature:g}"
+                raise PartError(f"weight_kernel: log weights must be finite or -inf; it is {name} at {place}")
+        if not (log_weights > -np.inf).any():
+            raise PartError(f"weight_kernel: every log weight is -inf at temperature {temperature:g}: it takes no goal")
+    return "weight_kernel as it should be"
+
+
+def check_priority(
+    priority: str | PriorityFn, env: Env, hparams: HParams | None = None, episodes: Episode | None = None
+) -> str:
+    """Asks a priority for the weights of random episodes: scalars, finite and not negative.
+
+    Returns:
+      A sentence: in which range they lie.
+
+    Raises:
+      PartError: names the first violation.
+    """
+    made, hparams = attempt("priority", priorities.make, priority), HParams() if hparams is None else hparams
+
+    def weigh(episode: Any) -> Any:
+        return jnp.asarray(made(episode, env.compute_reward, _as_arrays(hparams)))
+
+    episodes = episodes or random_episodes(env)
+    weights = np.asarray(attempt("priority", jax.jit(jax.vmap(weigh)), episodes))
+    if weights.ndim != 1:
+        raise PartError(f"priority: it must give one weight [] for an episode; it gives {list(weights.shape[1:])}")
+    if weights.dtype.kind not in "fiub":
+        raise PartError(f"priority: weights must be numbers; they are {weights.dtype}")
+    if not np.isfinite(weights).all():
+        raise PartError("priority: weights must be finite; one is not")
+    if weights.min() < 0:
+        raise PartError(f"priority: weights must not be negative; the least is {weights.min():.3g}")
+    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
+    if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
+        raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
+    return f"priority as it should be: weights from {weights.min():.3g} to {weights.max():.3g}"
+
+
+def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:
+    return attempt(field, names.resolve, field, value, known, parameters)
+
+
+def _as_arrays(hparams: HParams) -> HParams:
+    return jax.tree.map(functools.partial(jnp.asarray, dtype=jnp.float32), hparams)

@@ -1,0 +1,286 @@
+"""What users hand in is checked where it is handed in: a table of mistakes in each kind of part."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import mistakes
+import numpy as np
+import pytest
+
+import mjx_dher
+from mjx_dher import Config, HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
+from mjx_dher.rollout import rollout
+from mjx_dher.runs import driver
+from mjx_dher.testing import check_env, check_kernel, check_learner, check_metric, check_priority, check_sampler
+from point_mass import PointMass, soon
+
+ENV = PointMass()
+SMALL = Config(
+    num_envs=4,
+    cycles_per_epoch=1,
+    updates_per_cycle=2,
+    target_period=1,
+    batch_size=16,
+    total_steps=40,
+    replay_size=80,
+    hidden_sizes=(8,),
+    eval_episodes=4,
+)
+CHECKS = {
+    "sampler": (mistakes.SAMPLERS, lambda part: check_sampler(part, ENV)),
+    "metric": (mistakes.METRICS, lambda part: check_metric(part, ENV)),
+    "weight_kernel": (mistakes.KERNELS, check_kernel),
+    "priority": (mistakes.PRIORITY, lambda part: check_priority(part, ENV)),
+    "learner": (mistakes.LEARNERS, lambda part: check_learner(part, ENV, SMALL)),
+    "networks": (mistakes.NETWORKS, lambda part: check_learner("ddpg", ENV, SMALL, networks=part)),
+    "env": (mistakes.ENVS, lambda part: check_env(part())),
+}
+TABLE = [(kind, name) for kind, (table, _) in CHECKS.items() for name in table]
+
+
+@pytest.mark.parametrize(("kind", "name"), TABLE)
+def test_each_mistake_is_named_by_its_check(kind, name):
+    table, check = CHECKS[kind]
+    with pytest.raises(ValueError, match=table[name]) as raised:
+        check(getattr(mistakes, name))
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_right_passes(capsys):
+    for name in (*samplers.SAMPLERS, soon):
+        check_sampler(name, ENV)
+    for kernel in ("linear", "inverse", "softmax"):
+        check_kernel(kernel)
+    check_metric("position", ENV)
+    check_priority("eventful", ENV)
+    check_learner("ddpg", ENV, SMALL)
+    assert "no goal at" in check_sampler(within, ENV)
+    assert "goals of the past too" in check_sampler("episode", ENV)
+    assert "goals of the past never" in check_sampler("future", ENV)
+    parts = ["--env", "point_mass:PointMass", "--sampler", "weighted", "--metric", "test_mistakes:near"]
+    assert cli.main(["check", *parts, "--learner", "mjx_dher.learners.ddpg:make", "--priority", "test_mistakes:alike"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(" ")[0] for line in lines] == ["env", "metric", "weighted:", "priority", "learner"]
+    assert cli.main(["check"]) == 2
+    assert "one or more parts as module:attribute" in capsys.readouterr().err
+
+
+def within(achieved, desired, step, hparams):
+    """Future goals within a radius; often there is none."""
+    near = jnp.linalg.norm(achieved - desired, axis=-1) < 0.2
+    return jnp.where(near & samplers.future_mask(achieved.shape[0], step), 0.0, -jnp.inf)
+
+
+def near(achieved, desired):
+    return jnp.linalg.norm(achieved - desired, axis=-1)
+
+
+def alike(episode, compute_reward, hparams):
+    return jnp.ones(())
+
+
+FLAGS = [
+    *("--num-envs", "4", "--cycles-per-epoch", "1", "--updates-per-cycle", "2", "--target-period", "1", "--batch-size", "16"),
+    *("--total-steps", "40", "--replay-size", "80", "--hidden-sizes", "8", "--eval-episodes", "4", "--preset", "cpu"),
+]
+# On the command line, one of each kind, and each way in which the message can come about.
+THROUGH = [
+    ("sampler", "nan_late", []),
+    ("sampler", "two_arguments", []),
+    ("metric", "without_axis", ["--sampler", "closest"]),
+    ("weight_kernel", "pole", ["--sampler", "weighted"]),
+    ("priority", "negative", []),
+    ("learner", "unbounded", []),
+    ("networks", "swapped", []),
+    *(("env", name, []) for name in ("NanObservation", "RewardOfTwoAxes", "NoSteps", "Raising")),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "flags"), THROUGH)
+@pytest.mark.parametrize("command", ["train", "sweep", "check"])
+def test_each_is_named_by_the_command_before_anything_is_compiled(tmp_path, capsys, monkeypatch, kind, name, flags, command):
+    monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))
+    env = [] if kind == "env" else ["--env", "point_mass:PointMass"]
+    argv = [*env, f"--{kind.replace('_', '-')}", f"mistakes:{name}", *flags]
+    if command != "check":
+        argv += [*FLAGS, "--out", str(tmp_path / "out")]
+    assert cli.main([command, *argv] if command != "train" else argv) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert re.search(CHECKS[kind][0][name], error), error
+    assert not list(tmp_path.rglob("*.json"))
+    assert command == "sweep" or not (tmp_path / "out").exists()
+
+
+def train(tmp_path, env=ENV, **parts):
+    """Trains by a library call, which tries nothing out; returns the results and what was reported."""
+    told = []
+    spec = RunSpec(env="point_mass", config=SMALL, **parts)
+    return mjx_dher.train_runs(env, [spec], [tmp_path / "run"], options=Options(final_episodes=4), report=told.append), told
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "message"),
+    [
+        ("sampler", "scalar", "a sampler gives log weights"),
+        ("sampler", "whole_numbers", "floating-point numbers"),
+        ("metric", "without_axis", r"without_axis gives \[\]"),
+        ("metric", "without_norm", r"without_norm gives \[11, 2\]"),
+        ("weight_kernel", "mean_weight", r"mean_weight gives \[\]"),
+        ("priority", "of_each_step", "gives one weight"),
+        ("learner", "keeps_axis", r"gives actions \[N, A\] = \[4, 2\]; got \[4, 2, 1\]"),
+        ("networks", "one_action", "the actor must give"),
+    ],
+)
+def test_shapes_are_checked_where_a_function_is_handed_in(tmp_path, kind, name, message):
+    parts = {"metric": {"sampler": "closest"}, "weight_kernel": {"sampler": "weighted"}}.get(kind, {})
+    with pytest.raises(ValueError, match=message):
+        train(tmp_path, **{kind: f"mistakes:{name}"}, **parts)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("RewardOfTwoAxes", r"reward must be a scalar, \[\]; it has shape \(1,\)"),
+        ("ShorterGoal", r"vectors \[G\]"),
+        ("Growing", r"observation'\] is float32\[2\] and becomes float32\[4\]"),
+        ("NoActions", "action_size must lie in"),
+        ("NoSteps", "episode_length must lie in"),
+        ("WithoutAxis", r"compute_reward gives rewards \[B\] = .*; this one gives \[\]"),
+    ],
+)
+def test_shapes_of_an_environment_are_checked_in_training(tmp_path, name, message):
+    with pytest.raises(ValueError, match=message):
+        train(tmp_path, getattr(mistakes, name)())
+
+
+@pytest.mark.parametrize(
+    ("env", "parts", "reason"),
+    [
+        ("NanObservation", {}, "all 4 episodes were discarded"),
+        ("SuccessSeven", {}, "success must be 0 or 1; it is something else in 1 of the episodes"),
+        ("NanSuccess", {}, "success must be 0 or 1"),
+        (None, {"sampler": "mistakes:nothing"}, "the sampler offers no hindsight goal for any transition"),
+        (None, {"sampler": "mistakes:infinite"}, "the sampler offers no hindsight goal for any transition"),
+        (None, {"sampler": "closest", "metric": "mistakes:similarity"}, "the sampler offers no hindsight goal"),
+        (None, {"sampler": "weighted", "metric": "mistakes:similarity"}, "the sampler offers no hindsight goal"),
+        (None, {"sampler": "epsilon_closest", "metric": "mistakes:cosine"}, "the sampler offers no hindsight goal"),
+        (None, {"learner": "mistakes:breaks"}, "not finite"),
+    ],
+)
+def test_a_run_that_has_gone_bad_fails_and_says_why(tmp_path, env, parts, reason):
+    (result,), told = train(tmp_path, getattr(mistakes, env)() if env else ENV, **parts)
+    assert (result.status, result.epoch) == ("failed", 1)
+    assert reason in result.content["reason"]
+    assert "success_rate" not in result.content
+    assert any(line.startswith("failed in epoch 1: ") and reason in line for line in told)
+    assert not (tmp_path / "run" / "policy.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("env", "parts", "warning"),
+    [
+        ("Hundred", {}, r"epoch 1: .* of the rewards lie outside \[-1, 0\]"),
+        ("HalfNan", {}, r"epoch 1: \d of 4 episodes were discarded"),
+        (
+            None,
+            {"sampler": "mistakes:nan_late"},
+            r"epoch 1: for 0\.\d+ of the transitions to be relabelled the sampler offers no",
+        ),
+    ],
+)
+def test_trouble_is_told_once_and_training_goes_on(tmp_path, env, parts, warning):
+    (result,), told = train(tmp_path, getattr(mistakes, env)() if env else ENV, **parts)
+    assert result.status == "finished"
+    assert sum(bool(re.match(warning, line)) for line in told) == 1
+
+
+# The pieces by themselves.
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    actions = jax.random.normal(jax.random.key(0), (10, 6, 2))
+    return rollout(ENV, lambda action, obs: action, jax.random.key(1), 6, actions)[0]
+
+
+@pytest.fixture(scope="module")
+def ring(episodes):
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 8), episodes)
+
+
+def test_transitions_without_a_goal_keep_their_own_and_are_counted(ring):
+    sample = replay.sample(ring, jax.random.key(2), 400)
+    for sampler in (mistakes.nothing, mistakes.infinite, mistakes.nan_late, within):
+        batch, share = relabel.relabel_counted(ring, sample, sampler, ENV.compute_reward, HParams(her_k=1e9), jax.random.key(3))
+        log_weights = jax.vmap(sampler, (0, 0, 0, None))(sample.episode_goals, sample.desired_goal, sample.step, HParams())
+        offered = np.asarray(jnp.isfinite(jnp.max(log_weights, axis=1)))
+        kept = np.all(np.asarray(batch.desired_goal) == np.asarray(sample.desired_goal), axis=1)
+        assert np.all(kept[~offered])
+        assert share == pytest.approx(1 - offered.mean())
+        assert batch.reward.shape == (400,)
+    assert 0 < offered.mean() < 1
+
+
+def test_a_plain_function_is_a_sampler(ring):
+    sample = replay.sample(ring, jax.random.key(2), 50)
+    arguments = (ENV.compute_reward, HParams(), jax.random.key(3))
+    plain, named = (
+        relabel.relabel(ring, sample, sampler, *arguments) for sampler in (samplers.future, samplers.make("future"))
+    )
+    np.testing.assert_array_equal(plain.desired_goal, named.desired_goal)
+    assert samplers.make(samplers.future).log_weights is samplers.future
+    trainer.make_train(ENV, SMALL, sampler=samplers.future)
+    with pytest.raises(ValueError, match=r"sampler must be a function \(achieved, desired, step, hparams\)"):
+        samplers.make(3)
+
+
+@pytest.mark.parametrize("reward", [lambda a, d: ENV.compute_reward(a, d)[:, None], lambda a, d: jnp.zeros(())])
+def test_relabel_takes_rewards_of_one_axis(ring, reward):
+    sample = replay.sample(ring, jax.random.key(2), 5)
+    with pytest.raises(ValueError, match=r"compute_reward gives rewards \[B\] = \[5\] of goals \[B, G\] = \[5, 2\]"):
+        relabel.relabel(ring, sample, samplers.future, reward, HParams(), jax.random.key(3))
+
+
+def _of(episodes, **changes):
+    return episodes.replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda e: jax.tree.map(lambda x: x[0], e), r"must be float32\[N, 10, 2\]|must be float32\[N, 11, 2\]"),
+        (lambda e: e.replace(action=e.action[:, :5]), r"episodes\.action must be float32\[N, 10, 2\].*got float32\[6, 5, 2\]"),
+        (lambda e: e.replace(desired_goal=e.desired_goal[:, :1]), r"episodes\.desired_goal must be float32\[N, 2\]"),
+        (lambda e: e.replace(achieved_goal=e.achieved_goal[:, :-1]), r"episodes\.achieved_goal must be float32\[N, 11, 2\]"),
+        (lambda e: e.replace(observation={"x": e.observation}), "only one of them has"),
+        (lambda e: e.replace(desired_goal=e.desired_goal[:3]), r"N episodes \(of which actions have 6\)"),
+        (lambda e: e.replace(action=e.action.astype(jnp.complex64)), r"got complex64\[6, 10, 2\]"),
+    ],
+)
+def test_what_the_ring_has_no_place_for_is_named(ring, episodes, change, message):
+    with pytest.raises(ValueError, match=message):
+        replay.add(ring, change(episodes))
+
+
+@pytest.mark.parametrize(("name", "shape"), [("priority", (3,)), ("priority", (6, 1)), ("valid", (3,)), ("valid", ())])
+def test_weights_and_marks_are_one_for_each_episode(ring, episodes, name, shape):
+    with pytest.raises(ValueError, match=rf"{name} must be \[N\] = \[6\]"):
+        replay.add(ring, episodes, **{name: jnp.ones(shape)})
+
+
+def test_an_episode_without_size_has_no_ring(episodes):
+    one = jax.tree.map(lambda x: x[0], episodes)
+    with pytest.raises(ValueError, match=r"leaf \.action of an episode must not be empty; got shape \(10, 0\)"):
+        replay.init(one.replace(action=one.action[:, :0]), 4)
+
+
+def test_a_policy_s_actions_have_their_shape():
+    with pytest.raises(ValueError, match=r"the policy gives actions \[N, A\] = \[4, 2\]; got \[4, 3\]"):
+        rollout(ENV, lambda _, obs: jnp.zeros((4, 3)), jax.random.key(0), 4)
+
+
+def test_checks_are_public():
+    assert all(callable(getattr(testing, name)) for name in testing.__all__)
+    assert priorities.make(alike) is alike
