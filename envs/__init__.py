@@ -51,6 +51,7 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
         overrides["engine"] = engine
     elif engine != "auto":
         raise ValueError(f"env {name!r} has no engine to choose; got {engine!r}")
+    _check_arguments(name, constructor, overrides)
     try:
         env = constructor(**overrides)
     except TypeError as error:
@@ -61,6 +62,22 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
             f"env {name!r} is no environment: it has no {', '.join(missing)} (mjx_dher.types.Env says what one has)"
         )
     return env
+
+
+def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict[str, Any]) -> None:
+    """Raises ValueError for an argument that the constructor does not take; it names those that it takes, and its engine's."""
+    parameters = inspect.signature(constructor).parameters
+    named = [
+        key for key, parameter in parameters.items() if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+    ]
+    if len(named) < len(parameters):  # **options are the engine's, of which it alone knows
+        if name not in _REGISTRY:
+            return
+        from mjx_dher.envs.engines import engine_options
+
+        named += [key for key in engine_options(overrides["engine"]) if key not in named]
+    for key in overrides:
+        check_name(f"argument of env {name}", key, named)
 
 
 _MEMBERS = ("action_size", "episode_length", "reset", "step", "compute_reward")  # of types.Env

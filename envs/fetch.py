@@ -112,7 +112,7 @@ class FetchEnv(GoalEnv):
         return State(
             physics=physics,
             obs=obs,
-            reward=jnp.zeros(()),
+            reward=jnp.zeros((), jnp.float32),
             success=self._success(obs["achieved_goal"], obs["desired_goal"]),
             step=jnp.zeros((), jnp.int32),
             failed=jnp.zeros((), bool),
@@ -151,14 +151,14 @@ class FetchEnv(GoalEnv):
         self.engine.check()
 
     def _start(self, object_qpos: Array | None) -> Physics:
-        qpos = jnp.zeros(self.model.nq).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos))
+        qpos = jnp.zeros(self.model.nq, jnp.float32).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos, jnp.float32))
         if self.has_object:
-            qpos = qpos.at[self._object_qpos].set(object_qpos)
+            qpos = qpos.at[self._object_qpos].set(jnp.asarray(object_qpos, jnp.float32))
         # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
-        qvel = jnp.zeros(self.model.nv).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel))
+        qvel = jnp.zeros(self.model.nv, jnp.float32).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel, jnp.float32))
         if self.has_fingers:
-            qvel = qvel.at[self._finger_qvel].set(jnp.array(self.task.finger_qvel))
-        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv))
+            qvel = qvel.at[self._finger_qvel].set(jnp.array(self.task.finger_qvel, jnp.float32))
+        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv, jnp.float32))
 
     def _resting_place(self) -> Array | None:
         """Returns the object's qpos [7] after the physics has blown up: beside the gripper, as near as a reset would put it."""
@@ -181,7 +181,9 @@ class FetchEnv(GoalEnv):
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """Returns rewards: [..., 3], [..., 3] -> [...]. Sparse: 0 within the threshold, else -1. Dense: minus the distance."""
         distance = goal_distance(achieved_goal, desired_goal)
-        return -distance if self.reward_type == "dense" else -(distance > self.distance_threshold).astype(jnp.float32)
+        if self.reward_type == "dense":
+            return -distance
+        return -(~(distance <= self.distance_threshold)).astype(jnp.float32)  # -1, too, where the distance is NaN
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
         # Strict, unlike the reward: the original differs at a distance of exactly the threshold, so we do.
@@ -229,10 +231,16 @@ class FetchEnv(GoalEnv):
         finger_vel = physics.qvel[self._finger_qvel] if self.has_fingers else blocked
         if not self.has_object:
             observation = jnp.concatenate([grip_pos, finger_pos, grip_vel * DT, finger_vel * DT])
-            return GoalObs(observation=observation, achieved_goal=grip_pos, desired_goal=desired_goal)
+            return _in_float32(observation, grip_pos, desired_goal)
         object_qpos, object_qvel = physics.qpos[self._object_qpos], physics.qvel[self._object_qvel]
         observation = fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, finger_pos, finger_vel)
-        return GoalObs(observation=observation, achieved_goal=object_qpos[:3], desired_goal=desired_goal)
+        return _in_float32(observation, object_qpos[:3], desired_goal)
+
+
+def _in_float32(observation: Array, achieved_goal: Array, desired_goal: Array) -> GoalObs:
+    """Returns what an agent sees in float32, where JAX computes in 64 bits, too."""
+    observation, achieved_goal, desired_goal = (x.astype(jnp.float32) for x in (observation, achieved_goal, desired_goal))
+    return GoalObs(observation=observation, achieved_goal=achieved_goal, desired_goal=desired_goal)
 
 
 def goal_distance(achieved_goal: Array, desired_goal: Array) -> Array:

@@ -169,6 +169,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
           ValueError: `options` is not empty, or `GoalEnv.check` found a fault in the episodes so far.
         """
         _check_options(options)
+        _check_seeds([seed])
         super().reset(seed=seed)
         self._compiled.env.check()
         self.close()
@@ -272,6 +273,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         if isinstance(seed, (int, np.integer)):
             seed = [int(seed) + i for i in range(self.num_envs)]
         if seed is not None:
+            _check_seeds(list(seed) if isinstance(seed, (list, tuple, np.ndarray)) else [seed])
             if len(seed) != self.num_envs:
                 raise ValueError(f"seed must be one number or one for each of {self.num_envs} environments; got {len(seed)}")
             before = zip(self._np_random, self._np_random_seed)
@@ -333,6 +335,12 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
     if not np.all(np.isfinite(actions)):
         raise ValueError(f"action must be finite; got {actions}")
     return actions
+
+
+def _check_seeds(seeds: Sequence[Any]) -> None:
+    for seed in seeds:
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0):
+            raise ValueError(f"a seed must be an integer of at least 0, or None; got {seed!r}")
 
 
 def _check_options(options: dict[str, Any] | None) -> None:

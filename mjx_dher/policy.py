@@ -31,6 +31,11 @@ class Policy:
     norm_clip: float
     obs_clip: float
 
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in an observation, a goal and an action: D, G and A."""
+        return self.observation_mean.shape[0], self.goal_mean.shape[0], self.layers[-1][1].shape[0]
+
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
         """Computes the actions [..., A] for the observations of one state or a batch.
 
@@ -56,7 +61,8 @@ class Policy:
 
         def normalize(value, mean, std):
             value = xp.clip(value, -self.obs_clip, self.obs_clip)
-            return xp.clip((value - mean) / std, -self.norm_clip, self.norm_clip)
+            rank = (1,) * (value.ndim - 1)  # mean and std get the axes of the batch, which JAX may be told to insist on
+            return xp.clip((value - mean.reshape(*rank, -1)) / std.reshape(*rank, -1), -self.norm_clip, self.norm_clip)
 
         x = xp.concatenate(
             [
@@ -66,7 +72,7 @@ class Policy:
             axis=-1,
         )
         for index, (kernel, bias) in enumerate(self.layers):
-            x = x @ kernel + bias
+            x = x @ kernel + bias.reshape(*(1,) * (x.ndim - 1), -1)
             if index < len(self.layers) - 1:
                 x = xp.maximum(x, 0)
         return xp.tanh(x)
@@ -88,14 +94,41 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
     """Returns the policy with these `Policy.arrays`.
 
     Raises:
-      KeyError: an array is missing.
+      ValueError: an array is missing, or not what a policy has; the message names it.
     """
     num_layers = sum(name.endswith("_kernel") for name in arrays)
+    needed = [f"layer{i}_{part}" for i in range(max(1, num_layers)) for part in ("kernel", "bias")] + [*_VECTORS, *_SCALARS]
+    if missing := [name for name in needed if name not in arrays]:
+        raise ValueError(f"it has no array {missing[0]}")
+    for name in needed:
+        _check_array(name, arrays[name])
+    sizes = [arrays["observation_mean"].shape[0] + arrays["goal_mean"].shape[0]]
+    for i in range(num_layers):
+        kernel, bias = arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]
+        if kernel.shape[0] != sizes[-1] or bias.shape != kernel.shape[1:]:
+            raise ValueError(
+                f"layer{i}_kernel {list(kernel.shape)} and layer{i}_bias {list(bias.shape)} do not follow {sizes[-1]} numbers"
+            )
+        sizes.append(kernel.shape[1])
+    for name in ("observation", "goal"):
+        if arrays[f"{name}_mean"].shape != arrays[f"{name}_std"].shape:
+            raise ValueError(f"{name}_mean and {name}_std differ in shape")
     return Policy(
         layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
         **{field: arrays[field] for field in _VECTORS},
         **{field: float(arrays[field]) for field in _SCALARS},
     )
+
+
+def _check_array(name: str, array: Any) -> None:
+    """Raises ValueError for an array of the wrong type or number of axes, that is not finite, or that must be positive."""
+    ndim = 0 if name in _SCALARS else 2 if name.endswith("_kernel") else 1
+    if array.dtype.kind != "f" or array.ndim != ndim or 0 in array.shape:
+        raise ValueError(f"{name} must be floating-point numbers of {ndim} axes; it is {array.dtype}{list(array.shape)}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} must be finite")
+    if (name in _SCALARS or name.endswith("_std")) and not np.all(array > 0):
+        raise ValueError(f"{name} must be greater than 0; the least is {array.min():g}")
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:

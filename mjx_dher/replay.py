@@ -53,7 +53,7 @@ def init(episode: Episode, num_episodes: int) -> ReplayState:
             raise ValueError(f"leaf {name} must lead with T+1 = {length + 1} (T actions); got shape {leaf.shape}")
     return ReplayState(
         episodes=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape), x.dtype), episode),
-        priority=jnp.zeros(num_episodes),
+        priority=jnp.zeros(num_episodes, jnp.float32),
         cursor=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
     )

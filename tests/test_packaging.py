@@ -11,7 +11,7 @@ import mjx_dher
 
 # All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
-    "types names stats host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
+    "types names stats cli.output host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
     "config normalizer replay rollout host.caches host.warp_setup envs.base envs.kinematics envs.engines.base",
     "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx envs.engines.warp_substep tools.render",
     "presets networks priorities samplers runs.identity runs.health envs.engines.warp testing.env",

@@ -33,7 +33,7 @@ class PointMass:
 
     def reset(self, key: PRNGKey) -> PointState:
         """Start and goal are uniform in a square."""
-        start, goal = jax.random.uniform(key, (2, 2), minval=-0.4, maxval=0.4)
+        start, goal = jax.random.uniform(key, (2, 2), jnp.float32, minval=-0.4, maxval=0.4)
         return self._state(start, goal)
 
     def step(self, state: PointState, action: Array) -> PointState:

@@ -49,6 +49,21 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
     Raises:
       ValueError: there is no such engine or option, or the engine cannot run on this machine.
     """
+    for option in options:
+        check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
+    return _constructor(name)(model, substeps, **options)
+
+
+def engine_options(name: str) -> list[str]:
+    """Returns the options of an engine by name.
+
+    Raises:
+      ValueError: as for `make_engine`.
+    """
+    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps"})
+
+
+def _constructor(name: str) -> Callable[..., Engine]:
     name = resolve_engine(name)
     constructor: Callable[..., Engine]
     if name == "native":
@@ -59,7 +74,4 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
         from mjx_dher.envs.engines.warp import WarpEngine as constructor
     else:
         from mjx_dher.envs.engines.mjx import MjxEngine as constructor
-    allowed = set(inspect.signature(constructor).parameters) - {"model", "substeps"}
-    for option in options:
-        check_name(f"option of engine {name}", option, sorted(allowed))
-    return constructor(model, substeps, **options)
+    return constructor

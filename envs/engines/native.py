@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import os
 import threading
 from typing import Any
@@ -20,6 +21,16 @@ from mjx_dher.types import Array
 def usable_cores() -> int:
     """Returns the number of cores that this process may use, which a container or `taskset` can limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _drop_warnings() -> None:
+    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the current folder: what blows up is marked in the state.
+
+    A function of C is called, not one of Python, which MuJoCo's threads would have to wait for.
+    """
+    if os.name == "posix" and mujoco.get_mju_user_warning() is None:
+        ignore = ctypes.CFUNCTYPE(None, ctypes.c_char_p)(("strlen", ctypes.CDLL(None)))
+        mujoco.set_mju_user_warning(ignore)
 
 
 class NativeEngine:
@@ -42,6 +53,15 @@ class NativeEngine:
         self._num_threads = num_threads or usable_cores()
         self._batches: dict[int, Batch] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
+        _drop_warnings()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy, or a pickle, is made of: neither locks nor batches can be copied, and both are made anew."""
+        return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _batches={}, _lock=threading.Lock())
+        _drop_warnings()
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
         # One array in and one out, because each costs the callback some 20 microseconds.

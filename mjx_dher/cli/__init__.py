@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from mjx_dher import names
+from mjx_dher.cli import output
 
 # Each command, and the function (argv, console) -> exit status.
 COMMANDS = {
@@ -26,6 +27,9 @@ COMMANDS = {
     "doctor": "mjx_dher.cli.doctor:doctor_command",
 }
 
+MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that decide it
+TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk, not on the screen
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (2: the arguments were refused)."""
@@ -33,22 +37,46 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
         sys.path.append("")
+    with output.guarded() as stream:
+        try:
+            ended = _run(name, argv)
+        except SystemExit as error:  # of --help, and of arguments that cannot be parsed
+            ended = error.code if isinstance(error.code, int) else 1
+        stream.flush()
+    return output.status(stream, ended, name in TRAINING)
+
+
+def _run(name: str, argv: list[str]) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             names.check_name("command", argv[0], COMMANDS)
         module, function = COMMANDS[name].split(":")
         command = getattr(importlib.import_module(module), function)
-        return command(argv, Console(highlight=False, markup=False))
-    except ValueError as error:
-        for line in str(error).splitlines():
-            print(f"error: {line}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:  # whoever read the output has gone, as in `train.py --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains when it flushes
-        return 128 + signal.SIGPIPE
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return int(command(argv, Console(highlight=False, markup=False)))
     except KeyboardInterrupt:  # outside of training, which ends in order
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT
+    except Exception as error:
+        if (reason := _sentence(error)) is None:
+            raise  # a fault of this program, whose place its report should have
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
+            for line in reason.splitlines():
+                print(f"error: {line}", file=sys.stderr)
+        return 2
+
+
+def _sentence(error: Exception) -> str | None:
+    """Returns what a user is told of an error that comes of what was asked for, or of the machine; None for others."""
+    if isinstance(error, ValueError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return f"memory does not suffice ({_first_line(error)}); what decides it: {', '.join(MEMORY)}"
+    if isinstance(error, RecursionError):
+        return f"something is nested too deeply ({_first_line(error)})"
+    return None
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

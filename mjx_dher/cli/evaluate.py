@@ -35,11 +35,12 @@ def eval_command(argv: list[str], console: Console) -> int:
     check_count("episodes", args.episodes)
     check_engine(args.engine)
     run = read_run(args.run, console)
-    from mjx_dher.runs.load import load_policy
+    from mjx_dher.runs.load import check_fits, load_policy
     from mjx_dher.runs.play import play, summarize
 
     policy = load_policy(args.run)
     env = envs.make(run.env, engine=args.engine or run.engine)
+    check_fits(policy, env)
     console.print(f"{run.env}: {args.episodes} episodes, seed {args.seed}, physics {run_folder.engine_name(env)} ...")
     keep_compiled_programs()
     print_summary(summarize(*play(env, policy, args.episodes, args.seed)), console)

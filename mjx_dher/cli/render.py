@@ -46,6 +46,7 @@ class RenderArgs:
 
 def render_command(argv: list[str], console: Console) -> int:
     """Draws episodes of a run's policy, or of random actions."""
+    from mjx_dher.runs.load import check_fits, load_policy
     from mjx_dher.tools import render
 
     args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
@@ -53,8 +54,6 @@ def render_command(argv: list[str], console: Console) -> int:
     check_count("episodes", args.episodes)
     check_engine(args.engine)
     if args.run is not None and args.env is None:
-        from mjx_dher.runs.load import load_policy
-
         played, policy = read_run(args.run, console), load_policy(args.run)
     elif args.env is not None and args.run is None:
         check_name("env", args.env, envs.list_envs(), own=True)
@@ -64,6 +63,8 @@ def render_command(argv: list[str], console: Console) -> int:
     render.ffmpeg()
     gl = render.choose_gl()
     env: Any = envs.make(played.env, engine=args.engine or played.engine)  # Any: a GoalEnv need not have a model
+    if policy is not None:
+        check_fits(policy, env)
     import jax
     import jax.numpy as jnp
 

@@ -43,7 +43,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     check_count("episodes", args.episodes)
     run = read_run(args.run, console)
     from mjx_dher.envs.engines.native import usable_cores
-    from mjx_dher.runs.load import check_plain, load_policy
+    from mjx_dher.runs.load import check_fits, check_plain, load_policy
     from mjx_dher.runs.play import play, summarize
     from mjx_dher.stats import difference_interval
     from mjx_dher.tools import originals
@@ -57,6 +57,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     python = args.python or originals.interpreter(environment)
     name = originals.check(run.env, python)
     env = envs.make(run.env, engine=args.engine or run.engine)
+    check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
     theirs = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
     summary_original = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])

@@ -19,9 +19,28 @@ def keep_compiled_programs() -> None:
     """
     import jax
 
+    check_platform()
     config: Any = jax.config  # not all versions of JAX have types for its fields
     if config.jax_compilation_cache_dir is None:
         config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
+
+
+def check_platform() -> None:
+    """Starts JAX's devices.
+
+    Raises:
+      ValueError: the platform that JAX_PLATFORMS asks for does not exist on this machine.
+    """
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:  # an AssertionError where the package of a platform is missing
+        reason = (str(error).splitlines() or ["it is not installed"])[0]
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise ValueError(
+            f"JAX_PLATFORMS={asked!r}: JAX cannot start this platform ({reason}); unset it, or take cpu"
+        ) from error
 
 
 def prepare() -> None:

@@ -78,9 +78,10 @@ def new_folder(folder: Path) -> Iterator[None]:
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     make_folder(folder)
     try:
+        if not (folder / LOCK).exists():  # else another program may be at work on it, which says more
+            _refuse_used(folder)  # before a lock is left in what is someone else's
         with lock(folder):
-            if is_used(folder):
-                raise FolderError(f"out: {folder} is there already and is never overwritten; name a new or empty folder")
+            _refuse_used(folder)
             try:
                 yield
             finally:
@@ -90,6 +91,11 @@ def new_folder(folder: Path) -> Iterator[None]:
         for path in missing:
             with contextlib.suppress(OSError):  # something is in it
                 path.rmdir()
+
+
+def _refuse_used(folder: Path) -> None:
+    if is_used(folder):
+        raise FolderError(f"out: {folder} is there already and is never overwritten; name a new or empty folder")
 
 
 def is_used(folder: Path) -> bool:

@@ -46,9 +46,9 @@ def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: 
     """Draws noise for `num_envs` episodes of `num_steps` steps: a fraction `random_eps` of the actions is uniformly random."""
     gaussian_key, uniform_key = jax.random.split(key)
     shape = (num_steps, num_envs)
-    uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1))
+    uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1), jnp.float32)
     return Noise(
-        gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size)),
+        gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size), jnp.float32),
         is_random=uniform[..., -1] < hparams.random_eps,
         uniform=2.0 * uniform[..., :-1] - 1.0,
     )

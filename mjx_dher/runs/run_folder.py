@@ -131,7 +131,7 @@ def read_versioned(file: Path, *schemas: int) -> dict[str, Any]:
         content = json.loads(file.read_text())
     except FileNotFoundError:
         raise
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise FolderError(f"{file} cannot be read ({error})") from error
     schema = content.get("schema") if isinstance(content, dict) else None
     if schema not in schemas:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,9 @@ class Stop:
         self._console, self._folder = console, folder
 
     def __enter__(self) -> Stop:
+        self._handlers: dict[int, Any] = {}
+        if threading.current_thread() is not threading.main_thread():  # where Python takes no handlers
+            return self
         self._handlers = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         return self
 

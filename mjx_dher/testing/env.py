@@ -50,7 +50,9 @@ def check_env(env: Env, seed: int = 0, tolerance: float = 1e-3) -> None:
     _check_attributes(env)
     reset_key, action_key = jax.random.split(jax.random.key(seed))
     keys = jax.random.split(reset_key, STARTS)
-    actions = jax.random.uniform(action_key, (env.episode_length, STARTS, env.action_size), minval=-1.0, maxval=1.0)
+    actions = jax.random.uniform(
+        action_key, (env.episode_length, STARTS, env.action_size), jnp.float32, minval=-1.0, maxval=1.0
+    )
     first = _check_single(env, keys[0], actions[0, 0], tolerance)
     states = _play(env, keys, actions)
     played = jax.device_get(_outputs(states))  # [T+1, N, ...]

@@ -23,7 +23,7 @@ def random_episodes(env: Env, seed: int = 0) -> Episode:
     """Plays 16 episodes of uniformly random actions; leaves lead with [16]."""
     key, action_key = jax.random.split(jax.random.key(seed))
     shape = (env.episode_length, EPISODES, env.action_size)
-    actions = jax.random.uniform(action_key, shape, minval=-1.0, maxval=1.0)
+    actions = jax.random.uniform(action_key, shape, jnp.float32, minval=-1.0, maxval=1.0)
     return jax.jit(lambda: rollout(env, lambda action, obs: action, key, EPISODES, actions)[0])()
 
 

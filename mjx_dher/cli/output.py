@@ -1,0 +1,71 @@
+"""Standard output that a command can lose without losing what it does."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+
+class Guarded:
+    """A text stream that drops what cannot be written, and keeps the first error. All else is the stream's own."""
+
+    def __init__(self, stream: Any):
+        self.error: OSError | None = None
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Writes `text`, or drops it."""
+        self._attempt("write", text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Writes what the stream has kept back, or drops it."""
+        self._attempt("flush")
+
+    def _attempt(self, method: str, *args: Any) -> None:
+        if self._stream is None or self.error is not None:
+            return
+        try:
+            getattr(self._stream, method)(*args)
+        except OSError as error:
+            self.error = error
+            with contextlib.suppress(OSError, ValueError):  # the interpreter would complain when it flushes what is left
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+    def __getattr__(self, name: str) -> Any:
+        if self._stream is None and name == "isatty":
+            return lambda: False
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[Guarded]:
+    """Guards sys.stdout."""
+    before = sys.stdout
+    stream = Guarded(before)
+    sys.stdout = stream
+    try:
+        yield stream
+    finally:
+        stream.flush()
+        sys.stdout = before
+
+
+def status(stream: Guarded, ended: int, trains: bool) -> int:
+    """Returns the exit status of a command that ended with `ended`, and tells of output that was lost.
+
+    One that trains has done what it was to do; to another, whose output is its purpose, the loss is an error, or, where the
+    reader has gone (`| head`), what SIGPIPE would have been.
+    """
+    if stream.error is None:
+        return ended
+    gone = isinstance(stream.error, BrokenPipeError)
+    if not gone or trains:
+        lost = "what was printed since then is lost" if trains else "the output is not complete"
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr may be gone, too
+            print(f"error: cannot print ({stream.error.strerror}); {lost}", file=sys.stderr)
+    return ended if trains or ended else (128 + signal.SIGPIPE if gone else 2)
