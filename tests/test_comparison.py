@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_dher import RunSpec, stats
+from mjx_dher.host.files import FolderError
 from mjx_dher.runs import identity
 from mjx_dher.sweeps import comparison
 
@@ -17,7 +18,15 @@ def cell(sampler, seed, success, env="push", final=None, **numbers):
     }
     final = {"success_rate": success[-1] if final is None else final, "reset_success_rate": 0.07}
     settings = {**identity.settings(RunSpec(env=env, sampler=sampler)), **numbers}
-    return {"settings": settings, "seed": seed, "status": "finished", "curve": curve, "final": final}
+    return {
+        "settings": settings,
+        "seed": seed,
+        "status": "finished",
+        "curve": curve,
+        "final": final,
+        "lanes": 1,
+        "folder": f"cells/{sampler}-{seed}",
+    }
 
 
 SLOW = [[0.0, 0.2, 0.5, 0.9], [0.1, 0.3, 0.5, 0.8], [0.0, 0.2, 0.6, 0.9]]
@@ -103,3 +112,63 @@ def test_the_table_says_never_where_no_seed_got_there(tmp_path):
     lines = (tmp_path / comparison.COMPARISON).read_text().splitlines()
     assert lines[0].split(",") == list(comparison.Row._fields)
     assert len(lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("reach", "median"),
+    [([2, 9], math.inf), ([6, 8, 0, 0], math.inf), ([6, 8], 7), ([6, 8, 9, 0], 8.5), ([6, 8, 0], 8), ([6, 0, 0], math.inf)],
+)
+def test_the_median_is_the_median(reach, median):
+    """Epochs to the threshold; 0: never. With an even number of seeds it lies between the two in the middle."""
+    curves = [[1.0 if first and epoch >= first else 0.0 for epoch in range(1, 10)] for first in reach]
+    if reach == [2, 9]:
+        curves[1] = [0.0] * 9
+    (group,) = comparison.groups([cell("future", i, curve) for i, curve in enumerate(curves)])["push"]
+    (row,) = comparison.compare([group], "future", 0.9)
+    assert (row.epochs, row.env_steps) == (median, 1000 * median)
+    assert row.epochs_low <= row.epochs <= row.epochs_high
+    _, ((*_, epochs, _, _),) = comparison.table([row])
+    assert epochs.startswith("inf (" if median == math.inf else f"{median:g} (")
+
+
+def test_settings_that_print_alike_stay_apart():
+    cells = [cell("future", seed, SLOW[0], gamma=g) for seed in (0, 1) for g in (0.98, 0.98000001)]
+    groups = comparison.groups(cells)["push"]
+    assert [g.label for g in groups] == ["future, gamma 0.98", "future, gamma 0.98000001"]
+    assert [g.seeds for g in groups] == [(0, 1), (0, 1)]
+
+
+def test_own_code_that_changed_is_another_setting():
+    cells = [cell("future", 0, SLOW[0], source=source) for source in ("", "task.py 0123456789", "task.py abcdef0123")]
+    labels = [g.label for g in comparison.groups(cells)["push"]]
+    assert labels == ["future, source unknown", "future, task.py 0123456789", "future, task.py abcdef0123"]
+
+
+def test_no_seed_is_counted_twice():
+    """A copied folder is named; runs that differ in what their sampler does not read are the same run."""
+    copied = [cell("future", 0, SLOW[0]), {**cell("future", 0, SLOW[0]), "folder": "cells/copy"}]
+    with pytest.raises(FolderError, match="cells/future-0 and cells/copy hold the same run"):
+        comparison.groups(copied)
+    alike = [cell("future", 0, SLOW[0], temperature=t) for t in (0.5, 1.0)]
+    others = [cell("weighted", 0, SLOW[0], temperature=t) for t in (0.5, 1.0)]
+    groups = comparison.groups([*alike, *others])["push"]
+    assert [(g.label, g.seeds) for g in groups] == [
+        ("future", (0,)),
+        ("weighted, temperature 0.5", (0,)),
+        ("weighted, temperature 1", (0,)),
+    ]
+
+
+def failed(trial, epochs):
+    """The trial as one that failed in the epoch after `epochs` of them."""
+    curve = {name: values[:epochs] for name, values in trial["curve"].items()}
+    return {**trial, "status": "failed", "reason": "not finite", "curve": curve, "final": {}}
+
+
+def test_a_setting_that_failed_throughout_has_no_numbers():
+    cells = [*CELLS[:3], *(failed(cell("future", i, SLOW[0]), 2) for i in range(3))]
+    rows = comparison.compare(comparison.groups(cells)["push"], "weighted", 0.9)
+    _, lines = comparison.table(rows)
+    assert lines[0][:6] == ["push", "future", "3 (3 failed)", "failed", "failed", "never"]
+    assert [(row.failed, row.setting) for row in rows] == [(3, "future"), (0, "weighted")]
+    assert math.isnan(rows[0].at_reset)

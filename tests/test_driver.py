@@ -120,11 +120,11 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
     assert {seed: row["status"] for seed, row in finals.items()} == {"0": "finished", "1": "failed", "2": "finished"}
     assert finals["1"]["success_rate"] == ""
     for group in comparison.groups(trials)["point_mass:PointMass"]:
-        assert group.diverged == (1 if group.others["her_k"] == 7 else 0)
-        if group.diverged:
+        assert group.failed == (1 if group.others["her_k"] == 7 else 0)
+        if group.failed:
             assert group.final.tolist() == [0.0]
             assert group.success.shape == (1, 1)
-    assert any("(1 diverged)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
+    assert any("(1 failed)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
 
 
 def _rows(trials):
@@ -134,13 +134,13 @@ def _rows(trials):
 def test_a_run_that_diverged_counts_as_a_failure_from_then_on():
     curve = {"epoch": [1, 2, 3], "env_steps": [1, 2, 3], "wall_seconds": [1.0, 2.0, 3.0], "success_rate": [0.5, 0.6, 0.7]}
     settings = {"env": "e", "sampler": "future", "gamma": 0.9}
-    whole = {"settings": settings, "seed": 0, "status": "finished", "curve": curve}
+    whole = {"settings": settings, "seed": 0, "status": "finished", "curve": curve, "lanes": 1, "folder": "a"}
     whole["final"] = {"success_rate": 0.8, "reset_success_rate": 0.1}
     cut = {name: values[:1] for name, values in curve.items()}
     (group,) = comparison.groups([whole, {**whole, "seed": 1, "status": "failed", "curve": cut, "final": {}}])["e"]
     np.testing.assert_array_equal(group.success, [[0.5, 0.6, 0.7], [0.5, 0.0, 0.0]])
     np.testing.assert_array_equal(group.final, [0.8, 0.0])
-    assert (group.diverged, group.at_reset) == (1, 0.1)
+    assert (group.failed, group.at_reset) == (1, 0.1)
     np.testing.assert_array_equal(group.seconds, [1.0, 2.0, 3.0])
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
+from rich.table import Table
 
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
@@ -85,6 +87,21 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
         f" mean return {summary['return_mean']:.2f}",
         soft_wrap=True,
     )
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> None:
+    """Prints a table whole: as wide as it is where there is no terminal, and row by row on a terminal that is narrower."""
+    table = Table(*head)
+    for row in rows:
+        table.add_row(*row)
+    width = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
+    if not console.is_terminal:
+        Console(file=console.file, width=width, highlight=False, markup=False).print(table)  # `print` allows no wider one
+    elif width <= console.width:
+        console.print(table)
+    else:
+        for row in rows:
+            console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n", soft_wrap=True)
 
 
 class Screen:

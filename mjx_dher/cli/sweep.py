@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, refuse_foreign_flags, try_parts
+from mjx_dher.cli.common import Screen, print_table, refuse_foreign_flags, try_parts
 from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
@@ -252,9 +251,9 @@ def plot_command(argv: list[str], console: Console) -> int:
     check_number("threshold", args.threshold, "(0, 1]", float)
     plotting.check(args.formats)
     by_env = comparison.groups(tables.read(args.folder))
-    rows = _compare(args.folder, by_env, args.baseline, args.threshold, console)
     out = args.out or args.folder
-    out.mkdir(parents=True, exist_ok=True)
+    files.make_folder(out)
+    rows = _compare(out, by_env, args.baseline, args.threshold, console)
     for env, groups in by_env.items():
         own = [row for row in rows if row.env == env]
         for path in plotting.write(out, groups, own, args.threshold, args.formats):
@@ -270,11 +269,7 @@ def _compare(
 
     rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
     comparison.write(folder, rows)
-    head, lines = comparison.table(rows)
-    table = Table(*head)
-    for line in lines:
-        table.add_row(*line)
-    console.print(table)
+    print_table(*comparison.table(rows), console)
     for env, groups in by_env.items():
         if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
             labels = "; ".join(group.label for group in groups)

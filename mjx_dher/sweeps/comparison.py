@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import functools
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mjx_dher import stats
 from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
 from mjx_dher.runs.run_folder import FAILED
 from mjx_dher.spec import SAMPLERS, reads
 
@@ -27,7 +28,8 @@ class Group(NamedTuple):
     sampler: str
     others: dict[str, Any]  # the other values that differ and that this sampler reads
     seeds: tuple[int, ...]  # S of them
-    diverged: int  # runs of which the learner did not stay finite
+    failed: int  # runs that failed
+    lanes: int  # most that ran side by side
     epoch: NDArray  # [P]
     env_steps: NDArray  # [P]
     seconds: NDArray  # [P] the mean over the seeds
@@ -47,25 +49,45 @@ def groups(trials: list[dict[str, Any]]) -> dict[str, list[Group]]:
 def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     settings = [trial["settings"] for trial in trials]
     varying = [name for name in settings[0] if name not in ("sampler", "env") and len({str(s[name]) for s in settings}) > 1]
-    by_label: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
+    by_setting: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
     for trial, setting in zip(trials, settings):
         own = {name: setting[name] for name in varying if reads(setting["sampler"], name)}
-        label = ", ".join([setting["sampler"], *(_format(name, value) for name, value in own.items())])
-        by_label.setdefault(label, (own, []))[1].append(trial)
+        by_setting.setdefault(str((setting["sampler"], own)), (own, []))[1].append(trial)
     order = {name: number for number, name in enumerate(SAMPLERS)}
-    result = [_group(env, label, *rest) for label, rest in by_label.items()]
+    labels = [_label(alike[0], own, _format) for own, alike in by_setting.values()]
+    exact = [_label(alike[0], own, lambda name, value: f"{name} {value!r}") for own, alike in by_setting.values()]
+    labels = [label if labels.count(label) == 1 else digits for label, digits in zip(labels, exact)]
+    result = [_group(env, label, own, _once_a_seed(alike)) for label, (own, alike) in zip(labels, by_setting.values())]
     # Numbers in rising order; names of one setting are all strings.
     return sorted(result, key=lambda group: (order.get(group.sampler, len(order)), list(group.others.values())))
 
 
+def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any], str]) -> str:
+    return ", ".join([trial["settings"]["sampler"], *(form(name, value) for name, value in own.items())])
+
+
 def _format(name: str, value: Any) -> str:
-    return (
-        str(value) if isinstance(value, str) else f"{name} {value:g}" if isinstance(value, (int, float)) else f"{name} {value}"
-    )
+    if isinstance(value, str):
+        return value or f"{name} unknown"
+    return f"{name} {value:g}" if isinstance(value, (int, float)) else f"{name} {value}"
+
+
+def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns the trials of one setting, each seed once: runs that differ in what they do not read alone are the same.
+
+    Raises:
+      FolderError: two folders hold the same run, as after a copy.
+    """
+    by_seed: dict[int, dict[str, Any]] = {}
+    for trial in trials:
+        first = by_seed.setdefault(trial["seed"], trial)
+        if first is not trial and first["settings"] == trial["settings"]:
+            raise FolderError(f"{first['folder']} and {trial['folder']} hold the same run: remove one of them")
+    return list(by_seed.values())
 
 
 def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, Any]]) -> Group:
-    """Returns the group of one setting's trials. A run that diverged has a success of 0 from then on."""
+    """Returns the group of one setting's trials. A run that failed has a success of 0 from then on."""
     trials = sorted(trials, key=lambda trial: trial["seed"])
     longest = max((trial["curve"] for trial in trials), key=lambda curve: len(curve.get("epoch", ())))
     longest = longest or {"epoch": [1], "env_steps": [0], "wall_seconds": [0.0]}
@@ -79,7 +101,8 @@ def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, 
         sampler=trials[0]["settings"]["sampler"],
         others=others,
         seeds=tuple(trial["seed"] for trial in trials),
-        diverged=sum(trial["status"] == FAILED for trial in trials),
+        failed=sum(trial["status"] == FAILED for trial in trials),
+        lanes=max(trial["lanes"] for trial in trials),
         epoch=np.array(longest["epoch"]),
         env_steps=np.array(longest["env_steps"]),
         seconds=np.mean(whole or [longest["wall_seconds"]], axis=0),
@@ -95,7 +118,7 @@ class Row(NamedTuple):
     env: str
     setting: str
     seeds: int
-    diverged: int  # seeds whose learner did not stay finite; their success is 0 from then on
+    failed: int  # seeds whose run failed; their success is 0 from then on
     final: float  # mean success rate of the last policies
     final_iqm: float  # interquartile mean of these rates
     final_low: float
@@ -151,8 +174,7 @@ def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | 
 def _row(group: Group, base: Group | None, threshold: float) -> Row:
     areas = _areas(group)
     reach = stats.first_reach(group.epoch, group.success, threshold)
-    median = functools.partial(np.quantile, q=0.5, method="inverted_cdf")
-    epochs = float(median(reach))
+    epochs = float(np.median(reach))
     steps_per_epoch = group.env_steps[0] / group.epoch[0]
     nan = math.nan
     better, gain, p_value = (nan, nan, nan), nan, nan
@@ -165,7 +187,7 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
         group.env,
         group.label,
         len(group.seeds),
-        group.diverged,
+        group.failed,
         float(group.final.mean()),
         stats.interquartile_mean(group.final),
         *stats.bootstrap_interval(group.final),
@@ -174,7 +196,7 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
         *stats.bootstrap_interval(areas),
         int(np.isfinite(reach).sum()),
         epochs,
-        *stats.bootstrap_interval(reach, median),
+        *stats.bootstrap_interval(reach, np.median),
         epochs * steps_per_epoch,
         *better,
         gain,
@@ -195,13 +217,14 @@ def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     cells = []
     for r in rows:
         epochs = f"{r.epochs:g} ({r.epochs_low:g}-{r.epochs_high:g}); {r.reached} of {r.seeds}" if r.reached else "never"
+        all_failed = r.failed == r.seeds
         cells.append(
             [
                 r.env,
                 r.setting,
-                f"{r.seeds} ({r.diverged} diverged)" if r.diverged else str(r.seeds),
-                f"{r.final_iqm:.3f} ({r.final_low:.3f}-{r.final_high:.3f})",
-                f"{r.area:.3f} ({r.area_low:.3f}-{r.area_high:.3f})",
+                f"{r.seeds} ({r.failed} failed)" if r.failed else str(r.seeds),
+                "failed" if all_failed else f"{r.final_iqm:.3f} ({r.final_low:.3f}-{r.final_high:.3f})",
+                "failed" if all_failed else f"{r.area:.3f} ({r.area_low:.3f}-{r.area_high:.3f})",
                 epochs,
                 "" if math.isnan(r.better) else f"{r.better:.2f} ({r.better_low:.2f}-{r.better_high:.2f})",
                 "" if math.isnan(r.p_corrected) else f"{r.p_corrected:.3g}",

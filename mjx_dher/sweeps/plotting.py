@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +38,20 @@ def check(formats: Sequence[str]) -> None:
 def curves(groups: Sequence[Group], threshold: float) -> Any:
     """Draws success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
     plt = _pyplot()
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True, layout="constrained")
+    labels = [textwrap.fill(_name(group), 120) for group in groups]
+    columns = max(1, min(4, 140 // (6 + max(map(len, labels)))))
+    height = 3.6 + 0.2 * math.ceil(len(groups) / columns)
+    figure, axes = plt.subplots(1, 3, figsize=(12, height), sharey=True, layout="constrained")
     for group, (color, line, marker) in zip(groups, _styles(len(groups))):
         middle, low, high = stats.curve_interval(group.success)
         every = max(1, len(group.epoch) // 8)
         for axis, x in zip(axes, (group.epoch, group.env_steps / 1e6, group.seconds)):
             axis.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0)
-            axis.plot(x, middle, color=color, linestyle=line, marker=marker, markevery=every, markersize=4, label=group.label)
-    for axis, label in zip(axes, ("epoch", "million environment steps", "seconds (all runs side by side)")):
+            style = {"color": color, "linestyle": line, "marker": marker, "markevery": every, "markersize": 4}
+            axis.plot(x, middle, **style, label=_name(group))
+    side_by_side = max(group.lanes for group in groups) > 1
+    seconds = "seconds (all runs side by side)" if side_by_side else "seconds (of one run)"
+    for axis, label in zip(axes, ("epoch", "million environment steps", seconds)):
         axis.axhline(threshold, color="0.6", linewidth=0.8)
         axis.axhline(groups[0].at_reset, color="0.6", linewidth=0.8, linestyle=":")
         axis.set_xlabel(label)
@@ -51,8 +59,10 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
         axis.grid(alpha=0.2)
     axes[0].set_ylim(-0.02, 1.02)
     axes[0].set_ylabel("success rate")
-    figure.suptitle(f"{groups[0].env}: interquartile mean of {len(groups[0].seeds)} seeds, 95 % interval", fontsize=11)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    title = f"{groups[0].env}: interquartile mean of {_seeds(len(group.seeds) for group in groups)}, 95 % interval"
+    figure.suptitle(_folded(title, 12), fontsize=11)
+    handles, _ = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return figure
 
 
@@ -62,7 +72,10 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
     Seeds that never reach the threshold lie above the dashed line.
     """
     plt = _pyplot()
-    figure, axis = plt.subplots(figsize=(1.6 + 1.3 * len(groups), 3.8), layout="constrained")
+    names = ["\n".join(textwrap.fill(part, 20) for part in _name(group).split(", ")) for group in groups]
+    lines = max(name.count("\n") for name in names)
+    width = 1.6 + max(3.0, max(1.3, 0.085 * max(len(line) for name in names for line in name.split("\n"))) * len(groups))
+    figure, axis = plt.subplots(figsize=(width, 3.8 + 0.13 * lines), layout="constrained")
     last = max(float(group.epoch[-1]) for group in groups)
     never = 1.1 * last
     for place, (group, row, (color, _, marker)) in enumerate(zip(groups, rows, _styles(len(groups)))):
@@ -73,11 +86,11 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
         axis.errorbar(place + 0.32, middle, [[middle - low], [high - middle]], color=color, marker=marker, capsize=4)
     axis.axhline(1.05 * last, color="0.6", linewidth=0.8, linestyle="--")
     axis.text(-0.45, never, "never", fontsize=8, va="center", color="0.3")
-    axis.set_xticks(range(len(groups)), [group.label.replace(", ", "\n") for group in groups], fontsize=8)
+    axis.set_xticks(range(len(groups)), names, fontsize=8)
     axis.set_xlim(-0.5, len(groups) - 0.3)
     axis.set_ylim(0, 1.16 * last)
     axis.set_ylabel(f"epochs to {threshold:g}")
-    axis.set_title(f"{groups[0].env}: each seed, and the median with its 95 % interval", fontsize=10)
+    figure.suptitle(_folded(f"{groups[0].env}: each seed, and the median with its 95 % interval", width), fontsize=10)
     axis.grid(axis="y", alpha=0.2)
     return figure
 
@@ -85,7 +98,9 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
 def comparison(rows: Sequence[Row]) -> Any:
     """Draws final success, mean success over all epochs, and probability of improvement on the baseline, with intervals."""
     plt = _pyplot()
-    figure, axes = plt.subplots(1, 3, figsize=(11, 1.2 + 0.45 * len(rows)), sharey=True, layout="constrained")
+    names = [textwrap.fill(f"{row.setting}{_failures(row.failed, row.seeds)}", 40) for row in rows]
+    lines = sum(1 + name.count("\n") for name in names)
+    figure, axes = plt.subplots(1, 3, figsize=(11, 1.4 + 0.3 * lines + 0.15 * len(rows)), sharey=True, layout="constrained")
     panels = (
         ("final success (IQM)", [(r.final_iqm, r.final_low, r.final_high) for r in rows]),
         ("mean success over epochs (IQM)", [(r.area, r.area_low, r.area_high) for r in rows]),
@@ -93,16 +108,18 @@ def comparison(rows: Sequence[Row]) -> Any:
     )
     for axis, (label, values) in zip(axes, panels):
         for place, ((middle, low, high), (color, _, marker)) in enumerate(zip(values, _styles(len(rows)))):
-            if np.isfinite(middle):
+            if np.isfinite(middle) and rows[place].failed < rows[place].seeds:
                 around = [[max(0.0, middle - low)], [max(0.0, high - middle)]]
                 axis.errorbar(middle, place, xerr=around, color=color, marker=marker, markersize=5, capsize=3)
         axis.set_xlabel(label)
+        axis.locator_params(axis="x", nbins=4)
+        axis.ticklabel_format(axis="x", useOffset=False)
         axis.grid(axis="x", alpha=0.2)
     axes[2].axvline(0.5, color="0.6", linewidth=0.8)
     axes[2].set_xlim(-0.03, 1.03)
-    axes[0].set_yticks(range(len(rows)), [row.setting for row in rows])
+    axes[0].set_yticks(range(len(rows)), names, fontsize=9)
     axes[0].invert_yaxis()
-    figure.suptitle(f"{rows[0].env}: {rows[0].seeds} seeds, 95 % intervals", fontsize=11)
+    figure.suptitle(_folded(f"{rows[0].env}: {_seeds(row.seeds for row in rows)}, 95 % intervals", 11), fontsize=11)
     return figure
 
 
@@ -124,6 +141,24 @@ def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold:
             written.append(path)
         plt.close(figure)
     return written
+
+
+def _name(group: Group) -> str:
+    return group.label + _failures(group.failed, len(group.seeds))
+
+
+def _failures(failed: int, seeds: int) -> str:
+    return f" ({failed} of {seeds} failed)" if failed else ""
+
+
+def _seeds(counts: Iterable[int]) -> str:
+    low, *_, high = (*(ordered := sorted(counts)), ordered[-1])
+    return f"{low} seeds" if low == high else f"{low} to {high} seeds"
+
+
+def _folded(title: str, width: float) -> str:
+    """Returns a title in as many lines as a figure `width` inches wide takes."""
+    return textwrap.fill(title, int(11.5 * width))
 
 
 def _styles(number: int) -> list[tuple[Any, Any, str]]:

@@ -77,7 +77,7 @@ def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
         epochs = range(len(curve.get("epoch", ())))
         results += [{**head, **{name: values[i] for name, values in curve.items()}} for i in epochs]
         last = {name: curve[name][-1] for name in ("epoch", "env_steps", "updates", "wall_seconds") if epochs}
-        finals.append({**head, "status": trial["status"], **last, **trial["final"]})
+        finals.append({**head, "status": trial["status"], "reason": trial["reason"], **last, **trial["final"]})
     _write_csv(folder / RESULTS, results)
     _write_csv(folder / FINALS, finals)
     columns = {name: np.array([row.get(name, np.nan) for row in results]) for name in _columns(results)}
