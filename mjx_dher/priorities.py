@@ -14,7 +14,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import names
+from mjx_dher import names, replay
 from mjx_dher.config import HParams
 from mjx_dher.spec import PRIORITIES
 from mjx_dher.types import Array, Episode, RewardFn
@@ -44,13 +44,13 @@ def make(name: str | PriorityFn) -> PriorityFn:
 
 
 def weights(priority: PriorityFn, episodes: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
-    """Returns the weight [N] of each of N episodes (leaves lead with [N]), float32; what is not a positive number is 0.
+    """Returns the weight [N] of each of N episodes (leaves lead with [N]), float32; what is not a positive, finite number is 0.
 
     Raises:
-      ValueError: the priority gives no scalar.
+      ValueError: the priority gives no scalar, or no real number.
     """
     weight = jax.vmap(lambda episode: priority(episode, compute_reward, hparams))(episodes)
-    if weight.ndim != 1:
-        raise ValueError(f"a priority gives one weight [] for an episode; this one gives {list(weight.shape[1:])}")
-    weight = weight.astype(jnp.float32)
-    return jnp.where((weight > 0) & jnp.isfinite(weight), weight, 0.0)
+    if not isinstance(weight, jax.Array) or weight.ndim != 1:
+        given = list(weight.shape[1:]) if isinstance(weight, jax.Array) else f"a {type(weight).__name__}"
+        raise ValueError(f"a priority gives one weight [] for an episode; this one gives {given}")
+    return replay.as_priority(weight)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import jax
@@ -22,7 +23,7 @@ def hindsight_goals(
     A transition for which the sampler offers no goal (no weight is positive, or one is NaN or infinite) keeps its own.
 
     Raises:
-      ValueError: its log weights are not one for each goal of an episode.
+      ValueError: its log weights are not one floating-point number for each goal of an episode.
     """
     return _choose(state, sample, sampler, hparams, key)[0]
 
@@ -38,11 +39,8 @@ def _choose(
     if sampler.cross_episode:
         other = replay.sample_episode_goals(state, pool_key, batch_size)
         pool = jnp.where(sampler.cross_episode(hparams), other, pool) if callable(sampler.cross_episode) else other
-    log_weights = jax.vmap(sampler.log_weights, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
-    if log_weights.shape != pool.shape[:2]:
-        raise ValueError(f"a sampler gives log weights [T+1] = [{pool.shape[1]}]; this one gives {list(log_weights.shape[1:])}")
-    if not jnp.issubdtype(log_weights.dtype, jnp.floating):
-        raise ValueError(f"a sampler gives log weights as floating-point numbers; this one gives {log_weights.dtype}")
+    weigh = functools.partial(samplers.weigh, sampler)
+    log_weights = jax.vmap(weigh, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
     index = samplers.draw(draw_key, log_weights)
     offered = index < pool.shape[1]
     return jnp.where(offered[:, None], pool[jnp.arange(batch_size), index], sample.desired_goal), offered
@@ -105,10 +103,11 @@ def relabel_counted(
     desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
     reward = compute_reward(achieved_goal, desired_goal)
-    if jnp.shape(reward) != (batch_size,):
+    if getattr(reward, "shape", None) != (batch_size,):
+        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
         raise ValueError(
             f"compute_reward gives rewards [B] = [{batch_size}] of goals [B, G] = {list(desired_goal.shape)}; this one gives"
-            f" {list(jnp.shape(reward))}"
+            f" {given}"
         )
     batch = Batch(
         observation=sample.observation,

@@ -1,16 +1,18 @@
 """A ring of whole episodes on the device.
 
 Each observation is stored once (there is no next-observation copy), and what a sampled transition may look at is its own
-episode's row, so an index cannot reach into a neighbour. All functions are pure.
+episode's row, so an index cannot reach into a neighbour. All episodes of a ring have one length, T: one that
+ends early has to be filled up, with a state that it stays in. All functions are pure.
 """
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
-from mjx_dher.types import Array, Episode, PRNGKey, PyTree
+from mjx_dher.types import Array, Episode, PRNGKey, PyTree, check_size
 
 
 @struct.dataclass
@@ -39,24 +41,37 @@ def init(episode: Episode, num_episodes: int) -> ReplayState:
     """Makes an empty ring for `num_episodes` episodes like `episode` (arrays or `jax.ShapeDtypeStruct`s, unbatched).
 
     Raises:
-      ValueError: fewer than one episode, or leaves whose lengths do not agree.
+      ValueError: fewer than one episode, or leaves whose shapes do not agree.
     """
-    if num_episodes < 1:
-        raise ValueError(f"num_episodes must be at least 1; got {num_episodes}")
-    for path, leaf in jax.tree_util.tree_leaves_with_path(episode):
-        if 0 in leaf.shape:
-            raise ValueError(f"leaf {jax.tree_util.keystr(path)} of an episode must not be empty; got shape {leaf.shape}")
-    length = episode.action.shape[0]
-    for path, leaf in jax.tree_util.tree_leaves_with_path((episode.observation, episode.achieved_goal)):
-        if leaf.shape[0] != length + 1:
-            name = jax.tree_util.keystr(path)
-            raise ValueError(f"leaf {name} must lead with T+1 = {length + 1} (T actions); got shape {leaf.shape}")
+    check_size("num_episodes", num_episodes)
+    _check_one(episode)
     return ReplayState(
         episodes=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape), x.dtype), episode),
         priority=jnp.zeros(num_episodes, jnp.float32),
         cursor=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
     )
+
+
+def _check_one(episode: Episode) -> None:
+    """Raises ValueError unless one, unbatched episode is arrays of the shapes that `Episode` says."""
+    leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(episode)}
+    for name, leaf in leaves.items():
+        if not hasattr(leaf, "shape"):
+            raise ValueError(f"leaf {name} of an episode must be an array; got a {type(leaf).__name__}")
+        if 0 in leaf.shape:
+            raise ValueError(f"leaf {name} of an episode must not be empty; got shape {leaf.shape}")
+    action, achieved, desired = (np.shape(x) for x in (episode.action, episode.achieved_goal, episode.desired_goal))
+    if len(action) != 2:
+        raise ValueError(f"leaf .action of one episode must be [T, A]; got shape {action}")
+    for name, leaf in leaves.items():
+        if not name.startswith((".action", ".desired_goal")) and leaf.shape[:1] != (action[0] + 1,):
+            raise ValueError(f"leaf {name} must lead with T+1 = {action[0] + 1} (T actions); got shape {leaf.shape}")
+    if len(desired) != 1 or achieved[1:] != desired:
+        raise ValueError(
+            f"leaves .achieved_goal and .desired_goal must be [T+1, G] and [G], of one size G; got shapes {achieved} and"
+            f" {desired}"
+        )
 
 
 def nbytes(episode: Episode, num_episodes: int) -> int:
@@ -75,7 +90,7 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
     Args:
       state: the ring.
       episodes: N of them.
-      priority: [N], or one for all: weight by which `draw_rows` can draw an episode, 0 or more.
+      priority: [N], or one for all: weight by which `draw_rows` can draw an episode; what `as_priority` takes.
       valid: [N] which of them to write; the others leave no trace. All, where None.
 
     Raises:
@@ -95,10 +110,26 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
 
     return ReplayState(
         episodes=jax.tree.map(write, state.episodes, episodes),
-        priority=write(state.priority, priority),
+        priority=write(state.priority, as_priority(priority)),
         cursor=(state.cursor + written) % num_rows,
         size=jnp.minimum(state.size + written, num_rows),
     )
+
+
+def as_priority(weight: Array | float) -> Array:
+    """Returns weights as float32; what is not a positive, finite number is 0.
+
+    Raises:
+      ValueError: something that is no real number.
+    """
+    try:
+        weight = jnp.asarray(weight)
+    except (TypeError, ValueError):
+        raise ValueError(f"a priority must be a number; got {weight!r}") from None
+    if jnp.issubdtype(weight.dtype, jnp.complexfloating):
+        raise ValueError(f"a priority must be a real number; got {weight.dtype}")
+    weight = weight.astype(jnp.float32)
+    return jnp.where((weight > 0) & jnp.isfinite(weight), weight, 0.0)
 
 
 def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, valid: Array | None) -> int:
@@ -121,8 +152,10 @@ def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, v
                 f" {leading[0] if leading else 'none'}); got {dtype}{list(shape)}"
             )
     for name, value in (("priority", priority), ("valid", valid)):
-        if value is not None and jnp.shape(value) not in ((), leading)[name == "valid" :]:
-            raise ValueError(f"{name} must be [N] = {list(leading)}, one for each episode; got {list(jnp.shape(value))}")
+        if value is not None and np.shape(value) not in ((), leading)[name == "valid" :]:
+            raise ValueError(f"{name} must be [N] = {list(leading)}, one for each episode; got {list(np.shape(value))}")
+    if leading == (0,):
+        raise ValueError("add takes one or more episodes; got none")
     return leading[0]
 
 
@@ -162,7 +195,13 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
     """Draws `batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
 
     Without `rows`, uniform over all transitions in the ring, which must not be empty.
+
+    Raises:
+      ValueError: fewer than one transition, or `rows` that are not integers [B].
     """
+    check_size("batch_size", batch_size)
+    if rows is not None and (jnp.shape(rows) != (batch_size,) or not jnp.issubdtype(jnp.result_type(rows), jnp.integer)):
+        raise ValueError(f"rows must be integers [B] = [{batch_size}]; got {jnp.result_type(rows)}{list(jnp.shape(rows))}")
     row_bits, step_bits = jax.random.bits(key, (2, batch_size))
     if rows is None:
         rows = randint_from_bits(row_bits, state.size)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree
+from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree, check_env_parts, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
@@ -32,21 +33,28 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
       policy: called with one step of `inputs` and the observations of all environments.
       key: of the first states.
       num_envs: episodes, N.
-      inputs: further arguments of the policy, such as noise; leaves lead with [T]. None for none.
+      inputs: further arguments of the policy, such as noise, or keys for one that draws; leaves lead with [T]. None for none.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
 
     Raises:
-      ValueError: actions that are not [N, A], or states whose shapes are not what `types.Env` says.
+      ValueError: actions that are not [N, A], inputs that do not lead with [T], something that is no environment, or states
+        that are not what `types.Env` says.
     """
+    check_env_parts(env)
+    check_size("num_envs", num_envs)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
+        if jnp.shape(leaf)[:1] != (env.episode_length,):
+            name, shape = jax.tree_util.keystr(path), list(jnp.shape(leaf))
+            raise ValueError(f"inputs{name} must lead with [T] = [{env.episode_length}], one for each step; got {shape}")
     first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-    _check_state(first, num_envs)
+    check_first(first, (num_envs,))
 
     def step(state, step_inputs):
         action = policy(step_inputs, state.obs)
-        if jnp.shape(action) != (num_envs, env.action_size):
-            raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(jnp.shape(action))}")
+        if np.shape(action) != (num_envs, env.action_size):
+            raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
         following = jax.vmap(env.step)(state, action)
         _check_same_shapes(state, following)
         played = (state.obs["observation"], state.obs["achieved_goal"], action, following.reward)
@@ -76,13 +84,25 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
     )
 
 
-def _check_state(state: Any, num_envs: int) -> None:
-    """Raises ValueError unless N states, as `reset` gives them, have one reward, one success and goals of one size each."""
-    for name in ("reward", "success"):
-        shape = jnp.shape(getattr(state, name))
-        if shape != (num_envs,):
-            raise ValueError(f"reset: {name} must be a scalar, []; it has shape {shape[1:]}")
-    achieved, desired = (jnp.shape(state.obs[name])[1:] for name in ("achieved_goal", "desired_goal"))
+def check_first(state: Any, leading: tuple[int, ...]) -> None:
+    """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
+    for name in ("obs", "reward", "success"):
+        if not hasattr(state, name):
+            raise ValueError(f"reset must give a state with obs, reward and success; this {type(state).__name__} has no {name}")
+    for name in ("observation", "achieved_goal", "desired_goal"):
+        if not isinstance(state.obs, Mapping) or name not in state.obs:
+            raise ValueError(f"reset: obs must be a dict of observation, achieved_goal and desired_goal; it has no {name}")
+    for name in ("reward", "success", *(["failed"] if hasattr(state, "failed") else [])):
+        value = getattr(state, name)
+        if not hasattr(value, "shape"):
+            raise ValueError(f"reset: {name} must be a scalar, []; it is a {type(value).__name__}")
+        if value.shape != leading:
+            raise ValueError(f"reset: {name} must be a scalar, []; it has shape {value.shape[len(leading) :]}")
+        if name == "failed" and value.dtype != bool:
+            raise ValueError(f"reset: failed must be bool; it is {value.dtype}")
+        if jnp.issubdtype(value.dtype, jnp.complexfloating):
+            raise ValueError(f"reset: {name} must be a real number; it is {value.dtype}")
+    achieved, desired = (jnp.shape(state.obs[name])[len(leading) :] for name in ("achieved_goal", "desired_goal"))
     if len(achieved) != 1 or achieved != desired:
         raise ValueError(
             f"reset: achieved_goal and desired_goal must be vectors [G]; they have shapes {achieved} and {desired}"

@@ -6,7 +6,8 @@ it may not choose. `draw` makes a choice from them. So a sampler is a pure funct
     log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
 
 The transition under relabelling leads from `step` to `step + 1`; its *future* is the goals at step+1 ... T, never `step`
-itself.
+itself. A transition for which no weight is left, or one is NaN or +inf, keeps its own goal, and training counts it
+(`no_goal_share`).
 """
 
 from __future__ import annotations
@@ -71,17 +72,33 @@ def distances(metric: MetricFn, achieved: Array, desired: Array) -> Array:
     Raises:
       ValueError: the metric does not give [T+1].
     """
-    distance = jnp.asarray(metric(achieved, desired))
-    if distance.shape != achieved.shape[:1]:
-        raise ValueError(
-            f"a metric gives distances [T+1] = {list(achieved.shape[:1])} of goals [T+1, G] = {list(achieved.shape)} to one"
-            f" goal [G]; {_name_of(metric)} gives {list(distance.shape)}"
-        )
+    distance = measure(metric, achieved, desired)
     return distance if metric is position else jnp.where(distance >= 0, distance, jnp.nan)
 
 
-def _name_of(function: Any) -> str:
-    return str(getattr(function, "__name__", function))
+def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
+    """Returns what a metric gives [T+1] for `achieved` [T+1, G] and `desired` [G].
+
+    Raises:
+      ValueError: it is no numbers [T+1].
+    """
+    return _checked(
+        "a metric gives distances", metric, metric(achieved, desired), achieved.shape[0], (jnp.floating, jnp.integer)
+    )
+
+
+def _checked(told: str, function: Any, value: Any, num_goals: int, kinds: Sequence[Any] = (jnp.floating,)) -> Array:
+    """Returns what `function` gave as an array [T+1]; raises ValueError, which begins with `told`, where it is none."""
+    told, name = f"{told} [T+1] = [{num_goals}]", getattr(function, "__name__", function)
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{told}; {name} gives a {type(value).__name__}") from None
+    if array.shape != (num_goals,):
+        raise ValueError(f"{told}; {name} gives {list(array.shape)}")
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
+        raise ValueError(f"{told}, as floating-point numbers; {name} gives {array.dtype}")
+    return array
 
 
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
@@ -144,12 +161,7 @@ def weighted(
     mean = jnp.sum(distance) / jnp.sum(mask, dtype=distance.dtype)
     # Where every candidate lies on the goal, all are equally near.
     relative = jnp.where(mask & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
-    log_weights = jnp.asarray(kernel(relative, hparams.temperature))
-    if log_weights.shape != relative.shape:
-        raise ValueError(
-            f"a kernel gives log weights [T+1] = {list(relative.shape)} of relative distances [T+1]; {_name_of(kernel)} gives"
-            f" {list(log_weights.shape)}"
-        )
+    log_weights = _checked("a kernel gives log weights", kernel, kernel(relative, hparams.temperature), mask.size)
     return jnp.where(mask, log_weights, -jnp.inf)
 
 
@@ -209,9 +221,22 @@ def make(name: str | Sampler | LogWeightsFn, kernel: str | KernelFn = "linear", 
 
 
 def _to_sampler(sampler: Any) -> Sampler:
-    if isinstance(sampler, Sampler):
-        return sampler
-    return Sampler(names.check_function("sampler", sampler, ("achieved", "desired", "step", "hparams")))
+    if not isinstance(sampler, Sampler):
+        sampler = Sampler(sampler)
+    names.check_function("sampler", sampler.log_weights, ("achieved", "desired", "step", "hparams"))
+    if not (isinstance(sampler.cross_episode, bool) or callable(sampler.cross_episode)):
+        raise ValueError(f"cross_episode of a sampler must be True, False or a function; it is {sampler.cross_episode!r}")
+    return sampler
+
+
+def weigh(sampler: Sampler, achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """Returns a sampler's log weights [T+1] of the goals [T+1, G] of one episode.
+
+    Raises:
+      ValueError: they are no floating-point numbers [T+1].
+    """
+    value = sampler.log_weights(achieved, desired, step, hparams)
+    return _checked("a sampler gives log weights", sampler.log_weights, value, achieved.shape[0])
 
 
 def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
@@ -219,8 +244,13 @@ def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
 
     All log weights are computed and one is kept, so that a run draws what it would have drawn with that sampler alone. A
     field `choice` is not in `HParams`: the caller, `sweep`, adds it.
+
+    Raises:
+      ValueError: no sampler, or something that is none.
     """
     samplers = [make(choice) for choice in choices]
+    if not samplers:
+        raise ValueError("one_of joins one or more samplers; got none")
     if len(samplers) == 1:
         return samplers[0]
 
@@ -231,7 +261,7 @@ def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
         return kept
 
     def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-        return pick([sampler.log_weights(achieved, desired, step, hparams) for sampler in samplers], hparams)
+        return pick([weigh(sampler, achieved, desired, step, hparams) for sampler in samplers], hparams)
 
     crossing = [sampler.cross_episode for sampler in samplers]
     if not any(crossing):

@@ -23,9 +23,9 @@ from mjx_dher.learners import Learner
 from mjx_dher.priorities import PriorityFn
 from mjx_dher.relabel import draw_batches, relabel_counted
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import rollout
+from mjx_dher.rollout import check_first, rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_env_parts
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
@@ -114,14 +114,15 @@ def make_train(
       learner: DDPG where None, made of `config`.
 
     Raises:
-      ValueError: a Config that cannot run, here or at all, or an observation that is not one vector.
+      ValueError: a Config that cannot run, here or at all, an observation that is not one vector, or an argument of another
+        kind. `epoch` raises it where a part gives arrays of the wrong shape, as soon as it is traced.
     """
-    config_lib.validate(config, HParams(), env.episode_length)
+    _check_arguments(env, config, learner)
     loop = Loop(
         env=env,
         config=config,
         sampler=samplers.make("future" if sampler is None else sampler),
-        priority=priorities.eventful if priority is None else priority,
+        priority=priorities.make("eventful" if priority is None else priority),
         learner=learners.make("ddpg", config, env_sizes(env)) if learner is None else learner,
         template=episode_template(env),
     )
@@ -131,6 +132,15 @@ def make_train(
         learner=loop.learner,
         replay_bytes=replay.nbytes(loop.template, loop.num_episodes),
     )
+
+
+def _check_arguments(env: Env, config: Config, learner: Learner | None) -> None:
+    check_env_parts(env)
+    if not isinstance(config, Config):
+        raise ValueError(f"config must be a Config; got {config!r}")
+    config_lib.validate(config, HParams(), env.episode_length)
+    if learner is not None:
+        learners.check_methods(learner, learner)
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
@@ -151,7 +161,10 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes)
     means = jax.tree.map(jnp.mean, cycles)
     faults = {name: jnp.maximum(means[name], share) for name, share in evaluate.faults(outcome).items()}
-    metrics = evaluate.summary(outcome) | means | loop.learner.summary(state.learner)
+    metrics = evaluate.summary(outcome) | means
+    summary = loop.learner.summary(state.learner)
+    learners.check_metrics("summary", summary, means)
+    metrics |= summary
     return dataclasses.replace(state, key=key), metrics | faults | {"discarded_episodes": discarded}
 
 
@@ -164,6 +177,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         return loop.learner.explore(state.learner, obs, noise, hparams)
 
     noise = loop.learner.noise(noise_key, env.episode_length, config.num_envs, hparams)
+    learners.check_noise(noise, env.episode_length, config.num_envs)
     episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise)
     weights = priorities.weights(loop.priority, episodes, env.compute_reward, hparams)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
@@ -194,8 +208,9 @@ def _update_normalizers(
     sample_key, relabel_key = jax.random.split(key)
     sample = replay.sample(fresh, sample_key, num_new * num_steps)
     batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, loop.env.compute_reward, hparams, relabel_key)
-    learner = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
-    return learner, {**_relabel_metrics(sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
+    updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
+    learners.check_kept("update_normalizers", learner, updated)
+    return updated, {**_relabel_metrics(sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
 
 
 def _learn(loop: Loop, learner: PyTree, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[PyTree, Metrics]:
@@ -218,8 +233,14 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, hparams: HParams, key
 
 def _update_with_target(learner: Learner, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
     """Makes an update for each of `batches` (leaves lead with [target_period]), then moves the targets."""
-    state, losses = jax.lax.scan(lambda state, batch: learner.update(state, batch, hparams), state, batches)
-    return learner.update_target(state, hparams), losses
+
+    def update(state: PyTree, batch: Batch) -> tuple[PyTree, Metrics]:
+        return learners.check_update(state, learner.update(state, batch, hparams))
+
+    state, losses = jax.lax.scan(update, state, batches)
+    moved = learner.update_target(state, hparams)
+    learners.check_kept("update_target", state, moved)
+    return moved, losses
 
 
 def _relabel_metrics(goal: Array, hindsight: Array) -> Metrics:
@@ -257,7 +278,7 @@ def as_arrays(hparams: HParams) -> HParams:
 def is_finite(learner: PyTree) -> Array:
     """Returns [] whether all of a learner's numbers are finite: once they are not, no epoch will mend them."""
     floats = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
+    return jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
 
 
 def env_sizes(env: Env) -> Sizes:
@@ -274,11 +295,12 @@ def episode_template(env: Env) -> Episode:
     """Returns the shapes and types of one episode of `env`, without running it.
 
     Raises:
-      ValueError: the observation is not a single vector, or an action or an episode has no size.
+      ValueError: the observation is not a single vector, or `env` is no environment.
     """
-    for name in ("action_size", "episode_length"):
-        config_lib.check_count(name, getattr(env, name))
-    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    check_env_parts(env)
+    first = jax.eval_shape(env.reset, jax.random.key(0))
+    check_first(first, ())
+    obs = first.obs
     observation = obs["observation"]
     if not (hasattr(observation, "shape") and len(observation.shape) == 1):
         raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypedDict
 
 import jax
+import numpy as np
 from flax import struct
 
 Array = jax.Array
@@ -101,3 +102,20 @@ class Env(Protocol):
     def step(self, state: Any, action: Array) -> EnvState: ...
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array: ...
+
+
+def check_size(name: str, value: Any) -> None:
+    """Raises ValueError unless `value` is an integer of at least 1, of Python or NumPy."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} must be an integer of at least 1; it is {value!r}")
+
+
+def check_env_parts(env: Any) -> None:
+    """Raises ValueError unless `env` has the methods and the two numbers of an `Env`. It is not run."""
+    if isinstance(env, type):
+        raise ValueError(f"an environment is an object, not a class: {env.__name__}(...) instead of {env.__name__}")
+    for name in ("reset", "step", "compute_reward"):
+        if not callable(getattr(env, name, None)):
+            raise ValueError(f"an environment has reset, step and compute_reward; {env!r} has no {name}")
+    for name in ("action_size", "episode_length"):
+        check_size(name, getattr(env, name, None))

@@ -59,12 +59,12 @@ def two_arguments(achieved, desired):
 
 
 SAMPLERS = {
-    "scalar": r"log weights must be \[T\+1\] = \[11\]; they are \[\]",
-    "one_for_each_number": r"they are \[11, 2\]",
+    "scalar": r"a sampler gives log weights \[T\+1\] = \[11\]; scalar gives \[\]",
+    "one_for_each_number": r"one_for_each_number gives \[11, 2\]",
     "nan_late": "at step 6 is NaN",
     "infinite": r"is \+inf",
     "nothing": "offers no goal at any step",
-    "whole_numbers": "must be floating-point numbers; they are int32",
+    "whole_numbers": "as floating-point numbers; whole_numbers gives int32",
     "python_if": r"JAX traces the function.*mistakes.py, line",
     "raising": r"AttributeError: .*radius.*mistakes.py, line",
     "two_arguments": r"sampler must be a function \(achieved, desired, step, hparams\)",
@@ -102,12 +102,12 @@ def in_numpy(achieved, desired):
 
 
 METRICS = {
-    "without_axis": r"distances must be \[T\+1\] = \[11\] .*; they are \[\]",
-    "without_norm": r"they are \[11, 2\]",
+    "without_axis": r"a metric gives distances \[T\+1\] = \[11\]; without_axis gives \[\]",
+    "without_norm": r"without_norm gives \[11, 2\]",
     "similarity": "must not be negative",
     "cosine": "must be finite",
     "constant": "tells no goals apart",
-    "fewer": r"they are \[10\]",
+    "fewer": r"fewer gives \[10\]",
     "in_numpy": "ConcretizationTypeError",
 }
 

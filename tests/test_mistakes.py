@@ -89,6 +89,7 @@ THROUGH = [
     ("sampler", "nan_late", []),
     ("sampler", "two_arguments", []),
     ("metric", "without_axis", ["--sampler", "closest"]),
+    ("metric", "similarity", []),  # no sampler reads it, but it was handed in
     ("weight_kernel", "pole", ["--sampler", "weighted"]),
     ("priority", "negative", []),
     ("learner", "unbounded", []),
@@ -123,7 +124,7 @@ def train(tmp_path, env=ENV, **parts):
 @pytest.mark.parametrize(
     ("kind", "name", "message"),
     [
-        ("sampler", "scalar", "a sampler gives log weights"),
+        ("sampler", "scalar", r"a sampler gives log weights \[T\+1\] = \[11\]; scalar gives \[\]"),
         ("sampler", "whole_numbers", "floating-point numbers"),
         ("metric", "without_axis", r"without_axis gives \[\]"),
         ("metric", "without_norm", r"without_norm gives \[11, 2\]"),
@@ -145,7 +146,7 @@ def test_shapes_are_checked_where_a_function_is_handed_in(tmp_path, kind, name, 
         ("RewardOfTwoAxes", r"reward must be a scalar, \[\]; it has shape \(1,\)"),
         ("ShorterGoal", r"vectors \[G\]"),
         ("Growing", r"observation'\] is float32\[2\] and becomes float32\[4\]"),
-        ("NoActions", "action_size must lie in"),
+        ("NoActions", "action_size must be an integer of at least 1; it is 0"),
         ("NoSteps", "episode_length must lie in"),
         ("WithoutAxis", r"compute_reward gives rewards \[B\] = .*; this one gives \[\]"),
     ],
@@ -159,7 +160,7 @@ def test_shapes_of_an_environment_are_checked_in_training(tmp_path, name, messag
     ("env", "parts", "reason"),
     [
         ("NanObservation", {}, "all 4 episodes were discarded"),
-        ("SuccessSeven", {}, "success must be 0 or 1; it is something else in 1 of the episodes"),
+        ("SuccessSeven", {}, "success must be 0 or 1; it is something else in a share of 1 of the episodes"),
         ("NanSuccess", {}, "success must be 0 or 1"),
         (None, {"sampler": "mistakes:nothing"}, "the sampler offers no hindsight goal for any transition"),
         (None, {"sampler": "mistakes:infinite"}, "the sampler offers no hindsight goal for any transition"),
@@ -181,12 +182,12 @@ def test_a_run_that_has_gone_bad_fails_and_says_why(tmp_path, env, parts, reason
 @pytest.mark.parametrize(
     ("env", "parts", "warning"),
     [
-        ("Hundred", {}, r"epoch 1: .* of the rewards lie outside \[-1, 0\]"),
+        ("Hundred", {}, r"epoch 1: a share of 0\.\d+ of the rewards lie outside \[-1, 0\]"),
         ("HalfNan", {}, r"epoch 1: \d of 4 episodes were discarded"),
         (
             None,
             {"sampler": "mistakes:nan_late"},
-            r"epoch 1: for 0\.\d+ of the transitions to be relabelled the sampler offers no",
+            r"epoch 1: for a share of 0\.\d+ of the transitions to be relabelled the sampler offers no",
         ),
     ],
 )

@@ -76,7 +76,7 @@ def test_refuses_more_than_it_holds():
 
 def test_refuses_an_empty_ring_and_lengths_that_disagree():
     template = jax.tree.map(lambda x: x[0], make_episodes([0]))
-    with pytest.raises(ValueError, match="num_episodes must be at least 1; got 0"):
+    with pytest.raises(ValueError, match="num_episodes must be an integer of at least 1; it is 0"):
         replay.init(template, 0)
     with pytest.raises(ValueError, match=r"scalar.*T\+1 = 5"):
         replay.init(template.replace(observation=template.observation | {"scalar": jnp.zeros(4)}), 2)

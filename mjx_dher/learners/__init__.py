@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
 
 from mjx_dher import names, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.networks import NetworksFn
 from mjx_dher.spec import LEARNERS
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+
+# What the loop and the log call theirs: a learner's metrics have other names.
+RESERVED = frozenset(
+    (
+        *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
+        *("relabelled_share", "relabel_distance", "discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
+        *("epoch", "env_steps", "updates", "wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes"),
+    )
+)
 
 
 class Learner(Protocol):
@@ -31,13 +43,13 @@ class Learner(Protocol):
         """Returns the exploring policy's actions [N, A]; leaves of `noise` lead with [N]."""
 
     def update(self, state: Any, batch: Batch, hparams: HParams) -> tuple[PyTree, Metrics]:
-        """Takes one gradient step on a batch [B]; returns metrics [] to be averaged over an epoch."""
+        """Takes one gradient step on a batch [B]; returns metrics [] to be averaged over an epoch, not called as `RESERVED`."""
 
     def update_target(self, state: Any, hparams: HParams) -> PyTree:
         """Moves the target networks; called once every `target_period` updates."""
 
     def summary(self, state: Any) -> Metrics:
-        """Returns metrics [] of the state at the end of an epoch."""
+        """Returns metrics [] of the state at the end of an epoch, with names that `update` does not use."""
 
     def export(self, state: Any, hparams: HParams) -> Any:
         """Returns the policy as a `policy.Policy`, which needs NumPy alone, or None where that cannot be."""
@@ -61,7 +73,60 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     """
     make_learner = names.resolve("learner", name, LEARNERS, ("config", "sizes", "networks"))
     learner = make_learner(config, sizes, networks.make(network))
+    check_methods(name, learner)
+    return learner
+
+
+def check_methods(name: Any, learner: Any) -> None:
+    """Raises ValueError unless `learner`, which messages call `name`, has the methods of a `Learner`."""
     methods = [method for method in vars(Learner) if not method.startswith("_")]
     if missing := [method for method in methods if not callable(getattr(learner, method, None))]:
         raise ValueError(f"learner {name!r} is no learner: it has no {', '.join(missing)} (see mjx_dher.learners.Learner)")
-    return learner
+
+
+def check_kept(method: str, before: PyTree, after: PyTree) -> None:
+    """Raises ValueError unless a method of a learner keeps its state's structure, shapes and types, as `lax.scan` needs."""
+    old, new = (
+        {jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x))}" for path, x in _leaves(state)}
+        for state in (before, after)
+    )
+    differing = [f"{name} is {old[name]} and becomes {new[name]}" for name in old if name in new and old[name] != new[name]]
+    differing += [f"only one of them has {name}" for name in {**old, **new} if (name in old) != (name in new)]
+    if jax.tree.structure(before) != jax.tree.structure(after) or differing:
+        reason = (differing or ["its type or its static fields differ"])[0]
+        raise ValueError(f"learner.{method} must keep the state's structure, shapes and types; {reason}")
+
+
+def check_update(state: PyTree, result: Any) -> tuple[PyTree, Metrics]:
+    """Returns what a learner's `update` gave for `state`; raises ValueError unless it is a state like it, and metrics."""
+    if not (isinstance(result, tuple) and len(result) == 2):
+        raise ValueError(f"learner.update must give (state, metrics); it gives a {type(result).__name__}")
+    updated, metrics = result
+    check_kept("update", state, updated)
+    check_metrics("update", metrics)
+    return updated, metrics
+
+
+def check_metrics(method: str, metrics: Any, taken: Collection[str] = ()) -> None:
+    """Raises ValueError unless a learner's metrics are scalars [] by names that are not in `RESERVED`, nor `taken`."""
+    if not isinstance(metrics, dict):
+        raise ValueError(f"metrics of learner.{method} must be a dict of scalars; they are a {type(metrics).__name__}")
+    for name, value in metrics.items():
+        if not isinstance(name, str) or name in RESERVED or name in taken:
+            reason = "is another's" if isinstance(name, str) else "is no text"
+            raise ValueError(f"metrics of learner.{method} must have names of their own; {name!r} {reason}")
+        if jnp.shape(value) != ():
+            raise ValueError(f"metrics of learner.{method} must be scalars, []; {name} is {list(jnp.shape(value))}")
+
+
+def check_noise(noise: PyTree, num_steps: int, num_envs: int) -> None:
+    """Raises ValueError unless the leaves of a learner's noise lead with [T, N]."""
+    leading = (num_steps, num_envs)
+    for path, leaf in _leaves(noise):
+        if jnp.shape(leaf)[:2] != leading:
+            name, shape = f"noise{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
+            raise ValueError(f"learner.noise must give arrays that lead with [T, N] = {list(leading)}; {name} is {shape}")
+
+
+def _leaves(tree: PyTree) -> Any:
+    return jax.tree_util.tree_leaves_with_path(tree)

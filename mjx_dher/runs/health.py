@@ -24,7 +24,7 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
     if not finite:
         return "the networks or normalizers hold numbers that are not finite (smaller actor_lr and critic_lr may help)"
     if metrics["bad_success"] > 0:
-        return f"success must be 0 or 1; it is something else in {metrics['bad_success']:.3g} of the episodes"
+        return f"success must be 0 or 1; it is something else in a share of {metrics['bad_success']:.3g} of the episodes"
     if metrics["no_goal_share"] >= 1:
         return "the sampler offers no hindsight goal for any transition: its weights are all 0, NaN or infinite"
     return None
@@ -36,9 +36,9 @@ def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
     sentences = {
         "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment says"
         " `failed`, or a number in them is not finite",
-        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside [-1, 0], which targets are clipped to"
-        " [-1/(1-gamma), 0] for",
-        "no_goal_share": f"for {metrics['no_goal_share']:.3g} of the transitions to be relabelled the sampler offers no goal;"
-        " these keep their own",
+        "bad_rewards": f"a share of {metrics['bad_rewards']:.3g} of the rewards lie outside [-1, 0], though DDPG clips its"
+        " targets to what rewards in [-1, 0] can add up to: [-1/(1-gamma), 0]",
+        "no_goal_share": f"for a share of {metrics['no_goal_share']:.3g} of the transitions to be relabelled the sampler offers"
+        " no goal; these keep their own",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}

@@ -15,7 +15,8 @@ from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
 from mjx_dher.samplers import future
 from mjx_dher.testing.trial import EPISODES, PartError, attempt, expect_finite, random_episodes
-from mjx_dher.types import Batch, Env, Episode, Sizes
+from mjx_dher.trainer import env_sizes
+from mjx_dher.types import Batch, Env, Episode
 
 BATCH = 8
 
@@ -26,6 +27,7 @@ def check_learner(
     config: Config | None = None,
     hparams: HParams | None = None,
     networks: str | NetworksFn = "mlp",
+    episodes: Episode | None = None,
 ) -> None:
     """Makes a learner, lets it act, explore and learn from one batch, and looks at what it gives.
 
@@ -33,7 +35,8 @@ def check_learner(
     - `act` and `explore` give finite actions [N, A] in [-1, 1]; `act` takes any leading axes.
     - `update`, `update_target` and `update_normalizers` keep the state's structure, shapes and types, as `lax.scan` needs, and
       numbers finite; `update` changes it.
-    - Metrics of `update` and `summary` are a dict of scalars.
+    - Metrics of `update` and `summary` are dicts of scalars, with names that nothing else is logged by.
+    - What `update_normalizers` is to leave out, because it is not valid, changes nothing.
     - `export` gives a `policy.Policy` that acts as `act` does, or None.
 
     Args:
@@ -42,14 +45,14 @@ def check_learner(
       config: sizes; the defaults where None.
       hparams: numbers; the defaults where None.
       networks: what `networks.make` takes.
+      episodes: to learn from; random ones where None.
 
     Raises:
       ValueError: names the first violation.
     """
     config, hparams = config or Config(), hparams or HParams()
-    episodes = random_episodes(env)
-    sizes = Sizes(episodes.observation.shape[-1], episodes.desired_goal.shape[-1], env.action_size)
-    made: Learner = attempt("learner", learners.make, learner, config, sizes, networks)
+    episodes = episodes or random_episodes(env)
+    made: Learner = attempt("learner", learners.make, learner, config, attempt("env", env_sizes, env), networks)
     numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
     state = attempt("learner.init", jax.jit(made.init), jax.random.key(0))
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
@@ -58,15 +61,18 @@ def check_learner(
                 f"learner.init must give a pytree of arrays; {jax.tree_util.keystr(path)} is a {type(leaf).__name__}"
             )
     expect_finite("the state that learner.init gives", state)
-    valid = jnp.ones(EPISODES, bool)
     batch = _batch(env, episodes, numbers)
-    normalize = lambda s, n: made.update_normalizers(s, episodes.observation, batch.desired_goal, n, valid)  # noqa: E731
+    valid = jnp.arange(EPISODES) > 0
+    observation = jnp.where(valid[:, None, None], episodes.observation, jnp.nan)
+    normalize = lambda s, n: made.update_normalizers(s, observation, batch.desired_goal, n, valid)  # noqa: E731
     state = _step("update_normalizers", jax.jit(normalize), state, numbers)
     _check_acting(made, state, episodes, env, numbers)
     updated, metrics = _update(made, state, batch, numbers)
-    _check_metrics("update", metrics)
+    expect_finite("metrics of learner.update", metrics)
     moved = _step("update_target", jax.jit(made.update_target), updated, numbers)
-    _check_metrics("summary", attempt("learner.summary", jax.jit(made.summary), moved))
+    summary = attempt("learner.summary", jax.jit(made.summary), moved)
+    learners.check_metrics("summary", summary, metrics)
+    expect_finite("metrics of learner.summary", summary)
     _check_export(made, moved, episodes, hparams, numbers)
 
 
@@ -80,22 +86,9 @@ def _batch(env: Env, episodes: Episode, hparams: HParams) -> Batch:
 def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
     """Returns the state that a method of the learner gives, checked to be like `state` and finite."""
     after = attempt(f"learner.{name}", function, state, *args)
-    _check_kept(name, state, after)
+    learners.check_kept(name, state, after)
     expect_finite(f"the state that learner.{name} gives", after)
     return after
-
-
-def _check_kept(name: str, before: Any, after: Any) -> None:
-    describe = lambda tree: [f"{jax.tree_util.keystr(p)} {x.dtype}{list(x.shape)}" for p, x in _leaves(tree)]  # noqa: E731
-    old, new = describe(before), describe(after)
-    structure: Any = jax.tree.structure(before)
-    if structure != jax.tree.structure(after) or old != new:
-        differing = next((f"{a} becomes {b}" for a, b in zip(old, new) if a != b), "its structure differs")
-        raise PartError(f"learner.{name} must keep the state's structure, shapes and types; {differing}")
-
-
-def _leaves(tree: Any) -> Any:
-    return jax.tree_util.tree_leaves_with_path(jax.tree.map(jnp.asarray, tree))
 
 
 def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparams: HParams) -> None:
@@ -105,13 +98,7 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparam
         "desired_goal": episodes.desired_goal,
     }
     noise = attempt("learner.noise", made.noise, jax.random.key(2), env.episode_length, EPISODES, hparams)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(noise):
-        if leaf.shape[:2] != (env.episode_length, EPISODES):
-            leading = [env.episode_length, EPISODES]
-            raise PartError(
-                f"learner.noise must give arrays that lead with [T, N] = {leading}; noise{jax.tree_util.keystr(path)} is"
-                f" {list(leaf.shape)}"
-            )
+    learners.check_noise(noise, env.episode_length, EPISODES)
     first = jax.tree.map(lambda x: x[0], noise)
     explored = attempt("learner.explore", jax.jit(made.explore), state, obs, first, hparams)
     _check_actions("explore", explored, (EPISODES, env.action_size))
@@ -124,8 +111,9 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparam
 
 
 def _check_actions(name: str, action: Any, shape: tuple[int, ...]) -> None:
-    if action.shape != shape:
-        raise PartError(f"learner.{name} must give actions [..., A] = {list(shape)}; they are {list(action.shape)}")
+    if getattr(action, "shape", None) != shape:
+        given = list(action.shape) if hasattr(action, "shape") else f"a {type(action).__name__}"
+        raise PartError(f"learner.{name} must give actions [..., A] = {list(shape)}; they are {given}")
     expect_finite(f"actions of learner.{name}", action)
     if float(jnp.abs(action).max()) > 1.0 + 1e-6:
         raise PartError(f"learner.{name} must give actions in [-1, 1]; one is {float(jnp.abs(action).max()):.3g} in magnitude")
@@ -133,23 +121,11 @@ def _check_actions(name: str, action: Any, shape: tuple[int, ...]) -> None:
 
 def _update(made: Learner, state: Any, batch: Batch, hparams: HParams) -> tuple[Any, Any]:
     result = attempt("learner.update", jax.jit(made.update), state, batch, hparams)
-    if not (isinstance(result, tuple) and len(result) == 2):
-        raise PartError(f"learner.update must give (state, metrics); it gives {type(result).__name__}")
-    updated, metrics = result
-    _check_kept("update", state, updated)
+    updated, metrics = learners.check_update(state, result)
     expect_finite("the state that learner.update gives", updated)
     if all(bool(jnp.array_equal(a, b)) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(updated))):
         raise PartError("learner.update must change the state; nothing in it is changed")
     return updated, metrics
-
-
-def _check_metrics(name: str, metrics: Any) -> None:
-    if not isinstance(metrics, dict):
-        raise PartError(f"metrics of learner.{name} must be a dict of scalars; they are a {type(metrics).__name__}")
-    for metric, value in metrics.items():
-        if jnp.shape(value) != ():
-            raise PartError(f"metrics of learner.{name} must be scalars, []; {metric} is {list(jnp.shape(value))}")
-    expect_finite(f"metrics of learner.{name}", jax.tree.map(jnp.asarray, metrics))
 
 
 def _check_export(made: Learner, state: Any, episodes: Episode, hparams: HParams, numbers: HParams) -> None:
@@ -160,7 +136,6 @@ def _check_export(made: Learner, state: Any, episodes: Episode, hparams: HParams
         raise PartError(f"learner.export must give a policy.Policy or None; it gives a {type(policy).__name__}")
     obs: Any = {"observation": episodes.observation[:, 0], "desired_goal": episodes.desired_goal}
     theirs = attempt("the policy of learner.export", policy, obs)
-    if theirs.shape != (EPISODES, policy.layers[-1][1].shape[0]) or not jnp.allclose(
-        theirs, made.act(state, obs, numbers), atol=1e-3
-    ):
+    ours = made.act(state, obs, numbers)
+    if theirs.shape != ours.shape or not jnp.allclose(theirs, ours, atol=1e-3):
         raise PartError("the policy of learner.export must act as learner.act does; it does not")

@@ -16,10 +16,10 @@ from mjx_dher.config import HParams
 from mjx_dher.names import is_import_path
 from mjx_dher.priorities import PriorityFn
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
-from mjx_dher.spec import METRICS, RunSpec, reads
+from mjx_dher.spec import METRICS, WEIGHT_KERNELS, RunSpec, own_parts, reads
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.trial import EPISODES, PartError, attempt, random_episodes
+from mjx_dher.testing.trial import PartError, attempt, random_episodes
 from mjx_dher.types import Env, Episode
 
 TOLERANCE = 1e-3
@@ -38,19 +38,20 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
     if is_import_path(spec.env):
         check_env(env)
         yield f"env {spec.env}: as it should be, in random episodes"
+    if own_parts(spec) in ([], ["env"]):
+        return
     episodes = random_episodes(env)
-    metric_read, kernel_read = reads(spec.sampler, "metric"), reads(spec.sampler, "weight_kernel")
-    if is_import_path(spec.metric) and metric_read:
+    if is_import_path(spec.metric):
         yield check_metric(spec.metric, env, episodes)
-    if is_import_path(spec.weight_kernel) and kernel_read:
+    if is_import_path(spec.weight_kernel):
         yield check_kernel(spec.weight_kernel)
-    own = (spec.sampler, *([spec.metric] if metric_read else []), *([spec.weight_kernel] if kernel_read else []))
-    if any(map(is_import_path, own)):
+    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, field)]
+    if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
         yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes)}"
     if is_import_path(spec.priority):
         yield check_priority(spec.priority, env, spec.hparams, episodes)
     if is_import_path(spec.learner) or is_import_path(spec.networks):
-        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks)
+        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
         yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
 
 
@@ -79,24 +80,18 @@ def check_sampler(
     steps = jnp.arange(env.episode_length)
 
     def of_step(achieved: Any, desired: Any, step: Any) -> Any:
-        return jnp.asarray(made.log_weights(achieved, desired, step, _as_arrays(hparams)))
+        return samplers.weigh(made, achieved, desired, step, _as_arrays(hparams))
 
     of_episode = jax.vmap(of_step, in_axes=(None, None, 0))
     log_weights = attempt(
         "sampler", jax.jit(jax.vmap(of_episode, in_axes=(0, 0, None))), episodes.achieved_goal, episodes.desired_goal, steps
     )
-    expected = (EPISODES, env.episode_length, env.episode_length + 1)
-    if log_weights.shape != expected:
-        raise PartError(f"sampler: log weights must be [T+1] = [{expected[2]}]; they are {list(log_weights.shape[2:])}")
-    if not jnp.issubdtype(log_weights.dtype, jnp.floating):
-        raise PartError(f"sampler: log weights must be floating-point numbers; they are {log_weights.dtype}")
-    values = np.asarray(log_weights)
-    alone = attempt("sampler, alone,", of_step, episodes.achieved_goal[0], episodes.desired_goal[0], steps[1])
-    return _check_log_weights(values, np.asarray(alone))
+    alone = attempt("sampler, alone,", of_step, episodes.achieved_goal[0], episodes.desired_goal[0], steps[-1])
+    return _check_log_weights(np.asarray(log_weights), np.asarray(alone))
 
 
 def _check_log_weights(values: NDArray, alone: NDArray) -> str:
-    """Checks log weights [N, T, T+1], and those of episode 0 at step 1, computed `alone`; returns a sentence about them."""
+    """Checks log weights [N, T, T+1], and those of episode 0 at its last step, computed `alone`; returns a sentence."""
     for name, wrong in (("NaN", np.isnan(values)), ("+inf", values == np.inf)):
         if wrong.any():
             _, t, i = np.argwhere(wrong)[0]
@@ -104,16 +99,22 @@ def _check_log_weights(values: NDArray, alone: NDArray) -> str:
                 f"sampler: log weights must be finite, or -inf for what is not to be chosen; that of goal {i} at step {t} is"
                 f" {name}"
             )
-    weights = np.exp(values - values.max(axis=-1, keepdims=True, where=np.isfinite(values), initial=-1e30))
+    weights = _weights(values)
     offers = (values > -np.inf).any(axis=-1)
     if not offers.any():
         raise PartError("sampler: it offers no goal at any step: all log weights are -inf")
-    if not np.allclose(np.exp(values[0, 1]), np.exp(alone), rtol=TOLERANCE, atol=TOLERANCE):
+    if not np.allclose(weights[0, -1], _weights(alone), rtol=TOLERANCE, atol=TOLERANCE):
         raise PartError("sampler: log weights under jax.vmap must be those alone; they depend on other episodes or steps")
     num_steps = values.shape[1]
     past = np.tril(np.ones((num_steps, num_steps + 1), bool))[None]
     missing = f"no goal at {1 - offers.mean():.0%} of the steps, which keep their own; " if not offers.all() else ""
     return f"sampler as it should be: {missing}goals of the past {'too' if (weights[:, past[0]] > 0).any() else 'never'}"
+
+
+def _weights(log_weights: NDArray) -> NDArray:
+    """Returns weights [..., T+1] of which the largest is 1, of log weights [..., T+1]; 0 where all of these are -inf."""
+    largest = log_weights.max(axis=-1, keepdims=True)
+    return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 
 
 def check_metric(metric: str | MetricFn, env: Env, episodes: Episode | None = None) -> str:
@@ -129,17 +130,8 @@ def check_metric(metric: str | MetricFn, env: Env, episodes: Episode | None = No
     """
     made = _resolve("metric", metric, METRICS, ("achieved", "desired"))
     episodes = episodes or random_episodes(env)
-    compute = jax.jit(jax.vmap(lambda achieved, desired: jnp.asarray(made(achieved, desired))))
+    compute = jax.jit(jax.vmap(functools.partial(samplers.measure, made)))
     distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
-    expected = episodes.achieved_goal.shape[1:2]
-    if distances.shape[1:] != expected:
-        goals = list(episodes.achieved_goal.shape[1:])
-        raise PartError(
-            f"metric: distances must be [T+1] = {list(expected)} for achieved goals [T+1, G] = {goals} and one desired goal;"
-            f" they are {list(distances.shape[1:])}"
-        )
-    if distances.dtype.kind not in "fiu":
-        raise PartError(f"metric: distances must be numbers; they are {distances.dtype}")
     if not np.isfinite(distances).all():
         raise PartError("metric: distances must be finite; one is not")
     if distances.min() < 0:
@@ -155,15 +147,12 @@ def check_kernel(kernel: str | KernelFn) -> str:
     They must be as many as the distances, below +inf and not NaN, and not all -inf.
 
     Returns:
-      A sentence: that they are as they should be.
+      A sentence: the weights, of which a kernel gives the logarithms, at some distances.
 
     Raises:
       PartError: names the first violation.
     """
-    parameters = ("relative", "temperature")
-    made = attempt(
-        "weight_kernel", lambda: samplers.names.resolve("weight_kernel", kernel, samplers.WEIGHT_KERNELS, parameters)
-    )
+    made = _resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
     relative = jnp.linspace(0.0, 3.0, 31)
     for temperature in (0.3, 1.0, 3.0):
         compute = jax.jit(lambda r, t: jnp.asarray(made(r, t)))
@@ -178,7 +167,9 @@ def check_kernel(kernel: str | KernelFn) -> str:
                 raise PartError(f"weight_kernel: log weights must be finite or -inf; it is {name} at {place}")
         if not (log_weights > -np.inf).any():
             raise PartError(f"weight_kernel: every log weight is -inf at temperature {temperature:g}: it takes no goal")
-    return "weight_kernel as it should be"
+        if temperature == 1.0:
+            near, mean, far = np.exp(log_weights[[0, 10, 20]])
+    return f"weight_kernel as it should be: weights {near:.3g}, {mean:.3g} and {far:.3g} at relative distances 0, 1 and 2"
 
 
 def check_priority(
@@ -210,7 +201,8 @@ def check_priority(
     alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
     if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
         raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
-    return f"priority as it should be: weights from {weights.min():.3g} to {weights.max():.3g}"
+    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
+    return f"priority as it should be: weights from {weights.min():.3g} to {weights.max():.3g}{none}"
 
 
 def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections.abc import Callable
 from typing import Any
 
+import flax
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Env, Episode
+from mjx_dher.types import Env, Episode, check_env_parts
 
 EPISODES = 16
+# Folders of code that is not the user's.
+_OURS = os.path.dirname(os.path.dirname(__file__)) + os.sep
+_INNER = (_OURS, *(os.path.dirname(module.__file__) + os.sep for module in (jax, flax, np)))
 
 
 class PartError(ValueError):
@@ -20,20 +26,31 @@ class PartError(ValueError):
 
 
 def random_episodes(env: Env, seed: int = 0) -> Episode:
-    """Plays 16 episodes of uniformly random actions; leaves lead with [16]."""
+    """Plays 16 episodes of uniformly random actions; leaves lead with [16].
+
+    Raises:
+      PartError: the environment cannot be played.
+    """
+    attempt("env", check_env_parts, env)
     key, action_key = jax.random.split(jax.random.key(seed))
     shape = (env.episode_length, EPISODES, env.action_size)
     actions = jax.random.uniform(action_key, shape, jnp.float32, minval=-1.0, maxval=1.0)
-    return jax.jit(lambda: rollout(env, lambda action, obs: action, key, EPISODES, actions)[0])()
+    play = jax.jit(lambda: rollout(env, lambda action, obs: action, key, EPISODES, actions)[0])
+    return attempt("env, played with random actions,", play)
 
 
 def attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:
-    """Calls `function`; an error of any kind becomes a PartError that tells what was tried, the error, and its place."""
+    """Calls `function`; an error of any kind becomes a PartError that tells what was tried, the error, and its place.
+
+    The library's own sentences stay as they are.
+    """
     try:
         return function(*args)
     except PartError:
         raise
     except Exception as error:
+        if isinstance(error, ValueError) and traceback.extract_tb(error.__traceback__)[-1].filename.startswith(_OURS):
+            raise PartError(str(error)) from error
         raise PartError(f"{what} raises {describe(error)}") from error
 
 
@@ -49,7 +66,7 @@ def describe(error: Exception) -> str:
 
 
 def _is_inner(filename: str) -> bool:
-    return "<" in filename or any(f"/{name}/" in filename for name in ("jax", "_src", "mjx_dher", "flax"))
+    return filename.startswith("<") or filename.startswith(_INNER)
 
 
 def expect_finite(what: str, value: Any) -> None:
