@@ -92,7 +92,8 @@ def check_kept(method: str, before: PyTree, after: PyTree) -> None:
     )
     differing = [f"{name} is {old[name]} and becomes {new[name]}" for name in old if name in new and old[name] != new[name]]
     differing += [f"only one of them has {name}" for name in {**old, **new} if (name in old) != (name in new)]
-    if jax.tree.structure(before) != jax.tree.structure(after) or differing:
+    structure: Any = jax.tree.structure(before)
+    if structure != jax.tree.structure(after) or differing:
         reason = (differing or ["its type or its static fields differ"])[0]
         raise ValueError(f"learner.{method} must keep the state's structure, shapes and types; {reason}")
 

@@ -18,7 +18,7 @@ from mjx_dher.types import Env, Episode, check_env_parts
 EPISODES = 16
 # Folders of code that is not the user's.
 _OURS = os.path.dirname(os.path.dirname(__file__)) + os.sep
-_INNER = (_OURS, *(os.path.dirname(module.__file__) + os.sep for module in (jax, flax, np)))
+_INNER = (_OURS, *(os.path.dirname(str(module.__file__)) + os.sep for module in (jax, flax, np)))
 
 
 class PartError(ValueError):
