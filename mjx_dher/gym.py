@@ -168,8 +168,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         Raises:
           ValueError: `options` is not empty, or `GoalEnv.check` found a fault in the episodes so far.
         """
-        _check_options(options)
-        _check_seeds([seed])
+        (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
         self._compiled.env.check()
         self.close()
@@ -186,8 +185,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
           ValueError: `action` is not of shape [A], or is not finite.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
-        action = _checked(action, self.action_space, self._state)
-        self._state = self._compiled.step(self._state, action)
+        self._state = self._compiled.step(self._state, _checked(action, self.action_space, self._state))
         obs, reward, info = _to_numpy(self._state)
         return obs, reward.item(), False, False, {key: value.item() for key, value in info.items()}
 
@@ -269,16 +267,8 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         Raises:
           ValueError: there are not N seeds, `options` is not empty, or `GoalEnv.check` found a fault.
         """
-        _check_options(options)
-        if isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        if seed is not None:
-            _check_seeds(list(seed) if isinstance(seed, (list, tuple, np.ndarray)) else [seed])
-            if len(seed) != self.num_envs:
-                raise ValueError(f"seed must be one number or one for each of {self.num_envs} environments; got {len(seed)}")
-            before = zip(self._np_random, self._np_random_seed)
-            drawn = (old if one is None else seeding.np_random(one) for one, old in zip(seed, before))
-            self._np_random, self._np_random_seed = zip(*drawn)
+        streams = zip(_check_reset(options, seed, self.num_envs), zip(self._np_random, self._np_random_seed))
+        self._np_random, self._np_random_seed = zip(*(old if one is None else seeding.np_random(one) for one, old in streams))
         obs, _, infos = self._restart()
         return obs, infos
 
@@ -307,8 +297,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
 
     def _results(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
         obs, rewards, infos = _to_numpy(self._states)
-        masks = {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
-        return obs, rewards, infos | masks
+        return obs, rewards, infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
 
 
 def _spaces(env: GoalEnv) -> tuple[Any, Any]:
@@ -337,22 +326,21 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
     return actions
 
 
-def _check_seeds(seeds: Sequence[Any]) -> None:
-    for seed in seeds:
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0):
-            raise ValueError(f"a seed must be an integer of at least 0, or None; got {seed!r}")
-
-
-def _check_options(options: dict[str, Any] | None) -> None:
+def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[int | None]:
+    """Returns a seed for each of `count` environments, None where its random stream goes on."""
     if options:
         raise ValueError(f"reset takes no options; got {', '.join(map(repr, options))}")
+    is_one = seed is None or not np.iterable(seed)
+    for one in [seed] if is_one else seed:
+        if one is not None and not (isinstance(one, (int, np.integer)) and one >= 0):
+            raise ValueError(f"a seed must be an integer of at least 0, or None; got {one!r}")
+    if is_one:
+        return [None if seed is None else int(seed) + i for i in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"seed must be one number or one for each of {count} environments; got {len(seed)}")
+    return list(seed)
 
 
 for _id, _name in IDS.items():
-    gymnasium.register(
-        _id,
-        entry_point="mjx_dher.gym:GymEnv",
-        vector_entry_point="mjx_dher.gym:GymVectorEnv",
-        max_episode_steps=HORIZON,
-        kwargs={"name": _name},
-    )
+    options = {"max_episode_steps": HORIZON, "vector_entry_point": "mjx_dher.gym:GymVectorEnv", "kwargs": {"name": _name}}
+    gymnasium.register(_id, "mjx_dher.gym:GymEnv", **options)
