@@ -342,5 +342,9 @@ def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[
 
 
 for _id, _name in IDS.items():
-    options = {"max_episode_steps": HORIZON, "vector_entry_point": "mjx_dher.gym:GymVectorEnv", "kwargs": {"name": _name}}
-    gymnasium.register(_id, "mjx_dher.gym:GymEnv", **options)
+    _options: dict[str, Any] = {
+        "max_episode_steps": HORIZON,
+        "vector_entry_point": "mjx_dher.gym:GymVectorEnv",
+        "kwargs": {"name": _name},
+    }
+    gymnasium.register(_id, "mjx_dher.gym:GymEnv", **_options)
