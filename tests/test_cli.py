@@ -132,7 +132,7 @@ BAD = [
     (
         ["evall", "runs/x"],
         [
-            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, doctor;",
+            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, check, doctor;",
             "got 'evall' (did you mean 'eval'?)",
         ],
     ),
