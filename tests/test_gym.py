@@ -207,7 +207,7 @@ REFUSED = [
     (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), r"render_mode must be None.*'rgb_array'"),
     (lambda: single().step(np.zeros(3)), r"action must have shape \(2,\); got \(3,\)"),
     (lambda: single().step(np.array([0, np.nan])), r"action must be finite; got \[ 0. nan\]"),
-    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got 'goal'"),
+    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got {'goal': 1}"),
     (lambda: single().render(), 'must be made with render_mode="rgb_array"'),
     (lambda: single().compute_reward(np.zeros(2), np.zeros(3), {}), r"goals must end in an axis of 2; got .*\(3,\)"),
     (lambda: many().step(np.zeros(2)), r"action must have shape \(2, 2\); got \(2,\)"),
@@ -218,7 +218,7 @@ REFUSED = [
     ),
     (lambda: gymnasium.make(REACH).reset(seed=1.5), "a seed must be an integer of at least 0|seed"),
     (lambda: many().reset(seed=[1]), "seed must be one number or one for each of 2 environments; got 1"),
-    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got 'reset_mask'"),
+    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got {'reset_mask': 1}"),
 ]
 
 
