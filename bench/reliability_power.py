@@ -1,8 +1,12 @@
-"""Power cuts at random moments of runs and of sweeps; then the run is resumed, or the sweep's command repeated."""
+"""Power cuts at random moments of runs and of sweeps; then the run is resumed, or the sweep's command repeated.
+
+After every other cut all that was not flushed is gone; after the others some of it is there, as the disk liked.
+"""
 
 from __future__ import annotations
 
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import power_recorder
-from reliability_pairs import ROOT, SHAPES, faults_of, of_run, of_sweep, start
+from reliability_pairs import ROOT, SHAPES, ended, faults_of, of_run, of_sweep, same, start
 
 from mjx_dher.runs import run_folder, sinks
 
@@ -59,36 +63,37 @@ def cut(process, written, rng):
     process.communicate()
 
 
-def run_cut(folder, right, rng):
+def run_cut(folder, right, rng, disk_rng):
     """A run; returns the faults, and the epochs that were lost."""
     disk, store, after = folder / "disk", folder / "store", folder / "after"
     process = start_recorded(disk, store, *TRAIN, "--out", disk / "run")
     cut(process, (disk / "run" / "metrics.csv").exists, rng)
     done = sinks.whole_epochs(disk / "run")
-    power_recorder.rebuild(disk, store, after)
+    power_recorder.rebuild(disk, store, after, disk_rng)
     run = after / "run"
     if (run / run_folder.RESULT_FILE).exists():
-        return ([] if of_run(run) == right else ["silent: a finished run that is not whole"]), 0
-    kept = run_folder.checkpoints(run)
-    if not kept:
-        return ([] if done <= INTERVAL else [f"{done} epochs and no checkpoint"]), done
-    second = start("resume", run)
-    faults = faults_of(second, (0,))
-    lost = done - run_folder.epoch_of(kept[0])
+        return ([] if same(of_run, run, right) else ["silent: a finished run that is not whole"]), 0
+    if not run_folder.checkpoints(run):
+        return ([] if done <= INTERVAL else [f"lost: {done} epochs and no checkpoint"]), done
+    faults, text = ended(start("resume", run), (0,))
+    went_on = re.search(r"going on from .*, after epoch (\d+)", text)
+    lost = done - int(went_on[1]) if went_on else 0
     if lost > INTERVAL:
-        faults.append(f"{lost} epochs lost")
-    if not faults and of_run(run) != right:
+        faults.append(f"lost: {lost} epochs")
+    if "damaged" in text:
+        faults.append(f"damage that no one did: {text[-300:]}")
+    if not faults and not same(of_run, run, right):
         faults.append("silent: the resumed run is another")
     return faults, lost
 
 
-def sweep_cut(folder, right, rng, lanes):
+def sweep_cut(folder, right, rng, disk_rng, lanes):
     disk, store, after = folder / "disk", folder / "store", folder / "after"
     process = start_recorded(disk, store, *SWEEP, "--lanes", lanes, "--out", disk / "sweep")
     cut(process, lambda: any(disk.glob("sweep/cells/*/metrics.csv")), rng)
-    power_recorder.rebuild(disk, store, after)
+    power_recorder.rebuild(disk, store, after, disk_rng)
     faults = faults_of(start(*SWEEP, "--lanes", lanes, "--out", after / "sweep"), (0,))
-    if not faults and of_sweep(after / "sweep") != right[lanes]:
+    if not faults and not same(of_sweep, after / "sweep", right[lanes]):
         faults.append("silent: the tables are not those of an undisturbed sweep")
     return faults, 0
 
@@ -106,7 +111,10 @@ def power(folder, count, rng, workers):
 
     def run(number):
         own, place = random.Random(seeds[number]), folder / f"cut{number}"
-        return run_cut(place, right, own) if number % 3 else sweep_cut(place, tables, own, 1 + number // 3 % 2)
+        disk_rng = own if number % 2 else None
+        if number % 3:
+            return run_cut(place, right, own, disk_rng)
+        return sweep_cut(place, tables, own, disk_rng, 1 + number // 6 % 2)
 
     with ThreadPoolExecutor(workers) as pool:
         found = list(pool.map(run, range(count)))
