@@ -1,10 +1,11 @@
-"""What survives? Kills, stops, a full disk, damage and a second program, on short runs of the real command.
+"""What survives? Kills, stops, a full disk, damage, power cuts, other programs, edits and wrong calls, of the real command.
 
-    python bench/reliability.py [--parts kills stops flips damage disk twice] [--kills 200] [--stops 20] [--flips 200]
+    python bench/reliability.py [--parts kills stops ...] [--kills 200] [--stops 20] [--flips 200] [--pairs 100] [--power 50]
 
-Every state that is restored is compared, by the SHA-256 of all its leaves, with that of a run that nothing happened to. A line
-a part; exits with 1 where something was restored that is not right to the bit, more than one interval between checkpoints was
-lost, or a refusal was not an error with a name. docs/reliability.md has the results.
+Every state that is restored is compared, by the SHA-256 of all its leaves, with that of a run that nothing happened to, and
+every run, or sweep, that ends with what it would have left undisturbed. A line a part; exits with 1 where something is not
+right to the bit, more than one interval between checkpoints was lost, or a refusal was not an error with a name.
+docs/reliability.md has the results. `--workers` of `pairs` and `power` run at a time.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import reliability_calls
+import reliability_pairs
+import reliability_power
 from timing import print_table
 
 from mjx_dher import Config, HParams, envs, make_train
@@ -43,7 +47,7 @@ SHAPES = {
 }
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
-PARTS = ("kills", "stops", "flips", "damage", "disk", "twice")
+PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls")
 
 
 class Failure(Exception):
@@ -218,7 +222,7 @@ def damage(runs, count, rng):
             path.write_bytes(whole)
             tried += 1
     manifest = newest / checkpoint.MANIFEST
-    manifest.write_text(manifest.read_text().replace('"schema": 1', '"schema": 0'))
+    manifest.write_text(manifest.read_text().replace(f'"schema": {checkpoint.SCHEMA}', '"schema": 0'))
     expect("schema" in checkpoint.restore(out, runs.template).refused[0], "an older schema is not named")
     shutil.rmtree(older)
     process = runs.start(out)
@@ -256,22 +260,71 @@ def twice(runs, count, rng):
     return "a second program on the folder", "refused by name; the first goes on"
 
 
+def expect_none(faults):
+    for fault in faults:
+        print(fault, file=sys.stderr)
+    kinds = {kind: sum(f": {kind}" in fault for fault in faults) for kind in ("silent", "lost", "traceback")}
+    counts = ", ".join(f"{kind} {count}" for kind, count in kinds.items())
+    expect(not faults, f"{len(faults)} faults ({counts})")
+
+
+def pairs(args, folder):
+    """Two programs on one folder."""
+    expect_none(reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers))
+    return (
+        f"{args.pairs} pairs of programs on one folder",
+        "one goes on, the other is refused or takes other work; right tables",
+    )
+
+
+def power(args, folder):
+    """Power cuts."""
+    faults, lost = reliability_power.power(folder, args.power, random.Random(args.seed), args.workers)
+    expect_none(faults)
+    return (
+        f"{args.power} power cuts: what was not flushed is gone, or half there",
+        f"at most {lost} epochs lost, of 5 between checkpoints",
+    )
+
+
+def edits(args, folder):
+    """Edits of config.json."""
+    tried, faults = reliability_calls.edits(folder)
+    expect_none(faults)
+    return f"{tried} edits of config.json, then resume, eval or plot", "each refused by name, told, or without effect"
+
+
+def calls(args, folder):
+    """Wrong calls."""
+    tried, faults = reliability_calls.calls(folder)
+    expect_none(faults)
+    return f"{tried} wrong calls of the command line", "each a sentence and status 2; nothing written, no traceback"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--stops", type=int, default=20)
     parser.add_argument("--flips", type=int, default=200)
+    parser.add_argument("--pairs", type=int, default=100)
+    parser.add_argument("--power", type=int, default=50)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--env", default="reach")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
+    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls}
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
-        runs = Runs(args.env, folder)
+        runs = Runs(args.env, folder) if set(args.parts) - set(by_itself) else None
         for name in args.parts:
             try:
-                rows.append((name, *parts[name](runs, getattr(args, name, 0), random.Random(args.seed)), "yes"))
+                if name in by_itself:
+                    texts = by_itself[name](args, Path(folder, name))
+                else:
+                    texts = parts[name](runs, getattr(args, name, 0), random.Random(args.seed))
+                rows.append((name, *texts, "yes"))
             except Failure as failure:
                 failed = True
                 print(failure, file=sys.stderr)

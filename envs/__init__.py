@@ -47,6 +47,10 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
         constructor = load_import_path("env", constructor)
     if not callable(constructor):
         raise ValueError(f"env {name!r} must be a class or function that makes an environment; it is {constructor!r}")
+    try:
+        inspect.signature(constructor)
+    except ValueError as error:
+        raise ValueError(f"env {name!r} must be a class or function of Python's; {error}") from error
     if _takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
@@ -54,8 +58,11 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
     _check_arguments(name, constructor, overrides)
     try:
         env = constructor(**overrides)
-    except TypeError as error:
-        raise ValueError(f"env {name!r} cannot be made: {error}") from error
+    except ValueError:
+        raise
+    except Exception as error:
+        kind = "" if isinstance(error, TypeError) else f"{type(error).__name__}: "
+        raise ValueError(f"env {name!r} cannot be made: {kind}{error}") from error
     missing = [member for member in _MEMBERS if not hasattr(env, member)]
     if missing:
         raise ValueError(

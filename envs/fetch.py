@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.config import check_count, check_number
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Physics, make_engine
 from mjx_dher.envs.kinematics import Chain, quat_multiply
@@ -74,10 +75,9 @@ class FetchEnv(GoalEnv):
     ):
         if reward_type not in ("sparse", "dense"):
             raise ValueError(f"reward_type must be 'sparse' or 'dense'; got {reward_type!r}")
-        if not distance_threshold > 0:
-            raise ValueError(f"distance_threshold must be greater than 0; got {distance_threshold!r}")
-        if episode_length < 1:
-            raise ValueError(f"episode_length must be at least 1; got {episode_length!r}")
+        distance_threshold, episode_length = _plain(distance_threshold), _plain(episode_length)
+        check_number("distance_threshold", distance_threshold, "(0, inf)", float)
+        check_count("episode_length", episode_length)
         self.reward_type = reward_type
         self.distance_threshold = distance_threshold
         self.episode_length = episode_length
@@ -192,7 +192,8 @@ class FetchEnv(GoalEnv):
     def _sample_object(self, key: PRNGKey) -> Array:
         """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` from it."""
         task = self.task
-        offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), minval=-task.object_range, maxval=task.object_range)
+        bound = task.object_range
+        offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), jnp.float32, minval=-bound, maxval=bound)
         distance = jnp.linalg.norm(offsets, axis=-1)
         # The first candidate that is far enough, or else the farthest.
         index = jnp.argmax(jnp.where(distance >= task.min_object_distance, jnp.inf, distance))
@@ -203,8 +204,8 @@ class FetchEnv(GoalEnv):
         """Draws a goal [3] around the gripper plus the task's offset; with an object, at its height or (half of them) above."""
         task = self.task
         # Scaled by `uniform`, whose result XLA rounds alike wherever it computes it: reset and first step give the same goal.
-        largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift])
-        drawn = jax.random.uniform(key, (4,), minval=-largest, maxval=largest)
+        largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift], jnp.float32)
+        drawn = jax.random.uniform(key, (4,), jnp.float32, minval=-largest, maxval=largest)
         goal = jnp.array(task.initial_grip_pos) + drawn[:3] + jnp.array(task.target_offset)
         if task.object_height is None:
             return goal
@@ -241,6 +242,10 @@ def _in_float32(observation: Array, achieved_goal: Array, desired_goal: Array) -
     """Returns what an agent sees in float32, where JAX computes in 64 bits, too."""
     observation, achieved_goal, desired_goal = (x.astype(jnp.float32) for x in (observation, achieved_goal, desired_goal))
     return GoalObs(observation=observation, achieved_goal=achieved_goal, desired_goal=desired_goal)
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def goal_distance(achieved_goal: Array, desired_goal: Array) -> Array:

@@ -222,6 +222,11 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
         )
     if c.batch_size > c.replay_size:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
+    if c.batch_size * c.target_period > INT32_MAX:
+        yield (
+            f"batch_size must not exceed {INT32_MAX // c.target_period} with target_period {c.target_period}, because the"
+            f" batches of a period are drawn at once; got {c.batch_size}"
+        )
     epochs = num_epochs(c, episode_length)
     for field, count in (
         ("total_steps", epochs * steps_per_epoch(c, episode_length)),

@@ -7,19 +7,17 @@ Importing this module registers them. It loads neither JAX nor MuJoCo; making an
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import itertools
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_dher import envs
 from mjx_dher.config import check_count
 from mjx_dher.names import check_name, missing_extra
 from mjx_dher.tools import render
+from mjx_dher.tools.programs import Programs, programs
 
 try:
     import gymnasium
@@ -46,51 +44,6 @@ PICTURE = 480  # width and height of a picture, pixels
 Obs = dict[str, np.ndarray]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Compiled:
-    """An environment and its functions, each compiled at its first call."""
-
-    env: GoalEnv
-    reset: Callable[[Any], State]  # seed [] -> state
-    step: Callable[[State, np.ndarray], State]  # state, action [A] -> state
-    reset_all: Callable[[Any], State]  # seeds [N] -> states [N, ...]
-    step_all: Callable[[State, np.ndarray], State]  # states, actions [N, A] -> states
-    reward: Callable[[np.ndarray, np.ndarray], Any]  # achieved [M, G], desired [M, G] -> [M]
-
-
-def _compiled(name: str, options: dict[str, Any]) -> _Compiled:
-    """Returns the functions that all instances of an environment share; arguments as for `envs.make`.
-
-    Raises:
-      ValueError: as for `envs.make`, or an option has another name in gymnasium.
-    """
-    if "episode_length" in options:
-        raise ValueError("episode_length is called max_episode_steps in gymnasium.make and gymnasium.make_vec")
-    from mjx_dher.envs.engines import resolve_engine
-
-    engine = resolve_engine(options.get("engine", "auto"))  # so that auto shares the programs of the engine it stands for
-    return _compile(name, tuple(sorted({**options, "engine": engine}.items())))
-
-
-@functools.cache
-def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> _Compiled:
-    import jax
-
-    env = envs.make(name, **dict(options))
-
-    def reset(seed):
-        return env.reset(jax.random.key(seed))
-
-    return _Compiled(
-        env=env,
-        reset=jax.jit(reset),
-        step=jax.jit(env.step),
-        reset_all=jax.jit(jax.vmap(reset)),
-        step_all=jax.jit(jax.vmap(env.step)),
-        reward=jax.jit(env.compute_reward),
-    )
-
-
 def episode_seed(np_random: np.random.Generator) -> int:
     """Draws the seed of the next episode, which is the pure environment's from `jax.random.key(seed)`."""
     return int(np_random.integers(2**31))
@@ -99,7 +52,7 @@ def episode_seed(np_random: np.random.Generator) -> int:
 class _GoalApi:
     """Methods of gymnasium-robotics' goal environments other than `reset` and `step`, for single and vectorised ones."""
 
-    _compiled: _Compiled
+    _compiled: Programs
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """Computes the rewards [...] float32 for `achieved_goal` [..., G] and `desired_goal` [..., G]; ignores `info`.
@@ -124,7 +77,10 @@ class _GoalApi:
         return self.compute_terminated(achieved_goal, desired_goal, info)
 
     def _goals(self, achieved_goal: Any, desired_goal: Any) -> tuple[np.ndarray, np.ndarray]:
-        achieved, desired = np.asarray(achieved_goal, np.float32), np.asarray(desired_goal, np.float32)
+        try:
+            achieved, desired = np.asarray(achieved_goal, np.float32), np.asarray(desired_goal, np.float32)
+        except TypeError as error:
+            raise ValueError(f"goals must be numbers; got {achieved_goal!r} and {desired_goal!r}") from error
         size = self._compiled.env.goal_size
         for goals in (achieved, desired):
             if goals.shape[-1:] != (size,):
@@ -153,7 +109,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         if render_mode is not None:
             check_name("render_mode", render_mode, ("rgb_array",))
             render.choose_gl()
-        self._compiled = _compiled(name, options)
+        self._compiled = programs(name, options)
         if render_mode is not None:
             render.check_drawable(self._compiled.env)
         self.render_mode = render_mode
@@ -168,8 +124,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         Raises:
           ValueError: `options` is not empty, or `GoalEnv.check` found a fault in the episodes so far.
         """
-        _check_options(options)
-        _check_seeds([seed])
+        (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
         self._compiled.env.check()
         self.close()
@@ -186,8 +141,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
           ValueError: `action` is not of shape [A], or is not finite.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
-        action = _checked(action, self.action_space, self._state)
-        self._state = self._compiled.step(self._state, action)
+        self._state = self._compiled.step(self._state, _checked(action, self.action_space, self._state))
         obs, reward, info = _to_numpy(self._state)
         return obs, reward.item(), False, False, {key: value.item() for key, value in info.items()}
 
@@ -245,7 +199,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         check_count("num_envs", num_envs)
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, because many environments at once are not drawn; got {render_mode!r}")
-        self._compiled = _compiled(name, options)
+        self._compiled = programs(name, options)
         env = self._compiled.env
         self.num_envs = num_envs
         self.max_episode_steps = env.episode_length if max_episode_steps is None else max_episode_steps
@@ -269,16 +223,8 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         Raises:
           ValueError: there are not N seeds, `options` is not empty, or `GoalEnv.check` found a fault.
         """
-        _check_options(options)
-        if isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        if seed is not None:
-            _check_seeds(list(seed) if isinstance(seed, (list, tuple, np.ndarray)) else [seed])
-            if len(seed) != self.num_envs:
-                raise ValueError(f"seed must be one number or one for each of {self.num_envs} environments; got {len(seed)}")
-            before = zip(self._np_random, self._np_random_seed)
-            drawn = (old if one is None else seeding.np_random(one) for one, old in zip(seed, before))
-            self._np_random, self._np_random_seed = zip(*drawn)
+        streams = zip(_check_reset(options, seed, self.num_envs), zip(self._np_random, self._np_random_seed))
+        self._np_random, self._np_random_seed = zip(*(old if one is None else seeding.np_random(one) for one, old in streams))
         obs, _, infos = self._restart()
         return obs, infos
 
@@ -307,8 +253,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
 
     def _results(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
         obs, rewards, infos = _to_numpy(self._states)
-        masks = {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
-        return obs, rewards, infos | masks
+        return obs, rewards, infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
 
 
 def _spaces(env: GoalEnv) -> tuple[Any, Any]:
@@ -337,22 +282,25 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
     return actions
 
 
-def _check_seeds(seeds: Sequence[Any]) -> None:
-    for seed in seeds:
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0):
-            raise ValueError(f"a seed must be an integer of at least 0, or None; got {seed!r}")
-
-
-def _check_options(options: dict[str, Any] | None) -> None:
+def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[int | None]:
+    """Returns a seed for each of `count` environments, None where its random stream goes on."""
     if options:
-        raise ValueError(f"reset takes no options; got {', '.join(map(repr, options))}")
+        raise ValueError(f"reset takes no options; got {options!r}")
+    is_one = seed is None or not np.iterable(seed)
+    for one in [seed] if is_one else seed:
+        if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer)) or one < 0):
+            raise ValueError(f"a seed must be an integer of at least 0, or None; got {one!r}")
+    if is_one:
+        return [None if seed is None else int(seed) + i for i in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"seed must be one number or one for each of {count} environments; got {len(seed)}")
+    return [None if one is None else int(one) for one in seed]  # gymnasium takes no integers of NumPy's
 
 
 for _id, _name in IDS.items():
-    gymnasium.register(
-        _id,
-        entry_point="mjx_dher.gym:GymEnv",
-        vector_entry_point="mjx_dher.gym:GymVectorEnv",
-        max_episode_steps=HORIZON,
-        kwargs={"name": _name},
-    )
+    _options: dict[str, Any] = {
+        "max_episode_steps": HORIZON,
+        "vector_entry_point": "mjx_dher.gym:GymVectorEnv",
+        "kwargs": {"name": _name},
+    }
+    gymnasium.register(_id, "mjx_dher.gym:GymEnv", **_options)

@@ -108,7 +108,7 @@ def resets(task):
 # worker as a whole (--dist loadfile): its fixtures and what it compiles are made once.
 LONGEST = (
     *("sweep", "trainer", "engines", "cli", "checkpoint", "sweep_cli", "warp", "render", "driver", "hopper", "ddpg", "own"),
-    *("relabel", "replay", "doctor"),
+    *("mistakes", "identity", "wrong_calls", "claims", "relabel", "replay", "doctor"),
 )
 
 

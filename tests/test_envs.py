@@ -134,10 +134,14 @@ def test_bad_actions_are_refused(native, task, action, message):
         (("pusch",), {}, r"env must be one of .*push.*got 'pusch' .did you mean 'push'"),
         (("push", "natve"), {}, "engine must be one of auto, native, jax, warp; got 'natve' .did you mean 'native'"),
         (("push",), {"reward_type": "sprase"}, "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
-        (("push",), {"distance_threshold": 0}, "distance_threshold must be greater than 0; got 0"),
-        (("push",), {"episode_length": 0}, "episode_length must be at least 1; got 0"),
-        (("push",), {"colour": 1}, "option of engine native must be one of num_threads; got 'colour'"),
-        (("push",), {"engine": "jax", "num_threads": 1}, "option of engine jax must be one of iterations, ls_iterations"),
+        (("push",), {"distance_threshold": 0}, r"distance_threshold must lie in \(0, inf\); got 0"),
+        (("push",), {"episode_length": 0}, r"episode_length must lie in \[1, 1000000\]; got 0"),
+        (("push",), {"colour": 1}, "argument of env push must be one of engine, reward_type, .*, num_threads; got 'colour'"),
+        (
+            ("push",),
+            {"engine": "jax", "num_threads": 1},
+            "must be one of .*iterations, ls_iterations; got 'num_threads'",
+        ),
     ],
 )
 def test_bad_names_and_overrides_are_refused(args, kwargs, message):

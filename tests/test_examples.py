@@ -2,15 +2,18 @@
 
 import re
 
+import jax
 import many_copies
 import many_seeds
 import numpy as np
+import own_episodes
 import own_learner
 import pytest
 from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli, testing
 from mjx_dher.cli.train import parse_train_args
+from mjx_dher.rollout import rollout
 from point_mass import PointMass
 
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
@@ -18,7 +21,7 @@ TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
 
 def test_each_is_short():
     lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py")}
-    assert set(lengths) == {"point_mass.py", "own_learner.py", "many_copies.py", "many_seeds.py"}
+    assert set(lengths) == {"point_mass.py", "own_learner.py", "own_episodes.py", "many_copies.py", "many_seeds.py"}
     assert max(lengths.values()) < 60
 
 
@@ -28,6 +31,17 @@ def test_a_regression_learns_from_replay_and_weighted_relabelling(capsys):
     assert len(success) == 6
     assert success[0] < 0.3
     assert success[-1] > 0.8
+
+
+def test_episodes_of_a_loop_of_one_s_own(capsys):
+    own_episodes.main()
+    assert capsys.readouterr().out.startswith("16 episodes; a batch of 64, mean reward -")
+    ours = own_episodes.play(jax.random.key(0))
+    key, env = jax.random.key(0), own_episodes.env
+    actions = jax.random.uniform(key, (env.episode_length, 16, 2), minval=-1, maxval=1)
+    theirs, _ = rollout(env, lambda action, obs: action, key, 16, actions)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_many_copies_are_stepped(capsys):
@@ -56,10 +70,10 @@ def test_the_tutorial_shows_the_example_as_it_is():
     def lines(text):
         return [line.strip() for line in text.splitlines() if line.strip()]
 
-    code = lines((EXAMPLES / "point_mass.py").read_text())
+    code = lines((EXAMPLES / "point_mass.py").read_text()) + lines((EXAMPLES / "own_episodes.py").read_text())
     blocks = re.findall(r"```python\n(.*?)```", TUTORIAL, re.S)
     shown = [lines(block) for block in blocks if "class " in block or "def " in block]
-    assert len(shown) == 4
+    assert len(shown) == 5
     for block in shown:
         start = code.index(block[0])
         assert code[start : start + len(block)] == block

@@ -196,7 +196,7 @@ def test_what_is_returned_belongs_to_the_caller():
 
 REFUSED = [
     (lambda: gymnasium.make(REACH, engine="natve"), "engine must be one of auto, native, jax, warp; got 'natve'"),
-    (lambda: gymnasium.make(REACH, colour=1), "option of engine native must be one of num_threads; got 'colour'"),
+    (lambda: gymnasium.make(REACH, colour=1), "argument of env .* must be one of engine, .*, num_threads; got 'colour'"),
     (lambda: gymnasium.make(REACH, reward_type="sprase"), "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
     (lambda: gymnasium.make(REACH, episode_length=20), "episode_length is called max_episode_steps in gymnasium.make"),
     (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), "render_mode must be one of rgb_array; got 'ansi'"),
@@ -207,13 +207,18 @@ REFUSED = [
     (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), r"render_mode must be None.*'rgb_array'"),
     (lambda: single().step(np.zeros(3)), r"action must have shape \(2,\); got \(3,\)"),
     (lambda: single().step(np.array([0, np.nan])), r"action must be finite; got \[ 0. nan\]"),
-    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got 'goal'"),
+    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got {'goal': 1}"),
     (lambda: single().render(), 'must be made with render_mode="rgb_array"'),
     (lambda: single().compute_reward(np.zeros(2), np.zeros(3), {}), r"goals must end in an axis of 2; got .*\(3,\)"),
     (lambda: many().step(np.zeros(2)), r"action must have shape \(2, 2\); got \(2,\)"),
     (lambda: many().step(np.full((2, 2), np.inf)), "action must be finite"),
+    *(
+        (lambda seed=seed: many().reset(seed=seed), "a seed must be an integer of at least 0")
+        for seed in (1.5, -1, "x", [0, 1.5])
+    ),
+    (lambda: gymnasium.make(REACH).reset(seed=1.5), "a seed must be an integer of at least 0|seed"),
     (lambda: many().reset(seed=[1]), "seed must be one number or one for each of 2 environments; got 1"),
-    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got 'reset_mask'"),
+    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got {'reset_mask': 1}"),
 ]
 
 

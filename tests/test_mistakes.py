@@ -98,8 +98,10 @@ THROUGH = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "name", "flags"), THROUGH)
-@pytest.mark.parametrize("command", ["train", "sweep", "check"])
+@pytest.mark.parametrize(
+    ("command", "kind", "name", "flags"),
+    [*(("train", *mistake) for mistake in THROUGH), ("sweep", *THROUGH[2]), ("check", *THROUGH[2]), ("check", *THROUGH[3])],
+)
 def test_each_is_named_by_the_command_before_anything_is_compiled(tmp_path, capsys, monkeypatch, kind, name, flags, command):
     monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))
     env = [] if kind == "env" else ["--env", "point_mass:PointMass"]

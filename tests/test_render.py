@@ -1,3 +1,4 @@
+import contextlib
 import json
 import os
 import subprocess
@@ -139,10 +140,20 @@ def test_what_is_written_can_be_read(tmp_path, suffix, count):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
-def test_a_full_disk_is_an_error(tmp_path):
+def test_a_full_disk_is_an_error(tmp_path, monkeypatch):
     """All frames fit into a buffer, so that only ffmpeg's exit status tells."""
     out = tmp_path / "out.gif"
-    (tmp_path / "out.gif.partial").symlink_to("/dev/full")
+
+    @contextlib.contextmanager
+    def to_full_disk(path):
+        partial = path.with_name(path.name + ".partial")
+        partial.symlink_to("/dev/full")
+        try:
+            yield partial
+        finally:
+            partial.unlink()
+
+    monkeypatch.setattr(render.files, "atomic_write", to_full_disk)
     with pytest.raises(ValueError, match=r"out: .*out\.gif .*No space left"):
         render.write(out, moving(1))
     assert os.listdir(tmp_path) == []

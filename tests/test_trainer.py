@@ -105,7 +105,7 @@ def test_an_epoch_counts_what_it_does(program):
     assert set(metrics) == {
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
         *("relabelled_share", "relabel_distance", "critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"),
-        "discarded_episodes",
+        *("discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
     }
     squares = sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(state.learner.params.actor))
     assert float(metrics["actor_norm"]) == pytest.approx(float(squares) ** 0.5, rel=1e-5)

@@ -32,7 +32,7 @@ def main(argv=None):
     @jax.jit
     def play_and_learn(params, moments, ring, key):
         play_key, noise_key, learn_key = jax.random.split(key, 3)
-        noise = 0.3 * jax.random.normal(noise_key, (env.episode_length, 64, 2))
+        noise = 0.3 * jax.random.normal(noise_key, (env.episode_length, 64, 2), jnp.float32)
 
         def act(noise, obs):
             return jnp.clip(actor.apply(params, obs["observation"], obs["desired_goal"]) + noise, -1, 1)

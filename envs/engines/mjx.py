@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.envs.kinematics import quat_multiply
 from mjx_dher.host import private_api
@@ -91,6 +92,8 @@ class MjxEngine:
     name = "jax"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5):
+        check_count("iterations", iterations)
+        check_count("ls_iterations", ls_iterations)
         model = with_stand_ins(model)
         _grow_for_margins(model)
         model.opt.iterations = iterations
@@ -113,7 +116,8 @@ class MjxEngine:
             )
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
                 data = self._step(data)
-            return Physics(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart)
+            # MJX takes its own precision from jax_enable_x64; between substeps, as between steps, it is float32.
+            return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)))
 
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
             return jax.lax.fori_loop(0, self._substeps, substep, physics)

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from mjx_dher.config import check_number
 from mjx_dher.envs.engines.base import Physics
 from mjx_dher.types import Array
 
@@ -42,6 +43,8 @@ class NativeEngine:
     name = "native"
 
     def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int | None = None):
+        if num_threads is not None:
+            check_number("num_threads", num_threads, "[1, 4096]")
         self._model = copy.copy(model)
         # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)

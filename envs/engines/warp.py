@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
 from mjx_dher.envs.engines.warp_substep import make_substep
 from mjx_dher.host import private_api
@@ -62,6 +63,11 @@ class WarpEngine:
         constraints: int | None = None,
         allow_cpu: bool = False,
     ):
+        for name, value in (("iterations", iterations), ("ls_iterations", ls_iterations)):
+            check_count(name, value)
+        for name, size in (("contacts", contacts), ("constraints", constraints)):
+            if size is not None:
+                check_count(name, size)
         if not allow_cpu:
             _check_gpu()
         self._model = with_stand_ins(model)
@@ -76,6 +82,15 @@ class WarpEngine:
         self._simulations: dict[tuple[str, int], _Simulation] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
+        self._call = self._jax_callable()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what a copy, or a pickle, is made of: a lock, a thread and the device's memory cannot be copied."""
+        made_anew = ("_simulations", "_lock", "_loading", "_call")
+        return {name: value for name, value in vars(self).items() if name not in made_anew}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _simulations={}, _lock=threading.Lock(), _loading=None)
         self._call = self._jax_callable()
 
     def _jax_callable(self) -> Any:

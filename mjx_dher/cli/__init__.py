@@ -37,13 +37,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
         sys.path.append("")
+    trains = name in TRAINING
     with output.guarded() as stream:
         try:
             ended = _run(name, argv)
         except SystemExit as error:  # of --help, and of arguments that cannot be parsed
-            ended = error.code if isinstance(error.code, int) else 1
+            ended, trains = error.code if isinstance(error.code, int) else 1, False
         stream.flush()
-    return output.status(stream, ended, name in TRAINING)
+    return output.status(stream, ended, trains)
 
 
 def _run(name: str, argv: list[str]) -> int:

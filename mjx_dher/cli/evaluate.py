@@ -39,9 +39,9 @@ def eval_command(argv: list[str], console: Console) -> int:
     from mjx_dher.runs.play import play, summarize
 
     policy = load_policy(args.run)
+    keep_compiled_programs()
     env = envs.make(run.env, engine=args.engine or run.engine)
     check_fits(policy, env)
     console.print(f"{run.env}: {args.episodes} episodes, seed {args.seed}, physics {run_folder.engine_name(env)} ...")
-    keep_compiled_programs()
     print_summary(summarize(*play(env, policy, args.episodes, args.seed)), console)
     return 0

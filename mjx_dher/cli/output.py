@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -42,10 +43,25 @@ class Guarded:
         return getattr(self._stream, name)
 
 
+def open_closed() -> None:
+    """Opens the standard streams that the user has closed, onto nothing.
+
+    Else the next file that is opened takes the number of one, and what a library in C prints goes into that file.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+
+
 @contextlib.contextmanager
 def guarded() -> Iterator[Guarded]:
-    """Guards sys.stdout."""
+    """Guards sys.stdout. A character that it cannot encode is escaped, as on standard error."""
+    open_closed()
     before = sys.stdout
+    if isinstance(before, io.TextIOWrapper):
+        before.reconfigure(errors="backslashreplace")
     stream = Guarded(before)
     sys.stdout = stream
     try:

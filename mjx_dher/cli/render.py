@@ -12,6 +12,7 @@ from rich.console import Console
 from mjx_dher import envs
 from mjx_dher.cli.common import check_engine, read_run
 from mjx_dher.config import check_count
+from mjx_dher.host.caches import check_platform
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
 from mjx_dher.spec import RunSpec
@@ -62,6 +63,7 @@ def render_command(argv: list[str], console: Console) -> int:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
     render.ffmpeg()
     gl = render.choose_gl()
+    check_platform()
     env: Any = envs.make(played.env, engine=args.engine or played.engine)  # Any: a GoalEnv need not have a model
     if policy is not None:
         check_fits(policy, env)

@@ -15,14 +15,14 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
       config: sizes.
       finite: whether all numbers of the learner are.
     """
+    if not finite:
+        return "the networks or normalizers hold numbers that are not finite (smaller actor_lr and critic_lr may help)"
     episodes = config.num_envs * config.cycles_per_epoch
     if metrics["discarded_episodes"] >= episodes:
         return (
             f"all {episodes} episodes were discarded, so nothing can be learned: the environment says `failed`, or an"
             " observation, a goal, an action or a reward is not finite"
         )
-    if not finite:
-        return "the networks or normalizers hold numbers that are not finite (smaller actor_lr and critic_lr may help)"
     if metrics["bad_success"] > 0:
         return f"success must be 0 or 1; it is something else in a share of {metrics['bad_success']:.3g} of the episodes"
     if metrics["no_goal_share"] >= 1:

@@ -25,6 +25,8 @@ def read(folder: Path) -> dict[str, Any]:
       FolderError: it is missing or damaged.
     """
     path = folder / run_folder.RESULT_FILE
+    if path.exists() and not path.is_file():
+        raise FolderError(f"{path} is damaged: it is not a file")  # a FIFO, whose reader would wait for ever
     try:
         content = json.loads(path.read_text())
         status = content.get("status", FINISHED)

@@ -7,7 +7,6 @@ import dataclasses
 import datetime
 import json
 import platform
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -127,6 +126,8 @@ def read_versioned(file: Path, *schemas: int) -> dict[str, Any]:
       FileNotFoundError: there is no such file.
       FolderError: it cannot be read, or is of another schema.
     """
+    if file.exists() and not file.is_file():
+        raise FolderError(f"{file} is not a file")  # a FIFO, whose reader would wait for ever
     try:
         content = json.loads(file.read_text())
     except FileNotFoundError:
@@ -220,9 +221,11 @@ def written_identity(path: Path) -> dict[str, Any] | None:
         except (OSError, ValueError, KeyError, TypeError):  # damaged, or of an earlier version
             continue
     try:
+        if not (path / POLICY_FILE).is_file():
+            return None
         with np.load(path / POLICY_FILE, allow_pickle=False) as arrays:
             return dict(json.loads(arrays["settings"].tobytes()))
-    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile):
+    except Exception:  # NumPy, zipfile and zlib raise nearly anything at a file that is damaged; who loads it says so
         return None
 
 

@@ -1,0 +1,49 @@
+"""Files of a run that are archives NumPy cannot open, or that are no files, and sizes that no device can index."""
+
+import os
+
+import pytest
+from test_export import random_policy, save_run
+
+import mjx_dher
+from mjx_dher import cli
+from mjx_dher.config import Config, HParams, validate
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import results
+
+
+@pytest.fixture
+def run(tmp_path):
+    return save_run(tmp_path / "run", random_policy())
+
+
+@pytest.mark.parametrize(("offset", "bit"), [(6, 0x41), (8, 0x01), (10, 0x08)], ids=["version", "password", "method"])
+def test_an_archive_that_cannot_be_opened_is_damaged(offset, bit, run, capsys):
+    file = run / "policy.npz"
+    content = bytearray(file.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + offset] ^= bit
+    file.write_bytes(content)
+    with pytest.raises(FolderError, match=r"policy\.npz is damaged or not a policy"):
+        mjx_dher.load_policy(run)
+    assert cli.main(["eval", str(run)]) == 2
+    assert "policy.npz is damaged" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["config.json", "policy.npz"])
+def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(name, run, capsys):
+    (run / name).unlink()
+    os.mkfifo(run / name)
+    assert cli.main(["eval", str(run)]) == 2
+    assert f"{run / name} is" in capsys.readouterr().err
+
+
+def test_a_pipe_in_the_place_of_a_result_is_not_waited_for(run):
+    os.mkfifo(run / "result.json")
+    with pytest.raises(FolderError, match=r"result\.json is damaged: it is not a file"):
+        results.read(run)
+
+
+def test_batches_that_no_device_can_index_are_refused():
+    config = Config(batch_size=10**7, replay_size=10**8, updates_per_cycle=1000, target_period=1000)
+    with pytest.raises(ValueError, match="batch_size must not exceed 2147483 with target_period 1000"):
+        validate(config, HParams(), 50)
