@@ -61,6 +61,7 @@ def test_what_is_right_passes(capsys):
     parts = ["--env", "point_mass:PointMass", "--sampler", "weighted", "--metric", "test_mistakes:near"]
     assert cli.main(["check", *parts, "--learner", "mjx_dher.learners.ddpg:make", "--priority", "test_mistakes:alike"]) == 0
     lines = capsys.readouterr().out.splitlines()
+    assert "point_mass:PointMass" in lines[0]
     assert [line.partition(" ")[0] for line in lines] == ["env", "metric", "weighted:", "priority", "learner"]
     assert cli.main(["check"]) == 2
     assert "one or more parts as module:attribute" in capsys.readouterr().err

@@ -53,7 +53,7 @@ def _run(name: str, argv: list[str]) -> int:
             names.check_name("command", argv[0], COMMANDS)
         module, function = COMMANDS[name].split(":")
         command = getattr(importlib.import_module(module), function)
-        return int(command(argv, Console(highlight=False, markup=False)))
+        return int(command(argv, Console(highlight=False, markup=False, emoji=False)))
     except KeyboardInterrupt:  # outside of training, which ends in order
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT

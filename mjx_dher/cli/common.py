@@ -96,7 +96,9 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
         table.add_row(*row)
     width = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
     if not console.is_terminal:
-        Console(file=console.file, width=width, highlight=False, markup=False).print(table)  # `print` allows no wider one
+        Console(file=console.file, width=width, highlight=False, markup=False, emoji=False).print(
+            table
+        )  # `print` allows no wider one
     elif width <= console.width:
         console.print(table)
     else:
