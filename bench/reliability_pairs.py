@@ -94,14 +94,25 @@ def train_pair(folder, right, rng):
 
 
 def train_held(folder, right, rng):
-    """Two `train` with one `--out`, started together; one stands still until the other trains, or is refused."""
+    """Two `train` with one `--out`, started together; one stands still until the other trains, or has ended."""
     processes = {seed: start(*TRAIN, "--seed", seed, "--out", folder) for seed in right}
     held, other = rng.sample(sorted(right), 2)
-    time.sleep(rng.uniform(0, 4))
+    if rng.random() < 0.5:
+        wait_until(lambda: processes[held].poll() is not None or has_jax(processes[held]))
+    time.sleep(rng.uniform(0, 2))
     processes[held].send_signal(signal.SIGSTOP)
-    wait_until(lambda: processes[other].poll() is not None or (folder / "metrics.csv").exists())
+    is_enough = rng.choice((lambda: False, (folder / "metrics.csv").exists))
+    wait_until(lambda: processes[other].poll() is not None or is_enough(), seconds=120)
     processes[held].send_signal(signal.SIGCONT)
     return one_of(folder, right, processes)
+
+
+def has_jax(process):
+    """Whether a process has loaded JAX: by then it has looked at its arguments."""
+    try:
+        return "jaxlib" in Path(f"/proc/{process.pid}/maps").read_text()
+    except OSError:
+        return True
 
 
 def one_of(folder, right, processes):
@@ -157,12 +168,14 @@ def and_once_more(folder, right, processes, rng):
 
 
 def note(folder, seen):
-    """Results that were written twice."""
+    """Results that were written twice; `seen` has when each was written last."""
+    faults = []
     for path in folder.glob("cells/*/result.json"):
         written = path.stat().st_mtime_ns
-        if seen.setdefault(path, written) != written:
-            return [f"{path.parent.name} was trained again"]
-    return []
+        if seen.get(path, written) != written:
+            faults.append(f"{path.parent.name} was trained again")
+        seen[path] = written
+    return faults
 
 
 def pairs(folder, count, rng, workers):
