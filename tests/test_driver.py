@@ -66,10 +66,8 @@ def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, mo
     assert run_folder.read_spec(trial) == run_folder.read_spec(tmp_path / "run")
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Three runs side by side by a library call; the second one's learner is not finite from its second epoch on."""
-    folder = tmp_path_factory.mktemp("runs")
+def breaking():
+    """DDPG's update, but that a run with her_k 7 is not finite from its second epoch on."""
     update = ddpg.DDPG.update
 
     def break_one(self, state, batch, hparams):
@@ -77,10 +75,19 @@ def trained(tmp_path_factory):
         broken = (hparams.her_k == 7) & (state.num_updates > 8)
         return state.replace(params=jax.tree.map(lambda x: jnp.where(broken, jnp.nan, x), state.params)), losses
 
-    specs = [dataclasses.replace(SPEC, seed=seed, hparams=HParams(her_k=k)) for seed, k in ((0, 4.0), (1, 7.0), (2, 4.0))]
-    seen, said = [], []
+    return break_one
+
+
+THREE = [dataclasses.replace(SPEC, seed=seed, hparams=HParams(her_k=k)) for seed, k in ((0, 4.0), (1, 7.0), (2, 4.0))]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Three runs side by side by a library call; the second one's learner is not finite from its second epoch on."""
+    folder = tmp_path_factory.mktemp("runs")
+    specs, seen, said = THREE, [], []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ddpg.DDPG, "update", break_one)
+        patch.setattr(ddpg.DDPG, "update", breaking())
         results = mjx_dher.train_runs(
             PointMass(),
             specs,
@@ -125,6 +132,22 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
             assert group.final.tolist() == [0.0]
             assert group.success.shape == (1, 1)
     assert any("(1 failed)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
+
+
+def test_a_lane_that_had_failed_when_the_others_were_stopped_costs_them_nothing(trained, tmp_path, monkeypatch):
+    """They go on from their checkpoint, and all end as those that were not stopped."""
+    monkeypatch.setattr(ddpg.DDPG, "update", breaking())
+    folders, seen = [tmp_path / "cells" / identity.trial_name(spec) for spec in THREE], []
+    arguments = {"options": Options(final_episodes=20, log=("jsonl",)), "lanes": 3, "sweep": True}
+    arguments |= {"on_epoch": lambda specs, progress: seen.append(progress.epoch), "should_stop": lambda: seen == [1, 2]}
+    results = mjx_dher.train_runs(PointMass(), THREE, folders, **arguments)
+    assert [result.status for result in results] == ["stopped"] * 3
+    results = mjx_dher.train_runs(PointMass(), THREE, folders, **arguments)
+    assert seen == [1, 2, 3]
+    assert [(result.status, result.epoch) for result in results] == [("finished", 3), ("failed", 2), ("finished", 3)]
+    for folder, whole in zip(folders, trained[2]):
+        assert rows_of(folder) == rows_of(whole.folder)
+        assert result_of(folder) == result_of(whole.folder)
 
 
 def _rows(trials):

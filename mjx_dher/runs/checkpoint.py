@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -43,6 +42,7 @@ class Restored(NamedTuple):
     state: Any
     runs: list[dict[str, Any]]  # `identity.identity` of each; none of an earlier version
     refused: dict[Path, str]  # newer checkpoints that are not used, and why
+    failed: dict[int, tuple[int, str]]  # of runs side by side, those that had failed: the epoch, and why
 
 
 def save(
@@ -53,6 +53,7 @@ def save(
     keep: int,
     runs: Sequence[Mapping[str, Any]] = (),
     refused: Sequence[Path] = (),
+    failed: Mapping[int, tuple[int, str]] | None = None,
 ) -> Path:
     """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
 
@@ -66,6 +67,7 @@ def save(
       keep: at least 1.
       runs: `identity.identity` of the run, or of each of those side by side.
       refused: checkpoints that cannot be used, which go.
+      failed: of runs side by side, those that have failed: in which epoch, and why.
 
     Raises:
       CheckpointError: it cannot be written; earlier ones are as they were.
@@ -76,7 +78,8 @@ def save(
         files.make_folder(parent)
         for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
             files.remove(left)
-        _write(partial, state, {"schema": SCHEMA, "epoch": epoch, "wall_seconds": wall_seconds, "runs": list(runs)})
+        told = {"runs": list(runs), "failed": {str(lane): list(how) for lane, how in (failed or {}).items()}}
+        _write(partial, state, {"schema": SCHEMA, "epoch": epoch, "wall_seconds": wall_seconds, **told})
         files.flush_all(partial)
         if target.exists() or target.is_symlink():
             files.remove(target)
@@ -111,13 +114,13 @@ def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
         json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
 
 
-def restore(folder: Path, template: Any, last_epoch: float = math.inf) -> Restored:
+def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     """Returns the newest checkpoint of the run in `folder` that is whole.
 
     Args:
       folder: of the run.
       template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
-      last_epoch: up to which metrics.csv goes; later checkpoints are not used.
+      lines: up to which epoch metrics.csv of each run goes; later checkpoints are not used.
 
     Raises:
       FolderError: there is none.
@@ -126,13 +129,23 @@ def restore(folder: Path, template: Any, last_epoch: float = math.inf) -> Restor
     refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
         try:
-            if epoch_of(path) > last_epoch:
-                raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {last_epoch}")
+            failed = _check_lines(path, lines)
             manifest, state = _load(path, template)
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest.get("runs", []), refused)
+            runs = manifest.get("runs", [])
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, runs, refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
+
+
+def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
+    """Returns the runs that had failed; raises CheckpointError where one's metrics.csv lacks epochs that had ended."""
+    manifest = _read_manifest(path)
+    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest.get("failed", {}).items()}
+    for lane, whole in enumerate(lines):
+        if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
+            raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {whole}")
+    return failed
 
 
 def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:

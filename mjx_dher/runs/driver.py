@@ -156,9 +156,10 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     for folder in folders:  # before anything that a result tells of is touched
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
-    watch = Watch(specs, folders, session.report)
+    watch = Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
-        logs = [_open(stack, session, program.lanes, start, *run) for run in zip(specs, folders, runs)]
+        ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
+        logs = [_open(stack, session, program.lanes, *run) for run in zip(ended, specs, folders, runs)]
         for progress in loop.run(session.env, specs[0].config, program.compiled, start):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
@@ -194,18 +195,21 @@ def _open(
     stack: contextlib.ExitStack,
     session: _Session,
     lanes: int,
-    start: Start,
+    ended: int,
     spec: RunSpec,
     folder: Path,
     run: dict[str, Any],
 ) -> list[Sink]:
-    """Writes config.json of a run that begins, or goes on with other settings, and opens the sinks for its metrics."""
+    """Writes config.json of a run that begins, or goes on with other settings, and opens the sinks for its metrics.
+
+    `ended` is the number of epochs that its metrics have.
+    """
     digest = identity.digest(run)
-    if start.epoch == 0 or run_folder.read_content(folder).get("digest", digest) != digest:
+    if ended == 0 or run_folder.read_content(folder).get("digest", digest) != digest:
         run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), "lanes": lanes})
-    steps = start.epoch * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
+    steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)
-    opened = [*sinks.open_sinks(folder, session.options.log, start.epoch, steps, digest), *own]
+    opened = [*sinks.open_sinks(folder, session.options.log, ended, steps, digest), *own]
     for sink in opened:
         stack.callback(sink.close)
     return opened
@@ -214,8 +218,14 @@ def _open(
 class Watch:
     """What has gone wrong with runs side by side."""
 
-    def __init__(self, specs: Sequence[RunSpec], folders: Sequence[Path], report: Callable[[str], None]):
-        self.failed: dict[int, tuple[int, str]] = {}  # lane -> the epoch in which it failed, and why
+    def __init__(
+        self,
+        specs: Sequence[RunSpec],
+        folders: Sequence[Path],
+        report: Callable[[str], None],
+        failed: dict[int, tuple[int, str]],
+    ):
+        self.failed = failed  # lane -> the epoch in which it failed, and why; it is added to
         self._specs, self._report = specs, report
         self._names = [f"{folder.name}: " if len(specs) > 1 else "" for folder in folders]
         self._warned: set[tuple[int, str]] = set()

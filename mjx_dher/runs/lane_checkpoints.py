@@ -35,6 +35,9 @@ class LaneCheckpoints:
     report: Callable[[str], None]
     runs: Sequence[dict[str, Any]]  # `identity.identity` of each
     refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
+    failed: dict[int, tuple[int, str]] = dataclasses.field(
+        default_factory=dict
+    )  # lane -> the epoch in which it failed, and why
 
     @property
     def names(self) -> list[str]:
@@ -60,7 +63,7 @@ class LaneCheckpoints:
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
         del state  # there may be no memory for two
         try:
-            restored = checkpoint.restore(self.folder, template, min(map(sinks.whole_epochs, self.folders)))
+            restored = checkpoint.restore(self.folder, template, [*map(sinks.whole_epochs, self.folders)])
             self._compare(restored)
         except FolderError as error:
             if not self.restart:
@@ -71,6 +74,7 @@ class LaneCheckpoints:
         for path, why in restored.refused.items():
             self.report(f"not used: {why}")
             self.refused.append(path)
+        self.failed.update(restored.failed)
         self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
         # A lane's number for its sampler depends on which others are left.
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
@@ -97,8 +101,8 @@ class LaneCheckpoints:
             files.write_json(folder / NAMES_FILE, {"cells": self.names})
         for run in self.folders:
             sinks.flush(run)  # a checkpoint is of no use without the lines before it
-        runs, refused = self.runs, tuple(self.refused)
-        path = checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep, runs, refused)
+        told: dict[str, Any] = {"runs": self.runs, "refused": tuple(self.refused), "failed": self.failed}
+        path = checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep, **told)
         self.refused.clear()
         return path
 
