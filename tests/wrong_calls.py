@@ -62,7 +62,9 @@ def damaged(run: Path, folder: Path) -> list[str]:
     changes: list[tuple[str, bytes]] = [
         *((name, content[:n]) for name, content in whole.items() for n in (0, 10, len(content) // 2, len(content) - 3)),
         *((name, b"\x00" + content[1:]) for name, content in whole.items()),
-        *((name, content[: len(content) // 3] + b"#" + content[len(content) // 3 + 1 :]) for name, content in whole.items()),
+        ("config.json", _flipped(whole["config.json"], len(whole["config.json"]) // 3)),
+        # A byte of the first array: some bytes of the headers between arrays mean nothing.
+        ("policy.npz", _flipped(whole["policy.npz"], 300)),
         ("config.json", b"null"),
         ("config.json", b"[" * 100_000),
         ("config.json", whole["config.json"].replace(b'"reach"', b'"push"')),
@@ -77,6 +79,11 @@ def damaged(run: Path, folder: Path) -> list[str]:
         (copy / name).write_bytes(content)
         made.append(str(copy))
     return made
+
+
+def _flipped(content: bytes, place: int) -> bytes:
+    """Returns the bytes with all bits of one turned over."""
+    return content[:place] + bytes([content[place] ^ 0xFF]) + content[place + 1 :]
 
 
 def calls(folder: Path, run: Path, stopped: Path, sweep: Path) -> list[list[str]]:
