@@ -53,7 +53,7 @@ def close():
     plotting._pyplot().close("all")
 
 
-@pytest.mark.parametrize(("count", "env"), [(1, "push"), (2, ENV), (8, ENV)])
+@pytest.mark.parametrize(("count", "env"), [(1, "push"), (8, ENV)])
 @pytest.mark.parametrize("name", ["curves", "thresholds", "comparison"])
 def test_everything_written_is_inside_and_apart(name, env, count):
     groups = groups_of(count, env)

@@ -190,7 +190,7 @@ def switch():
         jax.config.update(name, value)
 
 
-@pytest.mark.parametrize("name", ["push", "reach"])
+@pytest.mark.parametrize("name", [pytest.param("push", marks=pytest.mark.slow), "reach"])
 def test_the_tasks_under_64_bits(switch, name):
     switch("jax_enable_x64", True)
     check_env(envs.make(name, engine="native", episode_length=4))
