@@ -155,6 +155,14 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
     assert without(rows_of(edited)) == without(rows_of(tmp_path / "long"))
 
 
+def test_steps_that_are_missing_are_not_the_default(stopped, capsys):
+    content = json.loads((stopped / "config.json").read_text())
+    del content["config"]["total_steps"]
+    (stopped / "config.json").write_text(json.dumps(content))
+    status, text = resume(stopped, capsys)
+    assert (status, "config.json does not describe a run ('total_steps')" in text) == (2, True), text
+
+
 def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, capsys):
     before = (stopped / "config.json").read_bytes()
     status, text = resume(stopped, capsys, "--total-steps", "160")

@@ -238,6 +238,8 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
     try:
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
+        if "total_steps" not in config:  # its default would be taken for a wish, which `resume` grants
+            raise KeyError("total_steps")
         spec = RunSpec(
             config=Config(**config),
             hparams=HParams(**content["hparams"]),
