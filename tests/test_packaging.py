@@ -14,7 +14,13 @@ LAYERS = [
     "types names stats cli.output host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
     "config normalizer replay rollout host.caches host.warp_setup envs.base envs.kinematics envs.engines.base",
     "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx envs.engines.warp_substep tools.render",
-    "presets networks priorities samplers runs.identity runs.health envs.engines.warp testing.env",
+    "presets networks priorities samplers runs.identity runs.health testing.env",
+    "envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
+    "envs.engines.fused.memory envs.engines.fused.kinematics envs.engines.fused.contacts envs.engines.fused.solver",
+    "envs.engines.fused.constraints envs.engines.fused.setup",
+    "envs.engines.fused.kernel",
+    "envs.engines.fused.simulation",
+    "envs.engines.warp",
     "relabel learners learners.common runs.run_folder envs.engines",
     "trainer testing.trial learners.stored runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
     "testing.learner learners.ddpg runs.loop runs.load runs.options runs.results",
@@ -27,7 +33,7 @@ LAYERS = [
     "cli.sweep",
     "cli",
 ]
-EMPTY = "hopper host runs sweeps tools"  # folders: they hold a docstring
+EMPTY = "envs.engines.fused hopper host runs sweeps tools"  # folders: they hold a docstring
 
 
 def modules():

@@ -39,7 +39,7 @@ def test_every_function_says_why_and_since_when():
     functions = [
         f for _, f in inspect.getmembers(private_api, callable) if getattr(f, "__module__", "") == private_api.__name__
     ]
-    assert len(functions) == 9
+    assert len(functions) == 10
     for function in functions:
         if function is not private_api.mujoco_warp_kernels_to_move:
             doc = inspect.getdoc(function)
@@ -133,6 +133,12 @@ def test_the_parts_of_mujoco_warp_s_step_are_still_private():
     public = {id(x): name for name, x in vars(library).items() if not name.startswith("_")}
     exported = [public[id(part)] for part in parts.values() if id(part) in public]
     assert not exported, no_longer_needed(f"MuJoCo Warp exports {exported}", "mujoco_warp_parts' fields of these names")
+
+
+def test_the_shapes_of_mujoco_warp_are_still_private():
+    library, shapes = private_api.mujoco_warp(), vars(private_api.mujoco_warp_shapes())
+    exported = [name for name in shapes if hasattr(library, name)]
+    assert not exported, no_longer_needed(f"MuJoCo Warp exports {exported}", "mujoco_warp_shapes' fields of these names")
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ of environments. Only the state goes in and out; `mjx.step` would pass some 170 
 # Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
 import concurrent.futures
+import copy
 import threading
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Physics, with_stand_ins
+from mjx_dher.envs.engines.fused import simulation as fused_simulation
 from mjx_dher.envs.engines.warp_substep import make_substep
 from mjx_dher.host import private_api
 from mjx_dher.host.warp_setup import prepare, wp
@@ -41,14 +43,18 @@ class WarpEngine:
     Args:
       model: the compiled MJCF, with exactly one mocap body.
       substeps: MuJoCo timesteps an environment step.
-      iterations: maximum Newton iterations of the constraint solver; the slowest environment of the batch sets the pace.
-      ls_iterations: maximum steps of the solver's line search.
+      iterations: maximum Newton iterations of the constraint solver; by default 8, since the slowest environment of the batch
+        sets the pace, and 50 with `fused`, where each stops by itself.
+      ls_iterations: maximum steps of the solver's line search; by default 8, and 20 with `fused`.
       contacts: contacts per environment (a mean over the batch) that fit into memory; by default, all that can occur.
       constraints: constraint rows that fit into memory in each environment; by default, all that can occur.
+      fused: whether one kernel of this library takes the whole step instead of MuJoCo Warp's many. It follows MuJoCo C to
+        rounding, the puck's cylinder included, its sums do not depend on the order of threads, and it has memory for all
+        contacts (`contacts` and `constraints` cannot be set). Not yet as fast (docs/design.md).
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
-      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False.
+      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the model has what `fused` leaves out.
     """
 
     name = "warp"
@@ -57,29 +63,29 @@ class WarpEngine:
         self,
         model: mujoco.MjModel,
         substeps: int,
-        iterations: int = 8,
-        ls_iterations: int = 8,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
         contacts: int | None = None,
         constraints: int | None = None,
+        fused: bool = False,
         allow_cpu: bool = False,
     ):
-        for name, value in (("iterations", iterations), ("ls_iterations", ls_iterations)):
-            check_count(name, value)
-        for name, size in (("contacts", contacts), ("constraints", constraints)):
-            if size is not None:
-                check_count(name, size)
+        _check_counts(iterations=iterations, ls_iterations=ls_iterations, contacts=contacts, constraints=constraints)
         if not allow_cpu:
             _check_gpu()
-        self._model = with_stand_ins(model)
-        self._model.opt.iterations = iterations
-        self._model.opt.ls_iterations = ls_iterations
+        if fused:
+            _check_fused(model, contacts, constraints)
+        self._fused = fused
+        self._model = copy.copy(model) if fused else with_stand_ins(model)
+        self._model.opt.iterations = iterations or (fused_simulation.ITERATIONS if fused else 8)
+        self._model.opt.ls_iterations = ls_iterations or (fused_simulation.LS_ITERATIONS if fused else 8)
         # Box-box contacts are analytic, as in MuJoCo C, not from the general convex algorithm.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._substeps = substeps
-        self.most_contacts, self.most_constraints = capacities(self._model)
+        self.most_contacts, self.most_constraints = (0, 0) if fused else capacities(self._model)
         self._contacts = contacts or self.most_contacts
         self._constraints = constraints or self.most_constraints
-        self._simulations: dict[tuple[str, int], _Simulation] = {}
+        self._simulations: dict[tuple[str, int], Any] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
         self._call = self._jax_callable()
@@ -155,6 +161,9 @@ class WarpEngine:
 
     def _load(self) -> None:
         prepare()
+        if self._fused:
+            fused_simulation.load(self._model)
+            return
         _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
         wp.synchronize()
 
@@ -162,10 +171,14 @@ class WarpEngine:
         if self._loading is not None:
             self._loading.result()
 
-    def _simulation(self, device: Any, num_envs: int) -> "_Simulation":
+    def _simulation(self, device: Any, num_envs: int) -> Any:
         key = (str(device), num_envs)
         if key not in self._simulations:
-            self._simulations[key] = _Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
+            self._simulations[key] = (
+                fused_simulation.FusedSimulation(self._model, num_envs, self._substeps)
+                if self._fused
+                else _Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
+            )
         return self._simulations[key]
 
 
@@ -225,12 +238,27 @@ def _set_inputs(
         ctrl[world, i] = inputs[world, 7 + i]
 
 
+def _check_counts(**counts: int | None) -> None:
+    for name, count in counts.items():
+        if count is not None:
+            check_count(name, count)
+
+
 def _check_gpu() -> None:
     if jax.default_backend() not in ("gpu", "cuda") or not wp.is_cuda_available():
         raise ValueError(
             f"engine warp needs JAX on an NVIDIA GPU, and JAX runs on {jax.default_backend()} here:"
             ' pip install -e ".[cuda]" on a machine that has one, or use engine native or jax'
         )
+
+
+def _check_fused(model: mujoco.MjModel, contacts: int | None, constraints: int | None) -> None:
+    given = [name for name, size in (("contacts", contacts), ("constraints", constraints)) if size is not None]
+    if given:
+        raise ValueError(f"{' and '.join(given)} cannot be set with fused=True, which has memory for all that can occur")
+    left_out = fused_simulation.unsupported(model)
+    if left_out:
+        raise ValueError(f"fused=True leaves out what the model has: {', '.join(left_out)}; make the engine without it")
 
 
 def capacities(model: mujoco.MjModel) -> tuple[int, int]:

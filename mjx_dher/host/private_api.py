@@ -84,6 +84,19 @@ def vec10() -> Any:
 
 
 @functools.cache
+def mujoco_warp_shapes() -> SimpleNamespace:
+    """Returns the functions of MuJoCo Warp's kernels that find the contacts of two shapes.
+
+    Private: both, in `mujoco_warp._src.collision_primitive_core`.
+    Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
+    """
+    from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive_core as core
+
+    return SimpleNamespace(box_box=core.box_box, plane_cylinder=core.plane_cylinder)
+
+
+@functools.cache
 def move_mujoco_warp_kernels() -> None:
     """Moves the kernels of MuJoCo Warp that `warp_substep` launches into modules of their own.
 

@@ -1,0 +1,195 @@
+"""Rows of constraints of a substep: the weld, joint limits, contacts.
+
+A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' qvel for the weld), as far as its weight
+D = imp / ((1 - imp) times its inverse inertia) has it: https://mujoco.readthedocs.io/en/3.17.0/computation/index.html.
+"""
+
+from mjx_dher.envs.engines.fused.contacts import tangent
+from mjx_dher.envs.engines.fused.kinematics import times
+from mjx_dher.envs.engines.fused.lanes import sync
+from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, Softness, World
+from mjx_dher.host.warp_setup import wp
+
+_MOST = wp.constant(6)  # edges of a pyramid of condim 4, which has most
+_TINY = wp.constant(1e-15)  # MuJoCo's smallest number
+
+
+@wp.func
+def _impedance(soft: Softness, depth: float) -> float:
+    """Returns how much of a constraint is enforced, between 0 and 1, at a distance from where it begins."""
+    least = soft[2]
+    most = soft[3]
+    width = soft[4]
+    middle = soft[5]
+    power = soft[6]
+    if least == most or width <= _TINY:
+        return 0.5 * (least + most)
+    x = wp.min(wp.abs(depth) / width, 1.0)
+    y = x
+    if power > 1.0:
+        if x <= middle:
+            y = wp.pow(x, power) / wp.pow(middle, power - 1.0)
+        else:
+            y = 1.0 - wp.pow(1.0 - x, power) / wp.pow(1.0 - middle, power - 1.0)
+    return least + y * (most - least)
+
+
+@wp.func
+def _ask(memory: Memory, row: int, soft: Softness, residual: float, depth: float, inverse_inertia: float, velocity: float):
+    """Sets what a row asks for."""
+    imp = _impedance(soft, depth)
+    memory.weight[row] = 1.0 / wp.max(inverse_inertia * (1.0 - imp) / imp, _TINY)
+    memory.aref[row] = -soft[0] * imp * residual - soft[1] * velocity
+
+
+@wp.func
+def _at(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
+    """Returns the velocity at a place of what moves so."""
+    return wp.spatial_bottom(motion) + wp.cross(wp.spatial_top(motion), arm)
+
+
+@wp.func
+def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+    """Sets the first six rows: the target's place less the body's, and the turn between them."""
+    body, target, nv = world.weld_body, world.weld_target, dofs.number
+    arm = memory.pos[body] - memory.pos[bodies.root[body]]
+    q = memory.quat[body]
+    inverse = wp.vec4(q[0], -q[1], -q[2], -q[3])
+    goal = memory.quat[target]
+    moved_by = bodies.moved_by[body]
+    for i in range(lane, nv, lanes):
+        along, about = wp.vec3(0.0), wp.vec3(0.0)
+        if (moved_by >> i) & 1 == 1:
+            motion = memory.motion[i]
+            along = -_at(motion, arm)
+            axis = wp.spatial_top(motion)
+            turn = times(times(inverse, wp.vec4(0.0, axis[0], axis[1], axis[2])), goal)
+            about = -0.5 * wp.vec3(turn[1], turn[2], turn[3])
+        for k in range(3):
+            memory.jacobian[k * nv + i] = along[k]
+            memory.jacobian[(3 + k) * nv + i] = about[k]
+    if lane == 0:
+        place = memory.pos[target] - memory.pos[body]
+        between = times(inverse, goal)
+        turn_left = wp.vec3(between[1], between[2], between[3])
+        depth = wp.sqrt(wp.length_sq(place) + wp.length_sq(turn_left))
+        velocity = memory.velocity[body]
+        bias = memory.bias[body]
+        omega, alpha = wp.spatial_top(velocity), wp.spatial_top(bias)
+        speed = _at(velocity, arm)
+        spin = times(times(inverse, wp.vec4(0.0, omega[0], omega[1], omega[2])), goal)
+        # With qacc 0: the body's acceleration, and the second derivative of the turn.
+        bend = _at(bias, arm) + wp.cross(omega, speed)
+        curl = times(times(inverse, wp.vec4(0.25 * wp.dot(omega, omega), 0.5 * alpha[0], 0.5 * alpha[1], 0.5 * alpha[2])), goal)
+        for k in range(3):
+            _ask(memory, k, world.weld_soft, place[k], depth, world.weld_weight[0], -speed[k])
+            memory.aref[k] = memory.aref[k] + bend[k]
+            _ask(memory, 3 + k, world.weld_soft, turn_left[k], depth, world.weld_weight[1], -0.5 * spin[k + 1])
+            memory.aref[3 + k] = memory.aref[3 + k] + curl[k + 1]
+
+
+@wp.func
+def number(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Gives a row to each joint at its limit, and a number of rows to each contact within its margin."""
+    if lane == 0:
+        rows = int(6)
+        for k in range(dofs.limits):
+            memory.limited[k] = -1
+            if _past_limit(dofs, memory, k) < 0.0:
+                memory.limited[k] = rows
+                rows += 1
+        touching = int(0)
+        for s in range(contacts.slots):
+            pair = contacts.pair[s]
+            if memory.distance[s] < contacts.margin[pair]:
+                memory.touching[touching] = s
+                memory.slot[touching] = rows
+                touching += 1
+                rows += _edges(contacts.dim[pair])
+        memory.counts[0] = touching
+        memory.counts[1] = rows
+    sync(lanes)
+
+
+@wp.func
+def _edges(dim: int) -> int:
+    """Returns how many edges a contact's friction pyramid has."""
+    return wp.where(dim == 1, 1, 2 * dim - 2)
+
+
+@wp.func
+def _past_limit(dofs: Dofs, memory: Memory, k: int) -> float:
+    """Returns how far a joint is from its nearer limit, less the margin."""
+    at = memory.qpos[dofs.qpos[dofs.limit_dof[k]]]
+    return wp.min(at - dofs.limit_range[k][0], dofs.limit_range[k][1] - at) - dofs.limit_margin[k]
+
+
+@wp.func
+def limit(
+    dofs: Dofs,
+    contacts: Contacts,
+    memory: Memory,
+    lane: int,
+    lanes: int,
+):
+    """Sets the rows of joints at their limits."""
+    for k in range(lane, dofs.limits, lanes):
+        row = memory.limited[k]
+        if row >= 0:
+            dof = dofs.limit_dof[k]
+            at = memory.qpos[dofs.qpos[dof]]
+            side = wp.where(at - dofs.limit_range[k][0] < dofs.limit_range[k][1] - at, 1.0, -1.0)
+            for i in range(dofs.number):
+                memory.jacobian[row * dofs.number + i] = wp.where(i == dof, side, 0.0)
+            past = _past_limit(dofs, memory, k)
+            _ask(memory, row, dofs.limit_soft[k], past, past, dofs.limit_weight[k], side * memory.qvel[dof])
+
+
+@wp.func
+def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent."""
+    nv = dofs.number
+    for at in range(lane, memory.counts[0] * nv, lanes):
+        i = at % nv
+        s = memory.touching[at // nv]
+        row = memory.slot[at // nv]
+        pair = contacts.pair[s]
+        sign = float(0.0)
+        if (bodies.moved_by[contacts.geom_body[contacts.geom2[pair]]] >> i) & 1 == 1:
+            sign += 1.0
+        if (bodies.moved_by[contacts.geom_body[contacts.geom1[pair]]] >> i) & 1 == 1:
+            sign -= 1.0
+        motion = sign * memory.motion[i]
+        velocity = _at(motion, memory.place[s] - memory.pos[bodies.root[dofs.body[i]]])
+        normal = memory.normal[s]
+        friction = contacts.friction[pair]
+        along = wp.dot(velocity, normal)
+        if contacts.dim[pair] == 1:
+            memory.jacobian[row * nv + i] = along
+        else:
+            for k in range(contacts.dim[pair] - 1):
+                aside = friction[2] * wp.dot(wp.spatial_top(motion), normal)
+                if k == 0:
+                    aside = friction[0] * wp.dot(velocity, tangent(normal))
+                elif k == 1:
+                    aside = friction[1] * wp.dot(velocity, wp.cross(normal, tangent(normal)))
+                memory.jacobian[(row + 2 * k) * nv + i] = along + aside
+                memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
+    sync(lanes)
+
+
+@wp.func
+def press(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Sets what the rows of contacts ask for."""
+    nv = dofs.number
+    for at in range(lane, _MOST * memory.counts[0], lanes):
+        s = memory.touching[at // _MOST]
+        pair = contacts.pair[s]
+        row = memory.slot[at // _MOST] + at % _MOST
+        if at % _MOST < _edges(contacts.dim[pair]):
+            depth = memory.distance[s] - contacts.margin[pair]
+            velocity = float(0.0)
+            for i in range(nv):
+                velocity += memory.jacobian[row * nv + i] * memory.qvel[i]
+            _ask(memory, row, contacts.soft[pair], depth, depth, contacts.weight[pair], velocity)
+    sync(lanes)

@@ -1,0 +1,167 @@
+"""Contacts of a substep: a lane for each pair of geoms."""
+
+from mjx_dher.envs.engines.fused.cylinder import cylinder_box
+from mjx_dher.envs.engines.fused.lanes import sync
+from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, Contacts, Memory
+from mjx_dher.host import private_api
+from mjx_dher.host.warp_setup import wp
+
+_BOX_BOX, _CYLINDER_BOX, _PLANE_BOX, _PLANE_CYLINDER = (
+    wp.constant(kind) for kind in (BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER)
+)
+_TILT = wp.constant(1e-3)  # rad
+_APART = wp.constant(1e-3)  # least distance of two contacts, relative to the smaller shape
+FAR = wp.constant(1.0e10)  # m, the distance of a slot without a contact
+
+_shapes = private_api.mujoco_warp_shapes()
+_box_box, _plane_cylinder = _shapes.box_box, _shapes.plane_cylinder
+
+
+@wp.func
+def collide(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Computes the distance, place and normal of each slot."""
+    for p in range(lane, contacts.pairs, lanes):
+        geom1 = contacts.geom1[p]
+        geom2 = contacts.geom2[p]
+        mat1 = _mat(contacts, memory, geom1)
+        mat2 = _mat(contacts, memory, geom2)
+        pos1 = _pos(contacts, memory, geom1)
+        pos2 = _pos(contacts, memory, geom2)
+        size1 = contacts.geom_size[geom1]
+        size2 = contacts.geom_size[geom2]
+        margin = contacts.margin[p]
+        first = contacts.first[p]
+        kind = contacts.kind[p]
+        for i in range(contacts.most[p]):
+            memory.distance[first + i] = FAR
+        if kind == _PLANE_BOX or kind == _PLANE_CYLINDER:
+            normal = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
+            if wp.dot(pos2 - pos1, normal) <= contacts.geom_reach[geom2] + margin:
+                if kind == _PLANE_BOX:
+                    _corners(memory, first, margin, pos1, normal, pos2, mat2, size2)
+                else:
+                    _rim(memory, first, pos1, normal, pos2, mat2, size2)
+        elif _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2):
+            if kind == _CYLINDER_BOX:
+                distance, at, normal_of_one = cylinder_box(pos1, mat1, size1, pos2, mat2, size2, margin)
+                memory.distance[first] = distance
+                memory.place[first] = at
+                memory.normal[first] = normal_of_one
+            elif _near(pos2, contacts.geom_reach[geom2] + margin, pos1, mat1, size1):
+                number, distances, places, normal_of_all = _box_box(pos1, mat1, size1, pos2, mat2, size2, margin)
+                for i in range(number):
+                    memory.distance[first + i] = distances[i]
+                    memory.place[first + i] = places[i]
+                    memory.normal[first + i] = normal_of_all
+    sync(lanes)
+    _tilt(contacts, memory, lane, lanes)
+    _thin(contacts, memory, lane, lanes)
+
+
+@wp.func
+def _tilt(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Looks for four more contacts of a cylinder and a box, both tilted by a little about the first one, as MuJoCo C does."""
+    for at in range(lane, 4 * contacts.pairs, lanes):
+        p = at // 4
+        first = contacts.first[p]
+        if contacts.kind[p] == _CYLINDER_BOX and memory.distance[first] < contacts.margin[p]:
+            geom1 = contacts.geom1[p]
+            geom2 = contacts.geom2[p]
+            centre = memory.place[first]
+            normal = memory.normal[first]
+            axis = tangent(normal)
+            if at % 4 >= 2:
+                axis = wp.cross(normal, axis)
+            half = _TILT * wp.where(at % 2 == 0, -0.5, 0.5)
+            turn = wp.quat_to_matrix(wp.quat(wp.sin(half) * axis, wp.cos(half)))
+            back = wp.transpose(turn)
+            distance, place, tilted = cylinder_box(
+                centre + turn * (_pos(contacts, memory, geom1) - centre),
+                turn * _mat(contacts, memory, geom1),
+                contacts.geom_size[geom1],
+                centre + back * (_pos(contacts, memory, geom2) - centre),
+                back * _mat(contacts, memory, geom2),
+                contacts.geom_size[geom2],
+                contacts.margin[p],
+            )
+            if distance < contacts.margin[p]:
+                memory.distance[first + 1 + at % 4] = memory.distance[first]
+                memory.place[first + 1 + at % 4] = place
+                memory.normal[first + 1 + at % 4] = tilted
+    sync(lanes)
+
+
+@wp.func
+def _thin(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Drops contacts of a cylinder and a box that are near others of them."""
+    for p in range(lane, contacts.pairs, lanes):
+        first = contacts.first[p]
+        if contacts.kind[p] == _CYLINDER_BOX:
+            least = _APART * wp.min(contacts.geom_reach[contacts.geom1[p]], contacts.geom_reach[contacts.geom2[p]])
+            for i in range(1, 5):
+                for j in range(i):
+                    if memory.distance[first + j] < FAR:
+                        if wp.length(memory.place[first + i] - memory.place[first + j]) <= least:
+                            memory.distance[first + i] = FAR
+    sync(lanes)
+
+
+@wp.func
+def tangent(normal: wp.vec3) -> wp.vec3:
+    """Returns the first tangent, which MuJoCo takes near y, or near z where the normal is."""
+    other = wp.vec3(0.0, 1.0, 0.0)
+    if wp.abs(normal[1]) >= 0.5:
+        other = wp.vec3(0.0, 0.0, 1.0)
+    return wp.normalize(other - wp.dot(other, normal) * normal)
+
+
+@wp.func
+def _mat(contacts: Contacts, memory: Memory, geom: int) -> wp.mat33:
+    return memory.mat[contacts.geom_body[geom]] * contacts.geom_mat[geom]
+
+
+@wp.func
+def _pos(contacts: Contacts, memory: Memory, geom: int) -> wp.vec3:
+    body = contacts.geom_body[geom]
+    return memory.pos[body] + memory.mat[body] * contacts.geom_pos[geom]
+
+
+@wp.func
+def _corners(
+    memory: Memory, first: int, margin: float, plane: wp.vec3, normal: wp.vec3, pos: wp.vec3, mat: wp.mat33, size: wp.vec3
+):
+    """Sets the slots of a plane and a box: corners of the box's lower half, as in MuJoCo C."""
+    corners = int(0)
+    for corner in range(8):
+        arm = mat * wp.cw_mul(wp.vec3(_side(corner & 1), _side(corner & 2), _side(corner & 4)), size)
+        down = wp.dot(arm, normal)
+        distance = wp.dot(pos - plane, normal) + down
+        if distance < margin and down <= 0.0 and corners < 4:
+            memory.distance[first + corners] = distance
+            memory.place[first + corners] = pos + arm - 0.5 * distance * normal
+            memory.normal[first + corners] = normal
+            corners += 1
+
+
+@wp.func
+def _rim(memory: Memory, first: int, plane: wp.vec3, normal: wp.vec3, pos: wp.vec3, mat: wp.mat33, size: wp.vec3):
+    """Sets the slots of a plane and a cylinder."""
+    distances, places, out = _plane_cylinder(normal, plane, pos, wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2]), size[0], size[1])
+    for i in range(4):
+        memory.distance[first + i] = distances[i]
+        memory.place[first + i] = places[i]
+        memory.normal[first + i] = out
+
+
+@wp.func
+def _side(bit: int) -> float:
+    return wp.where(bit == 0, -1.0, 1.0)
+
+
+@wp.func
+def _near(pos: wp.vec3, reach: float, box_pos: wp.vec3, box_mat: wp.mat33, box_size: wp.vec3) -> bool:
+    """Returns whether a sphere may touch a box."""
+    at = wp.transpose(box_mat) * (pos - box_pos)
+    return (
+        wp.abs(at[0]) <= box_size[0] + reach and wp.abs(at[1]) <= box_size[1] + reach and wp.abs(at[2]) <= box_size[2] + reach
+    )

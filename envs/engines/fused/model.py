@@ -1,0 +1,157 @@
+# mypy: disable-error-code="valid-type"
+"""What the fused substep knows of a model and of its environments: structs of Warp arrays, made from a MuJoCo model."""
+# Not `from __future__ import annotations`: Warp reads the annotations of structs as types.
+
+from mjx_dher.host.warp_setup import wp
+
+# How a body moves against its parent.
+STILL, HINGE, SLIDE, FREE, MOCAP = range(5)
+# Pairs of geoms, in the order of MuJoCo's types.
+PLANE_BOX, PLANE_CYLINDER, BOX_BOX, CYLINDER_BOX = range(4)
+Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
+
+_ints, _floats, _vec3s, _quats = wp.array(dtype=int), wp.array(dtype=float), wp.array(dtype=wp.vec3), wp.array(dtype=wp.vec4)
+_mat33s, _soft = wp.array(dtype=wp.mat33), wp.array(dtype=Softness)
+
+
+@wp.struct
+class Bodies:
+    """Bodies [nbody]; a parent comes before its children, and what is below a body follows it without a gap."""
+
+    number: int
+    parent: _ints
+    root: _ints  # the body of its tree that hangs on the world
+    last: _ints  # the last body below it
+    moved_by: _ints  # mask of the degrees of freedom that move it
+    kind: _ints  # STILL, HINGE, ...
+    qpos: _ints  # index of its first coordinate
+    dof: _ints  # index of its first degree of freedom
+    pos: _vec3s  # in the parent's frame
+    quat: _quats
+    axis: _vec3s  # of the joint, in the body's frame
+    anchor: _vec3s
+    rest: _floats  # coordinate of the joint in which the body is where `pos` and `quat` say
+    com: _vec3s  # centre of mass, in the body's frame
+    principal: _mat33s  # axes of `inertia`
+    mass: _floats
+    inertia: _vec3s
+
+
+@wp.struct
+class Dofs:
+    """Degrees of freedom [nv], and the joint limits and actuators on them."""
+
+    number: int
+    body: _ints
+    armature: _floats
+    damping: _floats
+    stiffness: _floats  # 0 except for joints of one coordinate
+    qpos: _ints  # index of the coordinate
+    rest: _floats
+    limits: int  # how many of them have limits; of each, by its number among those:
+    limit_dof: _ints
+    limit_range: wp.array(dtype=wp.vec2)
+    limit_margin: _floats
+    limit_soft: _soft
+    limit_weight: _floats  # inverse inertia
+    actuators: int
+    actuator_dof: _ints
+    actuator_qpos: _ints
+    actuator_force: wp.array(dtype=wp.vec4)  # for each of: 1, length, velocity; and the control
+    actuator_clip: wp.array(dtype=wp.vec4)  # least and most control; least and most force
+
+
+@wp.struct
+class Contacts:
+    """Geoms that meet [ngeom], pairs of them [npair], and the slots of the pairs' contacts [nslot]."""
+
+    geom_body: _ints
+    geom_pos: _vec3s  # in the body's frame
+    geom_mat: _mat33s
+    geom_size: _vec3s
+    geom_reach: _floats  # radius of a sphere around it
+    pairs: int
+    geom1: _ints
+    geom2: _ints
+    kind: _ints  # PLANE_BOX, ...
+    first: _ints  # slot
+    most: _ints  # slots
+    margin: _floats
+    dim: _ints
+    friction: _vec3s  # along both tangents, and about the normal
+    soft: _soft
+    weight: _floats  # inverse inertia, as a pyramid's rows have it
+    slots: int
+    pair: _ints  # pair of each slot
+
+
+@wp.struct
+class World:
+    """The rest of a model."""
+
+    timestep: float
+    gravity: wp.vec3
+    weld_body: int
+    weld_target: int
+    weld_soft: Softness
+    weld_weight: wp.vec2  # inverse inertia of translation and rotation
+    rows: int  # most rows of constraints
+    tolerance: float
+    iterations: int  # of Newton's method, at most
+    ls_iterations: int
+    scale: float  # of costs, by which they are compared with the tolerance
+
+
+_matrices, _spatial = wp.array(dtype=wp.mat33), wp.array(dtype=wp.spatial_vector)
+
+
+@wp.struct
+class Memory:
+    """What a substep computes, for one environment.
+
+    Spatial vectors have the angular part first and refer to the place of the tree's first body.
+    """
+
+    pos: _vec3s  # [nbody]
+    quat: _quats
+    mat: _matrices
+    moment: _vec3s  # mass times place of the centre of mass
+    inertia: _matrices
+    velocity: _spatial
+    bias: _spatial  # acceleration without qacc and gravity
+    force: _spatial  # that this acceleration needs
+    motion: _spatial  # [nv] velocity for one unit of qvel
+    turning: _spatial  # [nv] acceleration for one unit of qvel
+    momentum: _spatial  # [nv] of the body and what is below it, for one unit of qvel
+    mass: _floats  # [nv * nv]
+    smooth: _floats  # [nv] forces except those of constraints
+    qacc: _floats  # [nv]
+    inert: _floats  # [nv] mass matrix times qacc
+    search: _floats  # [nv] direction of Newton's method
+    step: _floats  # [nv] mass matrix times search
+    factor: _floats  # [(nv + 1) * nv] Cholesky factor, and below it the right-hand side
+    pivot: _floats  # [nv]
+    qpos: _floats  # [nq]
+    qvel: _floats  # [nv]
+    distance: _floats  # [nslot]
+    place: _vec3s  # [nslot]
+    normal: _vec3s  # [nslot] from the first geom to the second
+    touching: _ints  # [nslot] slots of the contacts that there are
+    slot: _ints  # [nslot] first row of each of those contacts
+    limited: _ints  # [nlimit] row of each joint at its limit, or -1
+    counts: _ints  # [2] how many contacts, how many rows
+    jacobian: _floats  # [rows * nv]
+    weight: _floats  # [rows] D, the inverse of a row's softness
+    aref: _floats  # [rows]
+    residual: _floats  # [rows] J qacc - aref
+    pull: _floats  # [rows] D of rows that act, 0 of others
+    change: _floats  # [rows] J search
+
+
+@wp.struct
+class Layout:
+    """Where the fields of `Memory` begin and how long they are, and the length of all of it, in floats."""
+
+    size: int
+    begin: _ints  # by the number of the field
+    length: _ints

@@ -1,0 +1,221 @@
+"""From a MuJoCo model to the structs of the fused substep."""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.engines.fused import model as kinds
+from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
+from mjx_dher.host.warp_setup import wp
+
+CONTACT_KINDS = {
+    ("PLANE", "BOX"): (kinds.PLANE_BOX, 4),
+    ("PLANE", "CYLINDER"): (kinds.PLANE_CYLINDER, 4),
+    ("BOX", "BOX"): (kinds.BOX_BOX, 8),
+    ("CYLINDER", "BOX"): (kinds.CYLINDER_BOX, 5),
+}  # types of two geoms -> (kind, most contacts)
+_JOINTS = {
+    int(mujoco.mjtJoint.mjJNT_HINGE): kinds.HINGE,
+    int(mujoco.mjtJoint.mjJNT_SLIDE): kinds.SLIDE,
+    int(mujoco.mjtJoint.mjJNT_FREE): kinds.FREE,
+}
+
+
+def _fill(struct: Any, **values: Any) -> Any:
+    """Sets fields of a struct: arrays from what NumPy takes, the rest as it is."""
+    made = struct()
+    for name, value in values.items():
+        field = struct.vars[name].type
+        setattr(made, name, _array(value, field.dtype) if isinstance(field, wp.array) else value)
+    return made
+
+
+def _array(value: Any, dtype: Any) -> Any:
+    rows = np.asarray(value, np.int32 if dtype in (int, wp.int32) else np.float32)
+    if dtype not in (int, float, wp.int32, wp.float32):
+        rows = rows.reshape(-1, *dtype._shape_)
+    return wp.array(rows, dtype=dtype)
+
+
+def last_below(model: mujoco.MjModel) -> np.ndarray:
+    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
+    last = np.arange(model.nbody, dtype=np.int32)
+    for body in range(model.nbody - 1, 0, -1):
+        parent = model.body_parentid[body]
+        last[parent] = max(last[parent], last[body])
+    return last
+
+
+def _matrices(quats: np.ndarray) -> np.ndarray:
+    """Returns rotation matrices [n, 3, 3] of quaternions [n, 4]."""
+    matrices = np.zeros((len(quats), 9))
+    for row, quat in zip(matrices, quats):
+        mujoco.mju_quat2Mat(row, quat)
+    return matrices.reshape(-1, 3, 3)
+
+
+def _softness(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> Any:
+    """Returns k, b and the impedance's five numbers, from a constraint's solref and solimp."""
+    least, most, width, middle, power = solimp
+    least, most, middle = (float(np.clip(x, 1e-4, 0.9999)) for x in (least, most, middle))
+    k, b = -solref[0] / most**2, -solref[1] / most
+    if solref[0] > 0:
+        time = max(solref[0], 2 * model.opt.timestep)
+        k, b = 1 / (most * time * solref[1]) ** 2, 2 / (most * time)
+    return Softness(k, b, least, most, width, middle, max(power, 1.0))
+
+
+def _joints_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Returns the fields of `Bodies` that say how each body moves."""
+    kind, qpos, dof, moved_by = (np.zeros(model.nbody, np.int32) for _ in range(4))
+    axis, anchor, rest = np.zeros((model.nbody, 3)), np.zeros((model.nbody, 3)), np.zeros(model.nbody)
+    for body in range(model.nbody):
+        moved_by[body] = moved_by[model.body_parentid[body]]
+        if model.body_mocapid[body] >= 0:
+            kind[body] = kinds.MOCAP
+        if model.body_jntnum[body]:
+            joint = model.body_jntadr[body]
+            kind[body] = _JOINTS[int(model.jnt_type[joint])]
+            qpos[body], dof[body] = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            axis[body], anchor[body], rest[body] = model.jnt_axis[joint], model.jnt_pos[joint], model.qpos0[qpos[body]]
+            for i in range(dof[body], dof[body] + model.body_dofnum[body]):
+                moved_by[body] |= 1 << i
+    return {"kind": kind, "qpos": qpos, "dof": dof, "moved_by": moved_by, "axis": axis, "anchor": anchor, "rest": rest}
+
+
+def bodies_of(model: mujoco.MjModel) -> Any:
+    """Returns `Bodies` of a model."""
+    return _fill(
+        Bodies,
+        number=model.nbody,
+        parent=model.body_parentid,
+        root=model.body_rootid,
+        last=last_below(model),
+        pos=model.body_pos,
+        quat=model.body_quat,
+        com=model.body_ipos,
+        principal=_matrices(model.body_iquat),
+        mass=model.body_mass,
+        inertia=model.body_inertia,
+        **_joints_of(model),
+    )
+
+
+def dofs_of(model: mujoco.MjModel) -> Any:
+    """Returns `Dofs` of a model."""
+    joints = model.dof_jntid
+    scalar = np.isin(model.jnt_type[joints], [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
+    qpos = np.where(scalar, model.jnt_qposadr[joints], 0)
+    limited = np.flatnonzero(model.jnt_limited)
+    driven = model.actuator_trnid[:, 0]
+    gear, gain, bias = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+    everything = np.array([-np.inf, np.inf])
+    return _fill(
+        Dofs,
+        number=model.nv,
+        body=model.dof_bodyid,
+        armature=model.dof_armature,
+        damping=model.dof_damping,
+        stiffness=np.where(scalar, model.jnt_stiffness[joints], 0),
+        qpos=qpos,
+        rest=model.qpos_spring[qpos],
+        limits=len(limited),
+        limit_dof=model.jnt_dofadr[limited],
+        limit_range=model.jnt_range[limited],
+        limit_margin=model.jnt_margin[limited],
+        limit_soft=[_softness(model, *soft) for soft in zip(model.jnt_solref[limited], model.jnt_solimp[limited])],
+        limit_weight=model.dof_invweight0[model.jnt_dofadr[limited]],
+        actuators=model.nu,
+        actuator_dof=model.jnt_dofadr[driven],
+        actuator_qpos=model.jnt_qposadr[driven],
+        actuator_force=np.stack([gear * bias[:, 0], gear**2 * bias[:, 1], gear**2 * bias[:, 2], gear * gain], axis=1),
+        actuator_clip=np.concatenate(
+            [
+                np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, everything),
+                np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange * gear[:, None], everything),
+            ],
+            axis=1,
+        ),
+    )
+
+
+def contacts_of(model: mujoco.MjModel) -> Any:
+    """Returns `Contacts` of a model: the pairs that it lists."""
+    geom1, geom2 = model.pair_geom1.copy(), model.pair_geom2.copy()
+    swap = model.geom_type[geom1] > model.geom_type[geom2]
+    geom1[swap], geom2[swap] = geom2[swap], geom1[swap]
+    kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
+    kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
+    slide = model.pair_friction[:, 0]
+    weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
+    return _fill(
+        Contacts,
+        geom_body=model.geom_bodyid,
+        geom_pos=model.geom_pos,
+        geom_mat=_matrices(model.geom_quat),
+        geom_size=model.geom_size,
+        geom_reach=model.geom_rbound,
+        pairs=len(kind),
+        geom1=geom1,
+        geom2=geom2,
+        kind=kind,
+        first=np.cumsum(most) - most,
+        most=most,
+        margin=model.pair_margin,
+        dim=model.pair_dim,
+        friction=model.pair_friction[:, [0, 1, 2]],
+        soft=[_softness(model, *soft) for soft in zip(model.pair_solref, model.pair_solimp)],
+        weight=weight * np.where(model.pair_dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
+        slots=int(most.sum()),
+        pair=np.repeat(np.arange(len(kind)), most),
+    )
+
+
+def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]:
+    """Returns the types of two geoms, in MuJoCo's order."""
+    first, second = sorted(int(model.geom_type[geom]) for geom in (geom1, geom2))
+    return mujoco.mjtGeom(first).name[len("mjGEOM_") :], mujoco.mjtGeom(second).name[len("mjGEOM_") :]
+
+
+def world_of(model: mujoco.MjModel, contacts: Any) -> Any:
+    """Returns `World` of a model."""
+    body, target = int(model.eq_obj2id[0]), int(model.eq_obj1id[0])
+    dims = np.asarray(model.pair_dim)[contacts.pair.numpy()]
+    return _fill(
+        World,
+        timestep=model.opt.timestep,
+        gravity=wp.vec3(*model.opt.gravity),
+        weld_body=body,
+        weld_target=target,
+        weld_soft=_softness(model, model.eq_solref[0], model.eq_solimp[0]),
+        weld_weight=wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
+        rows=6 + int(np.count_nonzero(model.jnt_limited)) + int(np.where(dims == 1, 1, 2 * dims - 2).sum()),
+        tolerance=model.opt.tolerance,
+        iterations=model.opt.iterations,
+        ls_iterations=model.opt.ls_iterations,
+        scale=1 / (model.stat.meaninertia * model.nv),
+    )
+
+
+def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any) -> Any:
+    """Returns `Layout` for a model."""
+    nb, nv, rows = model.nbody, model.nv, world.rows
+    lengths = {
+        **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
+        **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "pivot", "qvel"), nv),
+        "mass": nv * nv,
+        "factor": (nv + 1) * nv,
+        "qpos": model.nq,
+        **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
+        **dict.fromkeys(("touching", "slot"), contacts.slots),
+        "limited": dofs.limits,
+        "counts": 2,
+        "jacobian": rows * nv,
+        **dict.fromkeys(("weight", "aref", "residual", "pull", "change"), rows),
+    }
+    fields: dict[str, Any] = Memory.vars  # type: ignore[attr-defined]
+    length = np.array([lengths[name] for name in fields])
+    floats = length * [np.prod(getattr(field.type.dtype, "_shape_", ()), dtype=int) for field in fields.values()]
+    end = np.cumsum(floats)
+    return _fill(Layout, size=int(end[-1]), begin=end - floats, length=length)

@@ -1,0 +1,219 @@
+"""The fused kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_dher import envs
+from mjx_dher.envs.engines.fused import kernel, setup
+from mjx_dher.envs.engines.fused.cylinder import cylinder_box
+from mjx_dher.envs.engines.fused.memory import carve
+from mjx_dher.envs.engines.fused.model import Memory
+from mjx_dher.envs.engines.fused.simulation import FusedSimulation, unsupported
+from mjx_dher.host.warp_setup import wp
+
+TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
+NUM = 48  # environments
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_compiler():
+    """A third of the time, and code that is slower but computes the same."""
+    kernel.make(0).module.options["optimization_level"] = 0
+
+
+def floats(x):
+    return wp.array(np.asarray(x, np.float32), dtype=float)
+
+
+def touching(model, seed=0):
+    """States [NUM, ...] at which an object lies between the fingers, or tilted in the table, and the gripper is pulled away."""
+    rng, data = np.random.default_rng(seed), mujoco.MjData(model)
+    qpos = model.qpos0 + 0.05 * rng.standard_normal((NUM, model.nq))
+    qvel, control = 0.5 * rng.standard_normal((NUM, model.nv)), 0.05 * rng.standard_normal((NUM, model.nu))
+    poses = []
+    for i in range(NUM):
+        data.qpos[:] = qpos[i]
+        mujoco.mj_kinematics(model, data)
+        grip = data.body("gripper")
+        poses.append(np.concatenate([grip.xpos + 0.02 * rng.standard_normal(3), grip.xquat]))
+        if model.nq > 7:
+            qpos[i, :3] = [1.3, 0.75, 0.42] + rng.standard_normal(3) * [0.1, 0.1, 0.003]
+            if i % 2:
+                qpos[i, :3] = grip.xpos + 0.01 * rng.standard_normal(3)
+                qpos[i, 0] += 0.02
+    return qpos, qvel, np.concatenate([poses, control], axis=1)
+
+
+def in_c(model, qpos, qvel, inputs):
+    """One timestep of MuJoCo C."""
+    data, found = mujoco.MjData(model), []
+    for i in range(NUM):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], inputs[i, 7:]
+        data.mocap_pos[0], data.mocap_quat[0] = inputs[i, :3], inputs[i, 3:7]
+        mujoco.mj_step(model, data)
+        found.append((data.nefc, *(x.copy() for x in (data.qacc, data.qvel, data.qpos))))
+    return [np.array(x) for x in zip(*found)]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_timestep_is_mujoco_c_s(task):
+    """To single precision, from a cold start of the solver: nine of ten environments, and half of those of Slide. Boxes that
+    are deep in one another may touch at other corners, and a cylinder in a box with another normal."""
+    model = envs.make(task, engine="native").model
+    model.opt.tolerance, (qpos, qvel, inputs) = 1e-12, touching(model)
+    there = in_c(model, qpos, qvel, inputs)
+    simulation = FusedSimulation(model, NUM, substeps=1)
+    result = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]
+    simulation.advance((floats(qpos), floats(qvel), floats(np.zeros((NUM, model.nv)))), floats(inputs), tuple(result))
+    here = [x.numpy() for x in result]
+    assert there[0].max() > (20 if model.nq > 7 else 5)  # rows of constraints: the weld, and contacts
+    for name, a, b, scale in zip(("qpos", "qvel", "qacc"), here, there[:0:-1], (1e-6, 1e-4, 1e-4)):
+        error = np.quantile(np.abs(a - b).max(axis=1), 0.5 if task == "slide" else 0.9)
+        assert error < scale * np.abs(b).max(), name
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options={"optimization_level": 0})
+def collide(
+    cylinder_pos: wp.array(dtype=wp.vec3),
+    cylinder_mat: wp.array(dtype=wp.mat33),
+    cylinder_size: wp.vec3,
+    box_pos: wp.array(dtype=wp.vec3),
+    box_mat: wp.array(dtype=wp.mat33),
+    box_size: wp.vec3,
+    margin: float,
+    found: wp.array2d(dtype=float),
+):
+    i = wp.tid()
+    distance, pos, normal = cylinder_box(
+        cylinder_pos[i], cylinder_mat[i], cylinder_size, box_pos[i], box_mat[i], box_size, margin
+    )
+    found[i, 0] = distance
+    for k in range(3):
+        found[i, 1 + k] = pos[k]
+        found[i, 4 + k] = normal[k]
+
+
+PAIR = """
+<mujoco><option><flag nativeccd="disable"/></option><worldbody>
+  <body name="b" mocap="true"><geom name="b" type="box" size="{size}" contype="0" conaffinity="0"/></body>
+  <body name="c"><freejoint/><geom name="c" type="cylinder" size="0.025 0.02" contype="0" conaffinity="0"/></body>
+</worldbody><contact><pair geom1="c" geom2="b" margin="{margin}"/></contact></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("shape", "margin"), [("table", 0.0), ("finger", 0.001)])
+def test_a_cylinder_touches_a_box_as_in_mujoco_c(shape, margin):
+    """Where they touch they agree in all of 1,000 cases; in nine of ten the distance to 1 % of the radius. The rest is depth at
+    which the portal that is found first decides."""
+    size = {"table": (0.625, 0.45, 0.2), "finger": (0.0385, 0.007, 0.0135)}[shape]
+    model = mujoco.MjModel.from_xml_string(PAIR.format(size=" ".join(map(str, size)), margin=margin))
+    data, rng, number = mujoco.MjData(model), np.random.default_rng(0), 1000
+    poses, there = [], np.full((number, 7), np.inf)
+    for i in range(number):
+        mujoco.mju_euler2Quat(data.qpos[3:], rng.standard_normal(3) * (0.02 if shape == "finger" else 1e-3), "xyz")
+        data.qpos[:3] = rng.uniform(-1, 1, 3) * [0.065, 0.036, 0.04]
+        if shape == "table":
+            data.qpos[:3] = [rng.uniform(-0.64, 0.64), rng.uniform(-0.46, 0.46), 0.22 - abs(rng.normal()) * 1e-4]
+        mujoco.mj_fwdPosition(model, data)
+        poses.append([x.copy() for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3))])
+        if data.ncon:
+            there[i] = (data.contact[0].dist, *data.contact[0].pos, *data.contact[0].frame[:3])
+    pos, mat = (np.array(x, np.float32) for x in zip(*poses))
+    here = wp.zeros((number, 7), dtype=float)
+    arrays = [
+        *(wp.array(pos[:, 1], dtype=wp.vec3), wp.array(mat[:, 1], dtype=wp.mat33), wp.vec3(0.025, 0.02, 0.0)),
+        *(wp.array(pos[:, 0], dtype=wp.vec3), wp.array(mat[:, 0], dtype=wp.mat33), wp.vec3(*size)),
+    ]
+    wp.launch(collide, dim=number, inputs=[*arrays, margin], outputs=[here])
+    here, touches = here.numpy(), np.isfinite(there[:, 0])
+    assert touches.mean() > 0.5
+    assert (touches == (here[:, 0] < margin)).mean() > 0.999
+    error = np.abs(here - there)[touches]
+    assert np.quantile(error[:, 0], 0.9) < 2.5e-4
+    assert np.quantile(error[:, 4:].max(axis=1), 0.9) < 1e-2
+
+
+def test_fields_of_memory_follow_one_another():
+    """`carve` numbers them by hand, in the order in which they are declared."""
+    names = list(Memory.vars)
+    source = "".join(line for line in carve.adj.source.splitlines() if line.strip().startswith("memory."))
+    fields = [source.index(f"memory.{name} = ") for name in names]
+    numbers = [source.index(f"begin[{i}], length[{i}]") for i in range(len(names))]
+    assert fields == sorted(fields)
+    assert numbers == sorted(numbers)
+    model = envs.make("push", engine="native").model
+    contacts, dofs = setup.contacts_of(model), setup.dofs_of(model)
+    layout = setup.layout_of(model, setup.world_of(model, contacts), contacts, dofs)
+    begin, length = layout.begin.numpy(), layout.length.numpy()
+    assert begin[0] == 0
+    assert begin[1] == 3 * model.nbody  # places, three numbers each
+    assert layout.size == begin[-1] + length[-1]
+    assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
+
+
+WELDED = """
+<mujoco>{}<worldbody><body name="t" mocap="true"/><body name="b"><joint name="j"/><geom name="g" type="{}" size="1 1 1"
+contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" contype="0" conaffinity="0"/></worldbody>
+<equality><weld body1="t" body2="b" relpose="0 0 0 1 0 0 0"/></equality>
+<contact><pair geom1="g" geom2="o" condim="{}"/></contact></mujoco>
+"""
+MOTOR = '<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'
+
+
+@pytest.mark.parametrize(
+    ("model", "what"),
+    [
+        (WELDED.format("", "box", 3), None),
+        (WELDED.format("", "sphere", 3), "contacts other than of boxes and cylinders with boxes and planes"),
+        (WELDED.format("", "box", 6), "contacts with rolling friction"),
+        (WELDED.format("", "cylinder", 3), "contacts of cylinders and boxes without nativeccd=disable"),
+        (WELDED.format('<option integrator="implicitfast"/>', "box", 3), "an integrator other than Euler"),
+        (WELDED.format('<option cone="elliptic"/>', "box", 3), "elliptic friction cones"),
+        (WELDED.format('<option><flag gravity="disable"/></option>', "box", 3), "options disabled or enabled"),
+        (WELDED.format('<option density="1.2"/>', "box", 3), "a medium"),
+        (WELDED.format('<default><joint frictionloss="1"/></default>', "box", 3), "friction in joints"),
+        (WELDED.format('<default><joint stiffness="1 2"/></default>', "box", 3), "springs or damping that are not linear"),
+        (WELDED.format('<sensor><jointpos joint="j"/></sensor>', "box", 3), "sensors"),
+        (
+            WELDED.format('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>', "box", 3),
+            "actuators other",
+        ),
+        ("<mujoco/>", "other constraints than one weld of a mocap body"),
+    ],
+)
+def test_what_the_kernel_leaves_out_is_named(model, what):
+    found = unsupported(mujoco.MjModel.from_xml_string(model))
+    assert found == [] if what is None else any(name.startswith(what) for name in found), found
+
+
+@pytest.mark.parametrize("option", ["contacts", "constraints"])
+def test_its_memory_cannot_be_set(option):
+    with pytest.raises(ValueError, match=f"{option} cannot be set with fused=True"):
+        envs.make("push", engine="warp", fused=True, allow_cpu=True, **{option: 8})
+
+
+def test_the_engine_follows_native():
+    """Thirty random steps of Slide: pucks are dragged and fall; under vmap, from a jitted scan."""
+    native, fused = (
+        envs.make("slide", engine=e, **o) for e, o in (("native", {}), ("warp", {"fused": True, "allow_cpu": True}))
+    )
+    keys = jax.random.split(jax.random.key(0), 8)
+    actions = jax.random.uniform(jax.random.key(1), (30, 8, 4), minval=-1)
+    states = jax.jit(jax.vmap(native.reset))(keys)
+
+    def play(env):
+        def step(states, action):
+            states = jax.vmap(env.step)(states, action)
+            return states, (states.obs["observation"], states.failed)
+
+        return jax.jit(lambda s: jax.lax.scan(step, s, actions)[1])(states)
+
+    (there, _), (here, failed) = play(native), play(fused)
+    assert not failed.any()
+    error = np.abs(here - there)[-1]
+    assert error[:, :3].max() < 2e-3  # grip, m
+    assert np.median(error[:, 3:6].max(axis=1)) < 1e-3  # puck, m
+    fused.check()
