@@ -81,7 +81,7 @@ def edits(folder):
                 before = everything(copy)
                 status, text = call(*command(copy))
                 tried += 1
-                fault = fault_of(name, path[-1], status, text, copy, before, right[name])
+                fault = fault_of(name, named_by(path[-1], value, other), status, text, copy, before, right[name])
                 if fault:
                     shown = "removed" if other is REMOVED else repr(other)
                     faults.append(f"{command(copy)[0]}, {'.'.join(path)} {shown}: {fault}")
@@ -113,18 +113,23 @@ def changed(content, path, other):
     return copy
 
 
-def fault_of(kind, field, status, text, folder, before, right):
+def named_by(field, value, other):
+    """What a reader finds the edit by: the field, one that was in it, or the text that it has now."""
+    return [field, *(value if isinstance(value, dict) else ()), *([repr(other)] if isinstance(other, str) else ())]
+
+
+def fault_of(kind, names, status, text, folder, before, right):
     """What is wrong with a command on an edited folder; empty if nothing is."""
     if status == 0:
-        return silent(kind, field, text, folder, right)
+        return silent(kind, names[0], text, folder, right)
     if status == -1:
         return f"traceback: {text[:200]}"
     if status != 2 or "error: " not in text:
         return f"status {status} without a sentence: {text[-200:]}"
-    if field not in text:
+    if not any(name in text for name in names):
         return f"refused without the field's name: {text[-200:]}"
-    names = [name for name in differing(before, everything(folder)) if not name.endswith(".lock")]
-    return f"refused, and changed: {names[:3]}" if names else ""
+    written = [name for name in differing(before, everything(folder)) if not name.endswith(".lock")]
+    return f"refused, and changed: {written[:3]}" if written else ""
 
 
 def silent(kind, field, text, folder, right):

@@ -155,12 +155,26 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
     assert without(rows_of(edited)) == without(rows_of(tmp_path / "long"))
 
 
-def test_steps_that_are_missing_are_not_the_default(stopped, capsys):
-    content = json.loads((stopped / "config.json").read_text())
-    del content["config"]["total_steps"]
-    (stopped / "config.json").write_text(json.dumps(content))
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("config",), [], "without config, an object"),
+        (("config", "hidden_sizes"), 10**20, "without hidden_sizes, a list"),
+        (("config", "hidden_sizes"), None, "('hidden_sizes')"),
+        (("hparams",), "x", "without hparams, an object"),
+        (("physics",), 1, "without physics, a name"),
+        (("physics",), None, "('physics')"),
+        (("config", "total_steps"), None, "('total_steps')"),
+        (("sources",), [], "without sources, an object of texts"),
+        (("sources",), {"env": 10**20}, "without sources, an object of texts"),
+    ],
+)
+def test_parts_of_another_kind_are_named(stopped, capsys, path, value, message):
+    edit(stopped, path, value)
     status, text = resume(stopped, capsys)
-    assert (status, "config.json does not describe a run ('total_steps')" in text) == (2, True), text
+    assert (status, message in text, "Traceback" in text) == (2, True, False), text
+    assert cli.main(["eval", str(stopped)]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, capsys):

@@ -150,11 +150,27 @@ def read_content(path: Path) -> dict[str, Any]:
         raise FolderError(f"{path} is not a run folder: no such folder")
     try:
         content = read_versioned(path / CONFIG_FILE, 1, SCHEMA)
-        return _upgraded(content) if content["schema"] == 1 else content
+        content = _upgraded(content) if content["schema"] == 1 else content
+        _check_kinds(content)
+        return content
     except FileNotFoundError:
         raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
     except (KeyError, AttributeError, TypeError) as error:
         raise FolderError(f"{path / CONFIG_FILE} does not describe a run ({error})") from error
+
+
+def _check_kinds(content: dict[str, Any]) -> None:
+    """Raises TypeError where a part of config.json is of another kind than it is read as."""
+    sources = content.get("sources", {})  # earlier versions did not look at own code
+    right = {
+        "config, an object": isinstance(content["config"], dict),
+        "hparams, an object": isinstance(content["hparams"], dict),
+        "hidden_sizes, a list": isinstance(content["config"], dict) and isinstance(content["config"]["hidden_sizes"], list),
+        "physics, a name": isinstance(content["physics"], str),
+        "sources, an object of texts": isinstance(sources, dict) and all(isinstance(text, str) for text in sources.values()),
+    }
+    if wrong := [name for name, is_right in right.items() if not is_right]:
+        raise TypeError(f"without {'; without '.join(wrong)}")
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
