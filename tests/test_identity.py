@@ -165,8 +165,8 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
         (("physics",), 1, "without physics, a name"),
         (("physics",), None, "('physics')"),
         (("config", "total_steps"), None, "('total_steps')"),
-        (("sources",), [], "without sources, an object of texts"),
-        (("sources",), {"env": 10**20}, "without sources, an object of texts"),
+        (("sources",), [], "without sources, an object"),
+        (("sources",), {"env": 10**20}, "without sources.env, a text"),
     ],
 )
 def test_parts_of_another_kind_are_named(stopped, capsys, path, value, message):

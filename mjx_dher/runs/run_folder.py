@@ -162,12 +162,14 @@ def read_content(path: Path) -> dict[str, Any]:
 def _check_kinds(content: dict[str, Any]) -> None:
     """Raises TypeError where a part of config.json is of another kind than it is read as."""
     sources = content.get("sources", {})  # earlier versions did not look at own code
+    texts = sources if isinstance(sources, dict) else {}
     right = {
         "config, an object": isinstance(content["config"], dict),
         "hparams, an object": isinstance(content["hparams"], dict),
         "hidden_sizes, a list": isinstance(content["config"], dict) and isinstance(content["config"]["hidden_sizes"], list),
         "physics, a name": isinstance(content["physics"], str),
-        "sources, an object of texts": isinstance(sources, dict) and all(isinstance(text, str) for text in sources.values()),
+        "sources, an object": isinstance(sources, dict),
+        **{f"sources.{name}, a text": isinstance(text, str) for name, text in texts.items()},
     }
     if wrong := [name for name, is_right in right.items() if not is_right]:
         raise TypeError(f"without {'; without '.join(wrong)}")
