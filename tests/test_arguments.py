@@ -140,10 +140,10 @@ def in_64_bits():
     jax.config.update("jax_enable_x64", False)
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("pick_and_place", "slide")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("pick_and_place", "push", "slide")]
 
 
-@pytest.mark.parametrize("name", ["push", "reach", *SLOW])
+@pytest.mark.parametrize("name", ["reach", *SLOW])
 def test_starts_are_the_same_in_64_bits(name, in_64_bits, task):
     env, key = task(name).env, jax.random.key(4)
     doubled = env.reset(key)
