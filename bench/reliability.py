@@ -223,7 +223,7 @@ def damage(runs, count, rng):
             tried += 1
     manifest = newest / checkpoint.MANIFEST
     manifest.write_text(manifest.read_text().replace(f'"schema": {checkpoint.SCHEMA}', '"schema": 0'))
-    expect("schema" in checkpoint.restore(out, runs.template).refused[0], "an older schema is not named")
+    expect("schema" in checkpoint.restore(out, runs.template).refused[newest], "an older schema is not named")
     shutil.rmtree(older)
     process = runs.start(out)
     _, stderr = process.communicate()
