@@ -15,7 +15,7 @@ import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
 from mjx_dher.host.files import FolderError
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import driver, identity, run_folder
+from mjx_dher.runs import checkpoint, driver, identity, run_folder
 from mjx_dher.sweeps import comparison, grid, tables
 from point_mass import PointMass
 from probes import held
@@ -148,6 +148,20 @@ def test_a_lane_that_had_failed_when_the_others_were_stopped_costs_them_nothing(
     for folder, whole in zip(folders, trained[2]):
         assert rows_of(folder) == rows_of(whole.folder)
         assert result_of(folder) == result_of(whole.folder)
+
+
+def test_a_checkpoint_that_cannot_be_written_is_told_each_time_and_costs_nothing_else(tmp_path, monkeypatch):
+    def fill(path, arrays):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "_write_arrays", fill)
+    lines, options = [], Options(final_episodes=2, checkpoint_every=1)
+    (result,) = mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "run"], options=options, report=lines.append)
+    assert [line.split(" (")[0].rsplit("/", 1)[-1] for line in lines if "No space left" in line] == [
+        "epoch-000001",
+        "epoch-000002",
+    ]
+    assert (result.status, result.epoch, len(rows_of(tmp_path / "run"))) == ("finished", 3, 3)
 
 
 def _rows(trials):
