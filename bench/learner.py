@@ -1,29 +1,30 @@
 """Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
 
-    python bench/learner.py [--batch-sizes 256 512 1024] [--seeds 1] [--sampler weighted]
-        [--dtype bfloat16 [--kernels hopper]]
+    python bench/learner.py [--learners ddpg td3 sac redq tqc dtqc] [--networks mlp] [--batch-sizes 256 512 1024] [--seeds 1]
+        [--sampler weighted] [--dtype bfloat16 [--kernels hopper]] [--num-critics 2] [--policy-delay 1]
 
 As in training: as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
 until 500 updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one of
-them.
+them. The last column is the time of a learner's gradients over that of ddpg, each by its own products.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from timing import median_seconds, print_table
 
-from mjx_dher import Config, HParams, replay, samplers
-from mjx_dher.hopper import gradients as hopper
-from mjx_dher.learners import ddpg
-from mjx_dher.networks import mlp
+from mjx_dher import Config, HParams, learners, replay, samplers
 from mjx_dher.relabel import draw_batches
+from mjx_dher.spec import LEARNERS
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Episode, Sizes
+
+UPDATES = 500
 
 
 def compute_reward(achieved_goal, desired_goal):
@@ -43,82 +44,127 @@ def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayS
     return jax.jit(replay.add)(replay.init(shapes, num_episodes), episodes, priority)
 
 
-def flops(batch_size: int) -> int:
-    """Of the matrix products of an update.
+def flops(learner: Any, batch_size: int) -> float:
+    """Of the matrix products of an update, on average over a delayed actor's.
 
-    In passes through a network of one kind: the actor forward as target, forward, and backward (two products a layer); the
-    critic forward as target, forward and backward, and for the actor forward and backward (to its input only: one).
+    In passes through a network of one kind, forward one and backward two, or one to the inputs alone: actors forward as target,
+    forward and backward; critics forward as target, forward and backward, and for the actor forward and backward to the inputs.
     """
     sizes = (28, *Config().hidden_sizes)
     hidden = sum(a * b for a, b in itertools.pairwise(sizes))
-    actor, critic = hidden + sizes[-1] * 4, hidden + 4 * sizes[1] + sizes[-1]
-    return 2 * batch_size * (4 * actor + 6 * critic)
+    delay, parts = getattr(learner, "policy_delay", 1), getattr(learner, "critics", None)
+    number, size = (1, 1) if parts is None else (parts.number, parts.size)
+    judges = number if parts is None or parts.num_judges is None else parts.num_judges
+    heads = 1 if parts is None or learner.actor.has_target else 2
+    actor, critic = hidden + heads * 4 * sizes[-1], hidden + 4 * sizes[1] + size * sizes[-1]
+    return 2 * batch_size * (actor * (1 + 3 / delay) + critic * (4 * number + 2 * judges / delay))
+
+
+class Timed:
+    """Programs of a learner's updates, for a batch size and a number of seeds."""
+
+    def __init__(self, learner: Any, batch_size: int, seeds: int, sampler: Any):
+        self.delay = learners.policy_delay(learner)
+        self.at_once = max(1, MAX_TRANSITIONS_PER_DRAW // batch_size // self.delay) * self.delay
+        self.draws = -(-UPDATES // self.at_once)
+        self.shape = (self.at_once // self.delay, self.delay, batch_size)
+        self.learner, self.sampler, self.ring = learner, sampler, full_ring()
+        self.hparams = jax.tree.map(jnp.float32, HParams(priority_fraction=0.5))
+        self.cumulative = replay.cumulative_priority(self.ring)
+        self.keys = jax.random.split(jax.random.key(2), seeds)
+        self.states = jax.vmap(learner.init)(self.keys)
+        self.each = self.at_once * self.draws * seeds
+
+    def draw(self, key: Any) -> Any:
+        return draw_batches(self.ring, key, self.shape, self.sampler, compute_reward, self.hparams, self.cumulative)
+
+    def draw_all(self, key: Any) -> Any:
+        """[draws] one number of each batch, so that none is left out."""
+        add_up = lambda _, key: (None, sum(jnp.sum(x) for x in jax.tree.leaves(self.draw(key))))  # noqa: E731
+        return jax.lax.scan(add_up, None, jax.random.split(key, self.draws))[1]
+
+    def update(self, state: Any, batches: Any) -> Any:
+        for i in range(self.delay):
+            make = self.learner.update if i == self.delay - 1 else self.learner.update_critic
+            state, losses = make(state, jax.tree.map(lambda x, i=i: x[i], batches), self.hparams)
+            state = self.learner.update_target(state, self.hparams)
+        return state, losses
+
+    def updates_only(self, state: Any, batches: Any) -> Any:
+        return jax.lax.scan(lambda state, _: jax.lax.scan(self.update, state, batches), state, length=self.draws)
+
+    def both(self, state: Any, key: Any) -> Any:
+        draw_and_update = lambda state, key: jax.lax.scan(self.update, state, self.draw(key))  # noqa: E731
+        return jax.lax.scan(draw_and_update, state, jax.random.split(key, self.draws))
+
+    def seconds(self) -> tuple[float, float, float]:
+        """Seconds of an update of one seed: whole, its gradients, its drawing."""
+        drawing, updating, whole = (jax.jit(jax.vmap(f)) for f in (self.draw_all, self.updates_only, self.both))
+        batches = jax.jit(jax.vmap(self.draw))(self.keys)
+        calls = (
+            lambda: whole(self.states, self.keys),
+            lambda: updating(self.states, batches),
+            lambda: drawing(self.keys),
+        )
+        both, update, draw = (median_seconds(call) / self.each for call in calls)
+        return both, update, draw
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--learners", nargs="+", default=["ddpg"], choices=LEARNERS)
+    parser.add_argument("--networks", default="mlp")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[256, 512, 1024])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
     parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
+    parser.add_argument("--num-critics", type=int, default=2)
+    parser.add_argument("--policy-delay", type=int, default=1)
     args = parser.parse_args()
-    compute_gradients = (hopper if args.kernels == "hopper" else ddpg).compute_gradients
-    for batch_size in args.batch_sizes if args.kernels == "hopper" else ():
-        if problem := hopper.unsupported_reason(
-            Config(learner_dtype=args.dtype, batch_size=batch_size), num_inputs=28, action_size=4
-        ):
-            parser.error(f"--kernels hopper needs {problem}")
-    playing, learning = (mlp(4, Config().hidden_sizes, dtype) for dtype in ("float32", args.dtype))
-    learner = ddpg.DDPG(Sizes(25, 3, 4), playing, learning, compute_gradients)
-    hparams = jax.tree.map(jnp.float32, HParams(priority_fraction=0.5))
-    sampler, ring = samplers.make(args.sampler), full_ring()
-    cumulative = replay.cumulative_priority(ring)
-    rows = []
-    for batch_size, seeds in itertools.product(args.batch_sizes, args.seeds):
-        at_once = max(1, MAX_TRANSITIONS_PER_DRAW // batch_size)
-        draws = -(-500 // at_once)
-
-        def draw(key, shape=(at_once, batch_size)):
-            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, cumulative)
-
-        def draw_all(key, draw=draw, draws=draws):
-            """[draws] one number of each batch, so that none is left out."""
-            add_up = lambda _, key: (None, sum(jnp.sum(x) for x in jax.tree.leaves(draw(key))))  # noqa: E731
-            return jax.lax.scan(add_up, None, jax.random.split(key, draws))[1]
-
-        def update(state, batch):
-            state, losses = learner.update(state, batch, hparams)
-            return learner.update_target(state, hparams), losses
-
-        def updates_only(state, batches, update=update, draws=draws):
-            return jax.lax.scan(lambda state, _: jax.lax.scan(update, state, batches), state, length=draws)
-
-        def both(state, key, draw=draw, update=update, draws=draws):
-            draw_and_update = lambda state, key: jax.lax.scan(update, state, draw(key))  # noqa: E731
-            return jax.lax.scan(draw_and_update, state, jax.random.split(key, draws))
-
-        keys = jax.random.split(jax.random.key(2), seeds)
-        states = jax.vmap(learner.init)(keys)
-        drawing, updating, whole = (jax.jit(jax.vmap(function)) for function in (draw_all, updates_only, both))
-        batches = jax.jit(jax.vmap(draw))(keys)
-        each = at_once * draws * seeds
-        draw_time = median_seconds(lambda: drawing(keys)) / each
-        update_time = median_seconds(lambda: updating(states, batches)) / each
-        both_time = median_seconds(lambda: whole(states, keys)) / each
+    rows, per_flop = [], {}
+    for batch_size, seeds, name in itertools.product(args.batch_sizes, args.seeds, args.learners):
+        config = Config(
+            batch_size=batch_size,
+            learner_dtype=args.dtype,
+            learner_kernels=args.kernels,
+            num_critics=args.num_critics,
+            policy_delay=args.policy_delay,
+        )
+        try:
+            learner = learners.make(name, config, Sizes(25, 3, 4), args.networks)
+        except ValueError as error:
+            parser.error(str(error))
+        both, update, draw = Timed(learner, batch_size, seeds, samplers.make(args.sampler)).seconds()
+        products = flops(learner, batch_size)
+        per_flop[batch_size, seeds, name] = update / products
+        first = per_flop.get((batch_size, seeds, "ddpg"))
         rows.append(
             (
+                name,
                 batch_size,
                 seeds,
-                f"{both_time * 1e6:,.1f}",
-                f"{1 / both_time:,.0f}",
-                f"{update_time * 1e6:,.1f}",
-                f"{draw_time * 1e6:,.1f}",
-                f"{draw_time / update_time:.1%}",
-                f"{flops(batch_size) / update_time / 1e9:,.0f}",
+                f"{both * 1e6:,.1f}",
+                f"{1 / both:,.0f}",
+                f"{update * 1e6:,.1f}",
+                f"{draw * 1e6:,.1f}",
+                f"{draw / update:.1%}",
+                f"{products / update / 1e9:,.0f}",
+                f"{update / products / first:.2f}" if first else "",
             )
         )
-    head = ("batch", "seeds", "µs/update", "updates/s", "of it: gradients, µs", "drawing, µs", "share", "GFLOP/s")
+    head = (
+        "learner",
+        "batch",
+        "seeds",
+        "µs/update",
+        "updates/s",
+        "of it: gradients, µs",
+        "drawing, µs",
+        "share",
+        "GFLOP/s",
+        "to ddpg",
+    )
     print_table(head, rows)
 
 

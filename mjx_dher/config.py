@@ -30,11 +30,11 @@ class Number:
 
 
 class ReadBy(tuple[str, ...]):
-    """Metadata of a field: the built-in samplers that read it. A field without it is read by every run."""
+    """Metadata of a field: the built-in samplers, or learners, that read it. A field without it is read by every run."""
 
-    def __new__(cls, *samplers: str) -> ReadBy:
-        """Makes the tuple of `samplers`."""
-        return super().__new__(cls, samplers)
+    def __new__(cls, *parts: str) -> ReadBy:
+        """Makes the tuple of `parts`."""
+        return super().__new__(cls, parts)
 
 
 Count = Annotated[int, Number("[1, 1000000]")]
@@ -67,12 +67,25 @@ class Config:
     """Transitions that the replay ring (the buffer) holds."""
     hidden_sizes: Annotated[tuple[int, ...], Number("[1, 65536]")] = (256, 256, 256)
     """Units of the hidden layers, of actor and critic both."""
+    num_critics: Annotated[int, Number("[1, 1000]"), ReadBy("td3", "sac", "redq", "tqc", "dtqc")] = 2
+    """Critics that learn side by side: 2 in TD3 and SAC, 5 in TQC, 10 in REDQ."""
+    subset_critics: Annotated[int, Number("[1, 1000]"), ReadBy("redq")] = 2
+    """Critics, drawn at random, whose smallest value is the target."""
+    num_quantiles: Annotated[int, Number("[1, 10000]"), ReadBy("tqc", "dtqc")] = 25
+    """Quantiles of the return that a critic gives."""
+    dropped_quantiles: Annotated[int, Number("[0, 10000]"), ReadBy("tqc", "dtqc")] = 2
+    """Quantiles a critic that are left out of the target, the largest of all critics' first."""
+    policy_delay: Annotated[int, Number("[1, 1000]"), ReadBy("td3", "sac", "redq", "tqc", "dtqc")] = 1
+    """Gradient steps of the critics for one of the actor: 2 in TD3. It divides target_period, or is a multiple of it that
+    divides updates_per_cycle."""
     learner_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many runs side by side.
     Parameters, and the policy that plays, are float32 with either."""
     learner_kernels: Literal["auto", "xla", "hopper"] = "auto"
     """Implementation of the gradients: xla, hopper (this library's kernels for an NVIDIA H100 or H200, for bfloat16) or auto,
     which takes hopper wherever it can."""
+    n_step: Annotated[int, Number("[1, 1000]")] = 1
+    """Steps of a return that are taken from the episode, before the value of the state that they lead to."""
     eval_episodes: Count = 100
     """Episodes of the deterministic evaluation that ends each epoch."""
 
@@ -97,8 +110,8 @@ class HParams(NamedTuple):
     """Weight of the mean squared action in the actor's loss."""
     random_eps: Share = 0.3
     """Probability of a uniformly random action while exploring."""
-    noise_std: NotNegative = 0.2
-    """Standard deviation of the Gaussian noise on the other actions."""
+    noise_std: Annotated[float, Number("[0, inf)"), ReadBy("ddpg", "td3", "dtqc")] = 0.2
+    """Standard deviation of the Gaussian noise on the other actions; a learner that draws its actions needs none."""
     her_k: NotNegative = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
     priority_fraction: Share = 0.0
@@ -107,6 +120,14 @@ class HParams(NamedTuple):
     """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
     temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0
     """Evenness of the weights, for weighted: the larger, the more even (infinite: the same as future)."""
+    target_noise: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.2
+    """Standard deviation of the Gaussian noise on the actions of targets, which smooths these."""
+    target_noise_clip: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.5
+    """Bound of that noise: it is clipped to +- this."""
+    entropy_weight: Annotated[float, Number("[0, inf)"), ReadBy("sac", "redq", "tqc")] = 1.0
+    """Weight of the policy's entropy in its values, before the learner has changed it."""
+    entropy_target: Annotated[float, Number("(-inf, inf)"), ReadBy("sac", "redq", "tqc")] = -1.0
+    """Entropy that this weight is changed for, for each number of an action."""
     obs_clip: Positive = 200.0
     """Bound of observations and goals: they are clipped to +- this before they are normalized."""
     norm_clip: Positive = 5.0
@@ -173,6 +194,20 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
         raise ValueError("\n".join(problems))
 
 
+def delay_problem(config: Config, delay: int) -> str | None:
+    """Returns what is wrong with a learner's `policy_delay` for the updates of a cycle, or None."""
+    period, updates = config.target_period, config.updates_per_cycle
+    if updates % period:
+        divisors = [str(n) for n in range(1, updates + 1) if updates % n == 0]
+        return f"target_period must divide updates_per_cycle ({updates}); got {period}, allowed: {', '.join(divisors)}"
+    if period % delay and (delay % period or updates % delay):
+        return (
+            f"policy_delay must divide target_period ({period}), or be a multiple of it that divides updates_per_cycle"
+            f" ({updates}); got {delay}"
+        )
+    return None
+
+
 def choice_problems(spec: Any) -> Iterator[str]:
     """Yields what is wrong with the fields of a dataclass that take one of a closed set of names (`Literal`)."""
     for name, hint in get_type_hints(type(spec)).items():
@@ -214,6 +249,8 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
             f"target_period must divide updates_per_cycle ({c.updates_per_cycle}); got {c.target_period},"
             f" allowed: {', '.join(divisors)}"
         )
+    if problem := delay_problem(c, c.policy_delay):
+        yield problem
     cycle = c.num_envs * episode_length
     if c.replay_size < cycle:
         yield (
@@ -222,10 +259,12 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
         )
     if c.batch_size > c.replay_size:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
-    if c.batch_size * c.target_period > INT32_MAX:
+    period, delay = c.target_period, c.policy_delay
+    at_once = max(period, delay)
+    if c.batch_size * at_once > INT32_MAX:
         yield (
-            f"batch_size must not exceed {INT32_MAX // c.target_period} with target_period {c.target_period}, because the"
-            f" batches of a period are drawn at once; got {c.batch_size}"
+            f"batch_size must not exceed {INT32_MAX // at_once} with target_period {period} and policy_delay {delay}, because"
+            f" the batches of {at_once} updates are drawn at once; got {c.batch_size}"
         )
     epochs = num_epochs(c, episode_length)
     for field, count in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -14,9 +15,10 @@ from mjx_dher.spec import NETWORKS
 from mjx_dher.types import Array
 
 
-def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike) -> Array:
+def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, layer_norm: bool = False) -> Array:
     for size in hidden_sizes:
-        x = nn.relu(nn.Dense(size, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x))
+        x = nn.Dense(size, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x)
+        x = nn.relu(nn.LayerNorm(dtype=dtype)(x) if layer_norm else x)
     return nn.Dense(output_size, dtype=jnp.float32, kernel_init=nn.initializers.xavier_uniform())(x)
 
 
@@ -34,33 +36,73 @@ class Actor(nn.Module):
         return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype))
 
 
-class Critic(nn.Module):
-    """Q value of an action in a state, for a goal. Parameters and values are float32."""
+class GaussianActor(nn.Module):
+    """Gaussian policy before its tanh: normalized observation and goal to means and log standard deviations, both float32."""
 
+    action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
 
     @nn.compact
+    def __call__(self, observation: Array, goal: Array) -> tuple[Array, Array]:
+        """Maps observations [..., D] and goals [..., G] to means [..., A] and log standard deviations [..., A]."""
+        inputs = jnp.concatenate([observation, goal], axis=-1)
+        outputs = _mlp(inputs, self.hidden_sizes, 2 * self.action_size, self.dtype)
+        return outputs[..., : self.action_size], outputs[..., self.action_size :]
+
+
+class Critic(nn.Module):
+    """Q value of an action in a state, for a goal, or quantiles of the return. Parameters and values are float32."""
+
+    hidden_sizes: Sequence[int] = (256, 256, 256)
+    dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
+    layer_norm: bool = False  # before each ReLU
+    size: int | None = None  # M, numbers that it gives; one, without an axis, where None
+
+    @nn.compact
     def __call__(self, observation: Array, goal: Array, action: Array) -> Array:
-        """Maps observations [..., D], goals [..., G] and actions [..., A] to values [...]."""
+        """Maps observations [..., D], goals [..., G] and actions [..., A] to values [...] or [..., M]."""
         inputs = jnp.concatenate([observation, goal, action], axis=-1)
-        return _mlp(inputs, self.hidden_sizes, 1, self.dtype)[..., 0]
+        values = _mlp(inputs, self.hidden_sizes, self.size or 1, self.dtype, self.layer_norm)
+        return values[..., 0] if self.size is None else values
 
 
 class Networks(NamedTuple):
     """The modules of actor and critic, as flax modules with `init` and `apply`; static."""
 
-    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1]
-    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...]
+    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1]; what `Heads` says otherwise
+    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...]; what `Heads` says otherwise
 
 
-# make(action_size, hidden_sizes, dtype) -> Networks; those of another dtype have the same parameters
-NetworksFn = Callable[[int, tuple[int, ...], DTypeLike], Networks]
+class Heads(NamedTuple):
+    """What a learner asks of its networks, where it is not an action and a value."""
+
+    gaussian: bool = False  # the actor gives (mean [..., A], log standard deviation [..., A]), before tanh
+    critic_size: int | None = None  # M: the critic gives values [..., M]
 
 
-def mlp(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32") -> Networks:
+PLAIN = Heads()
+
+# make(action_size, hidden_sizes, dtype) -> Networks; those of another dtype have the same parameters. With heads as a fourth
+# argument it serves learners that ask for others than the default.
+NetworksFn = Callable[..., Networks]
+_PARAMETERS = ("action_size", "hidden_sizes", "dtype")
+
+
+def mlp(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
     """Makes the default networks."""
-    return Networks(actor=Actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=Critic(hidden_sizes, jnp.dtype(dtype)))
+    actor = GaussianActor if heads.gaussian else Actor
+    critic = Critic(hidden_sizes, jnp.dtype(dtype), size=heads.critic_size)
+    return Networks(actor=actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=critic)
+
+
+def layer_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
+    """Makes the default networks with layer normalization (Ba et al. 2016) in the critic, before each ReLU.
+
+    It bounds what the critic makes of actions that it never saw (Ball et al. 2023, RLPD).
+    """
+    networks = mlp(action_size, hidden_sizes, dtype, heads)
+    return networks._replace(critic=networks.critic.clone(layer_norm=True))
 
 
 def make(name: str | NetworksFn) -> NetworksFn:
@@ -69,4 +111,19 @@ def make(name: str | NetworksFn) -> NetworksFn:
     Raises:
       ValueError: no such networks, or no function of (action_size, hidden_sizes, dtype).
     """
-    return names.resolve("networks", name, NETWORKS, ("action_size", "hidden_sizes", "dtype"))
+    return names.resolve("networks", name, NETWORKS, _PARAMETERS)
+
+
+def check_heads(make_networks: NetworksFn, learner: str) -> None:
+    """Refuses networks of one's own for a learner that needs other heads than they have.
+
+    Raises:
+      ValueError: they do not take `heads` as a fourth argument.
+    """
+    try:
+        inspect.signature(make_networks).bind(*_PARAMETERS, "heads")
+    except TypeError:
+        raise ValueError(
+            f"learner {learner} needs networks that are a function ({', '.join(_PARAMETERS)}, heads), with the outputs that"
+            f" networks.Heads says; these are {make_networks!r}"
+        ) from None

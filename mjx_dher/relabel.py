@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 
@@ -54,18 +55,46 @@ def draw_batches(
     compute_reward: RewardFn,
     hparams: HParams,
     cumulative: Array,
+    n_step: int = 1,
 ) -> Batch:
     """Draws and relabels transitions as the learner takes them, all at once; leaves lead with `shape`.
 
     A fraction `hparams.priority_fraction` of them is from episodes drawn by priority; `cumulative` is
-    `replay.cumulative_priority(state)`. The ring must not be empty.
+    `replay.cumulative_priority(state)`. The ring must not be empty. `n_step` is what `look_ahead` takes.
     """
     row_key, sample_key, relabel_key = jax.random.split(key, 3)
     number = math.prod(shape)
     rows = replay.draw_rows(state, row_key, number, hparams.priority_fraction, cumulative)
     sample = replay.sample(state, sample_key, number, rows)
     batch = relabel(state, sample, sampler, compute_reward, hparams, relabel_key)
+    if n_step > 1:
+        batch = look_ahead(state, sample, batch, compute_reward, hparams.gamma, n_step)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
+
+
+def look_ahead(
+    state: ReplayState, sample: Sample, batch: Batch, compute_reward: RewardFn, gamma: Array | float, n_step: int
+) -> Batch:
+    """Returns the batch that `relabel` made of `sample`, with returns of up to `n_step` steps of its episodes.
+
+    A return ends where the episode does, and where the goal is reached (a reward of 0, the most there is): what the episode
+    did after that, it did for another goal. Up to there, actions are those of the policies that played (Hessel et al. 2018,
+    whose multi-step returns are not corrected for that either).
+    """
+    last = sample.episode_goals.shape[1] - 1
+    ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]
+    achieved = sample.episode_goals[jnp.arange(sample.step.shape[0]), jnp.minimum(ahead, last)]
+    rewards = jax.vmap(compute_reward, in_axes=(0, None))(achieved, batch.desired_goal)
+    going_on = jnp.cumprod((rewards < 0) & (ahead < last), axis=0)  # after the i-th step
+    counted = jnp.concatenate([jnp.ones_like(going_on[:1]), going_on[:-1]])
+    num_steps = jnp.sum(counted, axis=0)
+    powers = jnp.asarray(gamma, rewards.dtype) ** jnp.arange(n_step, dtype=rewards.dtype)[:, None]
+    return dataclasses.replace(
+        batch,
+        next_observation=jax.tree.map(lambda x: x[sample.row, sample.step + num_steps], state.episodes.observation),
+        reward=jnp.sum(powers * counted * rewards, axis=0),
+        discount=jnp.asarray(gamma, rewards.dtype) ** num_steps,
+    )
 
 
 def relabel(

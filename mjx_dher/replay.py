@@ -35,6 +35,7 @@ class Sample:
     episode_goals: Array  # [B, T+1, G] the achieved goals of the transition's episode
     desired_goal: Array  # [B, G] the goal that the episode was played for
     step: Array  # [B] the transition leads from `step` to `step + 1`, int32
+    row: Array  # [B] of the ring, which holds the episode, int32
 
 
 def init(episode: Episode, num_episodes: int) -> ReplayState:
@@ -214,6 +215,7 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
         episode_goals=episodes.achieved_goal[rows],
         desired_goal=episodes.desired_goal[rows],
         step=steps,
+        row=rows,
     )
 
 

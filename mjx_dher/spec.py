@@ -17,8 +17,11 @@ SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest"
 WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
 METRICS = {"position": "mjx_dher.samplers:position"}
 PRIORITIES = {"eventful": "mjx_dher.priorities:eventful"}
-LEARNERS = {"ddpg": "mjx_dher.learners.ddpg:make"}
-NETWORKS = {"mlp": "mjx_dher.networks:mlp"}
+LEARNERS = {
+    **{name: f"mjx_dher.learners.{name}:make" for name in ("ddpg", "td3", "sac", "redq", "tqc")},
+    "dtqc": "mjx_dher.learners.tqc:make_deterministic",
+}
+NETWORKS = {name: f"mjx_dher.networks:{name}" for name in ("mlp", "layer_norm")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,9 +43,9 @@ class RunSpec:
     priority: str = "eventful"
     """Priority of an episode in replay, for priority_fraction of each batch: eventful, or module:attribute."""
     learner: str = "ddpg"
-    """Learner: ddpg, or module:attribute."""
+    """Learner: ddpg, td3, sac, redq, tqc, dtqc (tqc with a deterministic actor), or module:attribute."""
     networks: str = "mlp"
-    """Networks of the learner: mlp, or module:attribute."""
+    """Networks of the learner: mlp, layer_norm (in its critics), or module:attribute."""
     seed: int = 0
     """Random seed."""
     config: Config = dataclasses.field(default_factory=Config)
@@ -76,10 +79,21 @@ def own_parts(spec: RunSpec) -> list[str]:
     return [field for field in ("env", *PARTS) if is_import_path(getattr(spec, field))]
 
 
-def reads(sampler: str, field: str) -> bool:
-    """Returns whether a setting makes a difference to runs with this sampler; an own sampler may read any."""
-    read_by = {**config_lib.metadata(RunSpec, ReadBy), **config_lib.metadata(HParams, ReadBy)}
-    return sampler not in SAMPLERS or field not in read_by or sampler in read_by[field]
+def read_by() -> dict[str, ReadBy]:
+    """Returns the samplers or learners that read a setting, for those that not every run reads."""
+    return {name: parts for owner in (RunSpec, Config, HParams) for name, parts in config_lib.metadata(owner, ReadBy).items()}
+
+
+def reads(sampler: str, learner: str, field: str) -> bool:
+    """Returns whether a setting makes a difference to runs with this sampler and learner.
+
+    A sampler, or learner, of one's own may read any setting that some sampler, or learner, reads.
+    """
+    parts = read_by().get(field)
+    if parts is None:
+        return True
+    part, known = (sampler, SAMPLERS) if parts[0] in SAMPLERS else (learner, LEARNERS)
+    return part in parts or part not in known
 
 
 def validate_values(spec: RunSpec) -> None:

@@ -80,12 +80,20 @@ class Loop:
         return config_lib.num_epochs(c, self.env.episode_length) * c.cycles_per_epoch * c.updates_per_cycle
 
     @property
-    def target_updates_per_draw(self) -> int:
-        """Target updates whose batches are drawn at once: as many as `max_transitions_per_draw` allows, at least one."""
-        per_cycle = self.config.updates_per_cycle // self.config.target_period
-        return _largest_divisor(
-            per_cycle, self.max_transitions_per_draw // (self.config.target_period * self.config.batch_size)
-        )
+    def policy_delay(self) -> int:
+        """Updates of the critics for one of the actor."""
+        return learners.policy_delay(self.learner)
+
+    @property
+    def updates_per_round(self) -> int:
+        """Updates until both the targets and the actor have moved."""
+        return max(self.config.target_period, self.policy_delay)
+
+    @property
+    def rounds_per_draw(self) -> int:
+        """Rounds whose batches are drawn at once: as many as `max_transitions_per_draw` allows, at least one."""
+        rounds = self.config.updates_per_cycle // self.updates_per_round
+        return _largest_divisor(rounds, self.max_transitions_per_draw // (self.updates_per_round * self.config.batch_size))
 
 
 def make_train(
@@ -126,6 +134,8 @@ def make_train(
         learner=learners.make("ddpg", config, env_sizes(env)) if learner is None else learner,
         template=episode_template(env),
     )
+    if problem := config_lib.delay_problem(config, loop.policy_delay):
+        raise ValueError(problem)
     return Train(
         init=functools.partial(_init, loop),
         epoch=functools.partial(_epoch, loop),
@@ -141,6 +151,7 @@ def _check_arguments(env: Env, config: Config, learner: Learner | None) -> None:
     config_lib.validate(config, HParams(), env.episode_length)
     if learner is not None:
         learners.check_methods(learner, learner)
+        learners.check_discount(learner, config)
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
@@ -220,27 +231,46 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, hparams: HParams, key
     """
     config = loop.config
     cumulative = replay.cumulative_priority(ring)
-    shape = (loop.target_updates_per_draw, config.target_period, config.batch_size)
+    shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
-        batches = draw_batches(ring, key, shape, loop.sampler, loop.env.compute_reward, hparams, cumulative)
-        return jax.lax.scan(functools.partial(_update_with_target, loop.learner, hparams), learner, batches)
+        batches = draw_batches(ring, key, shape, loop.sampler, loop.env.compute_reward, hparams, cumulative, config.n_step)
+        return jax.lax.scan(functools.partial(_round, loop, hparams), learner, batches)
 
-    keys = jax.random.split(key, config.updates_per_cycle // (config.target_period * loop.target_updates_per_draw))
+    keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))
     learner, losses = jax.lax.scan(draw_and_update, learner, keys)
     return learner, jax.tree.map(jnp.mean, losses)
 
 
-def _update_with_target(learner: Learner, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes an update for each of `batches` (leaves lead with [target_period]), then moves the targets."""
+def _round(loop: Loop, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
+    """Makes an update for each of `batches` (leaves lead with [updates_per_round]) and moves the targets when they are due."""
+    delay, period = loop.policy_delay, loop.config.target_period
+    if delay > period:
+        return _delayed_update(loop, hparams, state, batches)
+    groups = jax.tree.map(lambda x: x.reshape(period // delay, delay, *x.shape[1:]), batches)
+    state, losses = jax.lax.scan(functools.partial(_delayed_update, loop, hparams), state, groups)
+    return _move_targets(loop.learner, hparams, state), losses
 
-    def update(state: PyTree, batch: Batch) -> tuple[PyTree, Metrics]:
-        return learners.check_update(state, learner.update(state, batch, hparams))
 
-    state, losses = jax.lax.scan(update, state, batches)
+def _delayed_update(loop: Loop, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
+    """Makes `policy_delay` updates, the last of them of the actor, too; returns the last one's metrics.
+
+    Targets that are due within them are moved.
+    """
+    learner, period = loop.learner, loop.config.target_period
+    for number in range(1, loop.policy_delay + 1):
+        batch = jax.tree.map(lambda x, i=number - 1: x[i], batches)
+        method = "update" if number == loop.policy_delay else "update_critic"
+        state, losses = learners.check_update(state, getattr(learner, method)(state, batch, hparams), method)
+        if loop.policy_delay > period and number % period == 0:
+            state = _move_targets(learner, hparams, state)
+    return state, losses
+
+
+def _move_targets(learner: Learner, hparams: HParams, state: PyTree) -> PyTree:
     moved = learner.update_target(state, hparams)
     learners.check_kept("update_target", state, moved)
-    return moved, losses
+    return moved
 
 
 def _relabel_metrics(goal: Array, hindsight: Array) -> Metrics:

@@ -48,6 +48,9 @@ class Batch:
     desired_goal: Array  # [B, G]
     action: Array  # [B, A]
     reward: Array  # [B]
+    # [B] what the value of the next observation counts; gamma where None. With n-step returns, `reward` is the discounted sum
+    # of m rewards, this is gamma^m, and the next observation is m steps ahead.
+    discount: Array | None = None
 
 
 class Sizes(NamedTuple):

@@ -136,13 +136,23 @@ def test_every_field_s_extremes_are_run_or_refused_by_its_name(owner, name, valu
         config.validate(settings[Config], settings[HParams], 50)
 
 
-def test_what_a_sampler_reads():
-    assert spec.reads("weighted", "temperature")
-    assert not spec.reads("future", "temperature")
-    assert spec.reads("epsilon_closest", "metric")
-    assert not spec.reads("epsilon_closest", "weight_kernel")
-    assert spec.reads("future", "gamma")
-    assert spec.reads("mine:sampler", "temperature")  # an own sampler may read any
+def test_what_a_sampler_or_a_learner_reads():
+    assert spec.reads("weighted", "ddpg", "temperature")
+    assert not spec.reads("future", "ddpg", "temperature")
+    assert spec.reads("epsilon_closest", "ddpg", "metric")
+    assert not spec.reads("epsilon_closest", "ddpg", "weight_kernel")
+    assert spec.reads("future", "ddpg", "gamma")
+    assert spec.reads("mine:sampler", "ddpg", "temperature")  # an own sampler may read any
+    assert spec.reads("future", "tqc", "num_quantiles")
+    assert not spec.reads("future", "sac", "num_quantiles")
+    assert not spec.reads("mine:sampler", "sac", "noise_std")
+    assert spec.reads("future", "mine:learner", "noise_std")
+    assert not spec.reads("future", "mine:learner", "temperature")
+
+
+def test_each_setting_is_read_by_parts_of_one_kind_that_exist():
+    for name, parts in spec.read_by().items():
+        assert set(parts) <= set(spec.SAMPLERS) or set(parts) <= set(spec.LEARNERS), name
 
 
 def test_all_problems_are_named_at_once():

@@ -164,6 +164,42 @@ def test_a_checkpoint_that_cannot_be_written_is_told_each_time_and_costs_nothing
     assert (result.status, result.epoch, len(rows_of(tmp_path / "run"))) == ("finished", 3, 3)
 
 
+def test_a_run_that_has_reached_its_aim_ends_there_also_after_a_stop(tmp_path):
+    """The mean of three evaluations: those before the stop count."""
+    spec = dataclasses.replace(SPEC, config=dataclasses.replace(CONFIG, total_steps=400, eval_episodes=200))
+    env, rates, lines = PointMass(), [], []
+    options = Options(final_episodes=2)
+
+    def train(folder, options, **more):
+        return mjx_dher.train_runs(env, [spec], [folder], options=options, report=lines.append, **more)[0]
+
+    train(tmp_path / "whole", options, on_epoch=lambda specs, progress: rates.append(float(progress.metrics["success_rate"])))
+    means = [sum(rates[i - 3 : i]) / 3 for i in range(3, len(rates) + 1)]
+    aim = max(means)
+    assert (len(rates), aim > 0) == (10, True)
+    due = 3 + next(i for i, mean in enumerate(means) if mean >= aim)
+    ended = train(tmp_path / "ended", dataclasses.replace(options, stop_at=aim))
+    assert (ended.status, ended.epoch, ended.content["epochs"]) == ("finished", due, due)
+    assert len(rows_of(tmp_path / "ended")) == due
+    assert any(f"stop_at {aim:g} is reached after epoch {due} of 10" in line for line in lines) or due == 10
+    resumed, stopping = dataclasses.replace(options, stop_at=aim), iter([False] * (due - 2) + [True])
+    stopped = train(tmp_path / "resumed", resumed, should_stop=lambda: next(stopping))
+    assert (stopped.status, stopped.epoch) == ("stopped", due - 1)
+    assert train(tmp_path / "resumed", resumed).epoch == due
+
+
+def test_an_aim_is_for_one_run(tmp_path):
+    for value in (0.0, 1.5, "x", True):
+        with pytest.raises(ValueError, match=r"stop_at must .*\(0, 1\]"):
+            mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "a"], options=Options(stop_at=value))
+    two = [SPEC, dataclasses.replace(SPEC, seed=1)]
+    for specs, sweep in ((two, False), ([SPEC], True)):
+        folders = [tmp_path / str(spec.seed) for spec in specs]
+        with pytest.raises(ValueError, match="stop_at ends one run alone"):
+            mjx_dher.train_runs(PointMass(), specs, folders, options=Options(stop_at=0.9), sweep=sweep)
+    assert not list(tmp_path.iterdir())
+
+
 def _rows(trials):
     return [row for groups in comparison.groups(trials).values() for row in comparison.compare(groups, "future", 0.9)]
 

@@ -153,6 +153,28 @@ def test_what_is_no_method_is_missing():
         learners.make(lambda config, sizes, networks: types.SimpleNamespace(**methods), SMALL, SIZES)
 
 
+def test_a_delay_needs_an_update_of_the_critics():
+    methods = {name: (lambda *args: None) for name in METHODS}
+    for delay, message in (
+        (3, "policy_delay of 3, and no update_critic"),
+        (0, "policy_delay of the learner must be"),
+        (2.0, "policy"),
+    ):
+        made = types.SimpleNamespace(**methods, policy_delay=delay)
+        with pytest.raises(ValueError, match=message):
+            learners.make(lambda config, sizes, networks, made=made: made, SMALL, SIZES)
+
+
+def test_returns_of_several_steps_need_a_learner_that_takes_their_discount():
+    several = dataclasses.replace(SMALL, n_step=3)
+    made = types.SimpleNamespace(**{name: (lambda *args: None) for name in METHODS})
+    with pytest.raises(ValueError, match="n_step 3 needs a learner that takes a batch's discount"):
+        learners.make(lambda config, sizes, networks: made, several, SIZES)
+    with pytest.raises(ValueError, match="n_step 3 needs"):
+        make_train(PointMass(), several, learner=made)
+    assert learners.make("ddpg", several, SIZES).uses_discount
+
+
 class Wide(nn.Module):
     """Gives one number too many."""
 

@@ -7,9 +7,10 @@ import pytest
 
 from mjx_dher import replay, samplers
 from mjx_dher.config import HParams
-from mjx_dher.relabel import hindsight_goals, relabel
+from mjx_dher.relabel import draw_batches, hindsight_goals, look_ahead, relabel
 from mjx_dher.rollout import rollout
 from mjx_dher.spec import SAMPLERS
+from mjx_dher.types import Batch, Episode
 from probes import Clock
 
 HP = HParams()
@@ -114,3 +115,62 @@ def test_one_of_several_samplers_draws_what_it_would_alone(ring):
         goals.add(found.tobytes())
     assert len(goals) == len(names)
     assert samplers.one_of([together]) is together
+
+
+LINE = Episode(  # four steps along a line: 0, 1, 3, 6, 10
+    observation=jnp.arange(5.0)[:, None] * 10,
+    achieved_goal=jnp.array([[0.0], [1.0], [3.0], [6.0], [10.0]]),
+    desired_goal=jnp.array([20.0]),
+    action=jnp.zeros((4, 1)),
+)
+
+
+def near(achieved, desired):
+    return -(jnp.abs(achieved - desired)[..., 0] > 0.5).astype(jnp.float32)
+
+
+@pytest.mark.parametrize(
+    ("step", "goal", "reward", "num_steps"),
+    [
+        (0, 20.0, -1 - 0.5 - 0.25, 3),  # never reached: three steps
+        (0, 1.0, 0.0, 1),  # reached by the first
+        (0, 3.0, -1.0, 2),  # by the second: what comes after is another goal's
+        (0, 6.0, -1 - 0.5, 3),
+        (2, 20.0, -1 - 0.5, 2),  # the episode ends
+        (3, 10.0, 0.0, 1),
+        (3, 20.0, -1.0, 1),
+        (1, 1.0, -1 - 0.5 - 0.25, 3),  # where the transition began does not count
+    ],
+)
+def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
+    """gamma 1/2, up to three steps; the second row of the ring holds the episode."""
+    ring = replay.add(replay.init(LINE, 3), jax.tree.map(lambda x: jnp.stack([x + 99, x]), LINE))
+    sample = replay.Sample(
+        observation=LINE.observation[step][None],
+        next_observation=LINE.observation[step + 1][None],
+        action=LINE.action[step][None],
+        episode_goals=LINE.achieved_goal[None],
+        desired_goal=LINE.desired_goal[None],
+        step=jnp.array([step]),
+        row=jnp.array([1]),
+    )
+    one = Batch(sample.observation, sample.next_observation, jnp.array([[goal]]), sample.action, jnp.array([9.0]))
+    batch = look_ahead(ring, sample, one, near, 0.5, 3)
+    np.testing.assert_allclose(batch.reward, [reward])
+    np.testing.assert_allclose(batch.discount, [0.5**num_steps])
+    np.testing.assert_array_equal(batch.next_observation, LINE.observation[step + num_steps][None])
+    np.testing.assert_array_equal(batch.observation, one.observation)
+
+
+def test_one_step_ahead_is_the_transition(ring):
+    """Drawn alike with one step and several: the same transitions and goals; with one, the reward and gamma themselves."""
+    args = ring, jax.random.key(5), (300,), samplers.make("future"), ENV.compute_reward, HP, replay.cumulative_priority(ring)
+    single, several = draw_batches(*args), draw_batches(*args, n_step=4)
+    assert single.discount is None
+    for name in ("observation", "action", "desired_goal"):
+        np.testing.assert_array_equal(getattr(single, name), getattr(several, name))
+    once = np.isclose(several.discount, HP.gamma)
+    np.testing.assert_array_equal(single.next_observation[once], several.next_observation[once])
+    np.testing.assert_array_equal(single.reward[once], several.reward[once])
+    assert 0 < once.mean() < 1
+    assert np.all(np.asarray(several.reward)[~once] <= np.asarray(single.reward)[~once])

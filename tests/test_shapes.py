@@ -35,14 +35,15 @@ RING = jax.eval_shape(lambda: replay.init(jax.tree.map(lambda x: shape(*x.shape[
 SAMPLE = jax.eval_shape(lambda ring, key: replay.sample(ring, key, B), RING, KEY)
 BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B))
 typed = jaxtyped(typechecker=beartype)
-fields = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.fields(tree))  # noqa: E731
+values = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.fields(tree))  # noqa: E731
+fields = lambda tree: tuple(value for value in values(tree) if value is not None)  # noqa: E731
 
 NewEpisodes = tuple[Float[Array, "N T1 D"], Float[Array, "N T1 G"], Float[Array, "N G"], Float[Array, "N T A"]]
 Stored = tuple[Float[Array, "E T1 D"], Float[Array, "E T1 G"], Float[Array, "E G"], Float[Array, "E T A"]]
 Marks = tuple[Float[Array, "E"], Int[Array, ""], Int[Array, ""]]
 Ring = tuple[Stored, Marks]
 Ends = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B A"]]
-Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], Int[Array, "B"]]
+Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], Int[Array, "B"], Int[Array, "B"]]
 Drawn = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B G"], Float[Array, "B A"], Float[Array, "B"]]
 Batches = tuple[Float[Array, "T B D"], Float[Array, "T B D"], Float[Array, "T B G"], Float[Array, "T B A"], Float[Array, "T B"]]
 Rows = tuple[Int[Array, "B"], Int[Array, "E"], Bool[Array, ""]]

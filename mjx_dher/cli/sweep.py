@@ -80,7 +80,7 @@ class SweepArgs:
     priority: tuple[str, ...] = ("eventful",)
     """Priorities of episodes in replay: eventful, or module:attribute."""
     learner: tuple[str, ...] = ("ddpg",)
-    """Learners: ddpg, or module:attribute."""
+    """Learners: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
     networks: tuple[str, ...] = ("mlp",)
     """Networks: mlp, or module:attribute."""
     seeds: int = 10

@@ -63,6 +63,8 @@ class ResumeArgs:
     """Checkpoints to keep; as the run was started with unless given."""
     log: tuple[str, ...] | None = None
     """Logs beside metrics.csv: jsonl, tensorboard, wandb; as the run was started with unless given."""
+    stop_at: float | None = None
+    """Success rate that ends the run; as the run was started with unless given."""
 
 
 def train_command(argv: list[str], console: Console) -> int:

@@ -36,6 +36,7 @@ def unsupported_reason(config: Config, num_inputs: int, action_size: int) -> str
     """
     device = jax.devices()[0]
     requirements = (
+        (config.n_step == 1, f"n_step 1; it is {config.n_step}"),
         (config.learner_dtype == "bfloat16", f"learner_dtype bfloat16; it is {config.learner_dtype}"),
         (config.hidden_sizes == (WIDTH,) * 3, f"hidden_sizes {(WIDTH,) * 3}; they are {config.hidden_sizes}"),
         (

@@ -12,7 +12,7 @@ from mjx_dher import names, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.networks import NetworksFn
 from mjx_dher.spec import LEARNERS
-from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
 
 # What the loop and the log call theirs: a learner's metrics have other names.
 RESERVED = frozenset(
@@ -25,7 +25,12 @@ RESERVED = frozenset(
 
 
 class Learner(Protocol):
-    """A learner: pure functions of a state of its own, a pytree of arrays. Numbers come in as HParams, traced."""
+    """A learner: pure functions of a state of its own, a pytree of arrays. Numbers come in as HParams, traced.
+
+    It may have `policy_delay`, an integer of more than 1, and `update_critic`, which is called like `update`: of so many
+    updates all but the last are then made by `update_critic`. It has `uses_discount`, True, where it takes the `discount` of a
+    batch, as returns of several steps need.
+    """
 
     def init(self, key: PRNGKey) -> PyTree:
         """Makes a first state."""
@@ -74,6 +79,7 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     make_learner = names.resolve("learner", name, LEARNERS, ("config", "sizes", "networks"))
     learner = make_learner(config, sizes, networks.make(network))
     check_methods(name, learner)
+    check_discount(learner, config)
     return learner
 
 
@@ -82,6 +88,23 @@ def check_methods(name: Any, learner: Any) -> None:
     methods = [method for method in vars(Learner) if not method.startswith("_")]
     if missing := [method for method in methods if not callable(getattr(learner, method, None))]:
         raise ValueError(f"learner {name!r} is no learner: it has no {', '.join(missing)} (see mjx_dher.learners.Learner)")
+    delay = policy_delay(learner)
+    check_size("policy_delay of the learner", delay)
+    if delay > 1 and not callable(getattr(learner, "update_critic", None)):
+        raise ValueError(f"learner {name!r} has a policy_delay of {delay}, and no update_critic")
+
+
+def check_discount(learner: Any, config: Config) -> None:
+    """Raises ValueError where batches have returns of several steps and the learner does not take their discount."""
+    if config.n_step > 1 and not getattr(learner, "uses_discount", False):
+        raise ValueError(
+            f"n_step {config.n_step} needs a learner that takes a batch's discount; {learner!r} has no uses_discount"
+        )
+
+
+def policy_delay(learner: Any) -> int:
+    """Returns how many updates a learner makes for one of its actor; 1 where it does not say."""
+    return getattr(learner, "policy_delay", 1)
 
 
 def check_kept(method: str, before: PyTree, after: PyTree) -> None:
@@ -98,13 +121,13 @@ def check_kept(method: str, before: PyTree, after: PyTree) -> None:
         raise ValueError(f"learner.{method} must keep the state's structure, shapes and types; {reason}")
 
 
-def check_update(state: PyTree, result: Any) -> tuple[PyTree, Metrics]:
+def check_update(state: PyTree, result: Any, method: str = "update") -> tuple[PyTree, Metrics]:
     """Returns what a learner's `update` gave for `state`; raises ValueError unless it is a state like it, and metrics."""
     if not (isinstance(result, tuple) and len(result) == 2):
-        raise ValueError(f"learner.update must give (state, metrics); it gives a {type(result).__name__}")
+        raise ValueError(f"learner.{method} must give (state, metrics); it gives a {type(result).__name__}")
     updated, metrics = result
-    check_kept("update", state, updated)
-    check_metrics("update", metrics)
+    check_kept(method, state, updated)
+    check_metrics(method, metrics)
     return updated, metrics
 
 

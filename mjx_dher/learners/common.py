@@ -73,6 +73,11 @@ def update_normalizers(state: State, observation: Array, goal: Array, hparams: H
     )
 
 
+def discount(batch: Batch, hparams: HParams) -> Array | float:
+    """Returns what the values of a batch's next observations count: [B], or gamma for all."""
+    return hparams.gamma if batch.discount is None else batch.discount
+
+
 def normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:
     """Returns normalized, clipped `values` [..., D]."""
     return normalizer.normalize(state, values, hparams.norm_eps, hparams.norm_clip, hparams.obs_clip)

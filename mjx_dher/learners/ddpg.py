@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import cast
+from typing import ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ def target_value(networks: Networks, target: Params, batch: Batch, hparams: HPar
     """
     next_action = _pi(networks, target.actor, batch.next_observation, batch.desired_goal)
     next_q = _q(networks, target.critic, batch.next_observation, batch.desired_goal, next_action)
-    return jnp.clip(batch.reward + hparams.gamma * next_q, -1.0 / (1.0 - hparams.gamma), 0.0)
+    return jnp.clip(batch.reward + common.discount(batch, hparams) * next_q, -1.0 / (1.0 - hparams.gamma), 0.0)
 
 
 def critic_loss(networks: Networks, critic: PyTree, batch: Batch, target: Array) -> tuple[Array, Array]:
@@ -82,6 +82,7 @@ class DDPG:
     networks: Networks  # float32; these play
     learning: Networks  # of the learner's dtype, with the same parameters; these learn
     compute_gradients: GradientFn = compute_gradients  # what kernels may replace
+    uses_discount: ClassVar[bool] = True
 
     def init(self, key: PRNGKey) -> DDPGState:
         """Makes fresh networks, targets equal to them, and empty normalizers."""

@@ -103,12 +103,14 @@ def train_runs(
       A Result each; fewer than `specs` where training was stopped before their turn, or runs were left out.
 
     Raises:
-      ValueError: a run that cannot be trained, or memory that does not suffice for one alone.
+      ValueError: a run that cannot be trained, memory that does not suffice for one alone, or `stop_at` for several runs.
       FolderError: a run that has ended, that another program is at work on, or whose folder cannot be written to.
     """
     options = options or Options()
     options.check()
     _check_runs(env, specs, folders)
+    if options.stop_at is not None and (sweep or len(specs) > 1):
+        raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     shared = folders[0].parent / "unfinished" if shared is None else shared
@@ -160,11 +162,13 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         logs = [_open(stack, session, program.lanes, *run) for run in zip(ended, specs, folders, runs)]
+        success = [row["success_rate"] for row in sinks.read_rows(folders[0] / sinks.METRICS_FILE)]  # of one run, see stop_at
         for progress in loop.run(session.env, specs[0].config, program.compiled, start):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
             _log(rows, logs, watch.failed)
-            if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs):
+            success.append(rows[0]["success_rate"])
+            if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs) or options.is_reached(success):
                 break
             if program.lanes == 1:
                 _save_policy(program, jax.device_get(progress.state.learner), specs[0], folders[0], runs[0])
@@ -174,6 +178,8 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
                 return [Result(folder, STOPPED, progress.epoch, progress.num_epochs, {}) for folder in folders]
             if options.checkpoint_every and progress.epoch % options.checkpoint_every == 0:
                 checkpoints.try_save(progress)
+    if progress.epoch < progress.num_epochs and options.is_reached(success):
+        session.report(f"stop_at {options.stop_at:g} is reached after epoch {progress.epoch} of {progress.num_epochs}")
     results = _finish(session, program, progress, specs, folders, runs, watch.failed)
     if len(watch.failed) < len(specs):
         checkpoints.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from mjx_dher.config import check_count, check_number
 from mjx_dher.runs import sinks
@@ -20,6 +21,8 @@ class Options:
     """Checkpoints to keep, the newest (of runs side by side: one); they are deleted when the run has ended."""
     log: tuple[str, ...] = ()
     """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
+    stop_at: float | None = None
+    """Success rate that ends a run, as the mean of its last three evaluations; a run goes on to total_steps unless given."""
 
     def check(self) -> None:
         """Raises ValueError where an option cannot be used."""
@@ -27,3 +30,10 @@ class Options:
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
         sinks.check(self.log)
+        if self.stop_at is not None:
+            check_number("stop_at", self.stop_at, "(0, 1]", float)
+
+    def is_reached(self, success_rates: Sequence[float]) -> bool:
+        """Returns whether a run with these success rates, an epoch each, has reached `stop_at`."""
+        last = success_rates[-3:]
+        return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at

@@ -7,27 +7,26 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_dher.config import HParams
+from mjx_dher.config import Config, HParams
 from mjx_dher.host.files import FolderError
 from mjx_dher.runs import identity, results, run_folder
-from mjx_dher.spec import RunSpec, reads
+from mjx_dher.spec import RunSpec, read_by, reads
 
 CELLS = "cells"
-_PARTS = ("weight_kernel", "metric")  # settings that only some samplers read, beside numbers
+_SIZES = tuple(field.name for field in dataclasses.fields(Config))
 
 
 def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
     """Returns every setting with every seed, seed by seed within an environment, so that what is to be compared ends together.
 
-    Settings that a sampler does not read are those of its environment's first setting; what is then the same is there once.
+    Settings that neither sampler nor learner reads are those of the environment's first setting; what is then the same is
+    there once.
     """
     settings: dict[RunSpec, None] = {}
     first: dict[str, RunSpec] = {}
     for spec in specs:
         base = first.setdefault(spec.env, spec)
-        parts = {name: getattr(base, name) for name in _PARTS if not reads(spec.sampler, name)}
-        numbers = {name: getattr(base.hparams, name) for name in HParams._fields if not reads(spec.sampler, name)}
-        settings[dataclasses.replace(spec, seed=0, hparams=spec.hparams._replace(**numbers), **parts)] = None
+        settings[dataclasses.replace(_with_unread_of(base, spec), seed=0)] = None
     grouped = itertools.groupby(settings, key=lambda spec: spec.env)
     return [
         dataclasses.replace(spec, seed=seed)
@@ -35,6 +34,16 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
         for seed in seeds
         for spec in group
     ]
+
+
+def _with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
+    """Returns `spec` with those settings of `base` that neither its sampler nor its learner reads."""
+    unread = [name for name in read_by() if not reads(spec.sampler, spec.learner, name)]
+    numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
+    sizes = {name: getattr(base.config, name) for name in unread if name in _SIZES}
+    parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}
+    config, hparams = dataclasses.replace(spec.config, **sizes), spec.hparams._replace(**numbers)
+    return dataclasses.replace(spec, config=config, hparams=hparams, **parts)
 
 
 def shard(specs: Sequence[RunSpec], index: int, count: int) -> list[RunSpec]:

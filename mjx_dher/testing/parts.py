@@ -45,7 +45,7 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
         yield check_metric(spec.metric, env, episodes)
     if is_import_path(spec.weight_kernel):
         yield check_kernel(spec.weight_kernel)
-    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, field)]
+    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, spec.learner, field)]
     if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
         yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes)}"
     if is_import_path(spec.priority):

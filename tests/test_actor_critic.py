@@ -1,0 +1,324 @@
+"""The update that td3, sac, redq, tqc and dtqc share: targets by hand, problems with known answers, lanes, delays."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher import Config, HParams, learners, make_train, networks
+from mjx_dher.learners import common, critics
+from mjx_dher.learners.actor_critic import ActorCritic
+from mjx_dher.learners.actors import Deterministic, Gaussian
+from mjx_dher.learners.critics import Critics
+from mjx_dher.networks import Networks
+from mjx_dher.policy import Policy
+from mjx_dher.types import Batch, Sizes
+from point_mass import PointMass
+
+NAMES = ("td3", "sac", "redq", "tqc", "dtqc")
+SIZES = Sizes(2, 2, 2)
+SMALL = Config(
+    num_envs=16,
+    cycles_per_epoch=5,
+    updates_per_cycle=20,
+    target_period=1,
+    batch_size=128,
+    replay_size=20_000,
+    hidden_sizes=(32, 32),
+    num_critics=3,
+    num_quantiles=5,
+    dropped_quantiles=1,
+    eval_episodes=100,
+    total_steps=8_000,
+)
+HP = HParams(gamma=0.5, action_l2=0.0, target_noise=0.0, entropy_weight=0.25)
+
+
+class LinearActor(nn.Module):
+    """tanh(w * observation): one number in, one out."""
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        return jnp.tanh(self.param("w", nn.initializers.constant(1.0), ()) * observation)
+
+
+class Moments(nn.Module):
+    """Mean w * observation, standard deviation 1/2."""
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        mean = self.param("w", nn.initializers.constant(1.0), ()) * observation
+        return mean, jnp.full_like(mean, jnp.log(0.5))
+
+
+class LinearCritic(nn.Module):
+    """Quantiles a * observation + b * goal + c * action + d * m."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self, observation, goal, action):
+        abcd = self.param("abcd", lambda _: jnp.array([-0.5, 0.25, 0.5, 0.1]))
+        value = abcd[0] * observation + abcd[1] * goal + abcd[2] * action
+        return value + abcd[3] * jnp.arange(self.size)
+
+
+BATCH = Batch(
+    observation=jnp.array([[1.0], [0.0]]),
+    next_observation=jnp.array([[0.0], [2.0]]),
+    desired_goal=jnp.array([[-1.0], [-4.0]]),
+    action=jnp.array([[1.0], [-1.0]]),
+    reward=jnp.array([-1.0, 0.0]),
+)
+Q = np.array([-0.25, -2 + 0.5 * np.tanh(2)])  # of the next states, where the policy is tanh: see test_ddpg.py
+
+
+def linear(actor, parts):
+    """A learner of these networks; its second critic thinks less of everything by 1/2, by a goal's weight of 1/2 and 3/8."""
+    module = Networks(LinearActor() if isinstance(actor, Deterministic) else Moments(), LinearCritic(parts.size))
+    learner = ActorCritic(Sizes(1, 1, 1), module, module, actor, parts)
+    state = learner.init(jax.random.key(0))
+    lower = {"params": {"abcd": state.target.critic["params"]["abcd"].at[1, 1].add(0.125)}}
+    return learner, dataclasses.replace(state, target=dataclasses.replace(state.target, critic=lower))
+
+
+SECOND = np.array([-0.125, -0.5])  # what the second critic adds: 1/8 of the goal
+
+
+@pytest.mark.parametrize(("size", "combine"), [(1, critics.smallest), (1, critics.smallest_of(2))])
+def test_the_target_of_the_smaller_critic_by_hand(size, combine):
+    learner, state = linear(Deterministic(), Critics(2, size, combine, critics.squared_error, critics.lowest))
+    got = learner.target(state, BATCH, HP, jax.random.key(1))
+    np.testing.assert_allclose(got[:, 0], [-1 + 0.5 * (Q[0] + SECOND[0]), 0.5 * (Q[1] + SECOND[1])], rtol=1e-6)
+
+
+def test_the_target_of_truncated_quantiles_by_hand():
+    """Of six quantiles, three a critic and 0.1 apart, the two largest are dropped: both of the first critic, or one of each."""
+    learner, state = linear(Deterministic(), Critics(2, 3, critics.truncated(1), critics.quantile_huber, critics.mean))
+    got = learner.target(state, BATCH, HP, jax.random.key(1))
+    steps = np.array([0.0, 0.1, 0.2])
+    for i, reward in enumerate((-1.0, 0.0)):
+        pooled = np.sort(np.concatenate([Q[i] + steps, Q[i] + SECOND[i] + steps]))[:4]
+        np.testing.assert_allclose(got[i], np.minimum(reward + 0.5 * pooled, 0), rtol=1e-5)
+
+
+def test_the_target_of_a_soft_value_takes_off_alpha_log_pi():
+    parts = Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest)
+    learner, state = linear(Gaussian(), parts)
+    draws = jax.vmap(lambda key: learner.target(state, BATCH, HP, key))(jax.random.split(jax.random.key(1), 20_000))
+    u = np.array([0.0, 2.0])[:, None] + 0.5 * np.random.default_rng(0).normal(size=(2, 200_000))
+    log_pi = -0.5 * ((u.T - [0.0, 2.0]) / 0.5) ** 2 - np.log(0.5 * np.sqrt(2 * np.pi)) - np.log1p(-(np.tanh(u.T) ** 2))
+    values = np.array([-0.25 - 0.125, -2.0 - 0.5]) + 0.5 * np.tanh(u.T)
+    expected = np.clip([-1.0, 0.0] + 0.5 * (values - 0.25 * log_pi), -2.0, 0.0).mean(0)
+    np.testing.assert_allclose(draws.mean(axis=(0, 2)), expected, atol=0.005)
+
+
+@pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
+def test_targets_are_clipped_to_what_returns_can_be(reward, clipped):
+    learner, state = linear(Deterministic(), Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest))
+    got = learner.target(state, BATCH.replace(reward=jnp.full(2, reward)), HP, jax.random.key(1))
+    np.testing.assert_array_equal(got, [[clipped], [clipped]])
+
+
+def test_a_target_takes_its_actions_from_the_slower_actor():
+    learner, state = linear(Deterministic(), Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest))
+    quick = dataclasses.replace(state.params, actor={"params": {"w": jnp.float32(-1.0)}})
+    moved = dataclasses.replace(state, params=quick)
+    key = jax.random.key(1)
+    np.testing.assert_array_equal(learner.target(moved, BATCH, HP, key), learner.target(state, BATCH, HP, key))
+    target = learner.update_target(moved, HP._replace(polyak=0.75)).target
+    np.testing.assert_allclose(target.actor["params"]["w"], 0.5)
+
+
+def test_an_update_of_the_critics_leaves_the_actor_and_a_whole_one_judges_by_the_new_critics():
+    parts = Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest, num_judges=1)
+    learner, state = linear(Deterministic(), parts)
+    hparams = HP._replace(critic_lr=2.0, actor_lr=0.1)
+    after, metrics = jax.jit(learner.update_critic)(state, BATCH, hparams)
+    assert after.params.actor == state.params.actor
+    assert metrics.keys() == {"critic_loss", "q_mean"}
+    whole, metrics = jax.jit(learner.update)(state, BATCH, hparams)
+    jax.tree.map(np.testing.assert_array_equal, whole.params.critic, after.params.critic)
+    assert metrics.keys() == {"critic_loss", "q_mean", "actor_loss"}
+    # Adam's first step is that of the gradient's sign: the first critic's weight of actions, 0.5, has become -1.5 or 2.5.
+    weight = float(after.params.critic["params"]["abcd"][0, 2])
+    assert abs(weight - 0.5) > 1.9
+    step = float(whole.params.actor["params"]["w"] - state.params.actor["params"]["w"])
+    np.testing.assert_allclose(step, 0.1 * np.sign(weight), rtol=1e-4)
+    jax.tree.map(np.testing.assert_array_equal, whole.target, state.target)
+    assert (int(after.num_updates), int(whole.num_updates)) == (1, 1)
+
+
+def made(name, **changes):
+    config = dataclasses.replace(SMALL, **changes)
+    return learners.make(name, config, SIZES, "layer_norm"), config
+
+
+@pytest.mark.parametrize("name", ["td3", "dtqc"])
+def test_critics_learn_a_known_value(name):
+    """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma) = -5, whatever the action."""
+    learner, _ = made(name)
+    hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.003)
+    np.testing.assert_allclose(learned_value(learner, hparams), -5.0, atol=0.1)
+
+
+@pytest.mark.parametrize("name", ["sac", "redq", "tqc"])
+def test_critics_learn_a_known_soft_value(name):
+    """The same chain, for a policy that stays as it is: Q = (-1 - gamma alpha E log pi) / (1 - gamma), or -5 without pay."""
+    learner, _ = made(name, dropped_quantiles=0)  # the pay is noise to a critic, whose largest quantiles count here, too
+    hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.003, actor_lr=0.0, entropy_weight=0.3)
+    state = learner.init(jax.random.key(0))
+    ones = jnp.ones((20_000, 2))
+    normalized = common.normalize_batch(state, Batch(ones, ones, ones, ones, ones[:, 0]), hparams)
+    inputs = normalized.observation, normalized.desired_goal
+    _, cost = learner.actor.next_action(learner.networks.actor, state.params.actor, *inputs, jax.random.key(3), hparams)
+    expected = (-1.0 - 0.8 * float(cost.mean())) / (1 - 0.8)
+    assert expected > -4.8  # the pay is to be seen
+    np.testing.assert_allclose(learned_value(learner, hparams), expected, atol=0.15)
+    np.testing.assert_allclose(learned_value(learner, hparams._replace(entropy_weight=0.0)), -5.0, atol=0.1)
+
+
+def learned_value(learner, hparams):
+    state = learner.init(jax.random.key(0))
+    ones = jnp.ones((32, 2))
+
+    @jax.jit
+    def step(state, key):
+        action = jax.random.uniform(key, (32, 2), minval=-1, maxval=1)
+        state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+        return learner.update_target(state, hparams), losses
+
+    _, losses = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
+    return losses["q_mean"][-100:].mean()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_best_action_of_a_bandit_is_found(name):
+    """The reward is -|a - 0.5| / 4 for each number of the action, and the next state is worth the same as all others."""
+    learner, _ = made(name)
+    hparams = HParams(gamma=0.0, action_l2=0.0, entropy_weight=0.01, critic_lr=0.003, actor_lr=0.003)
+    state, ones = learner.init(jax.random.key(0)), jnp.ones((64, 2))
+
+    @jax.jit
+    def step(state, key):
+        action = jax.random.uniform(key, (64, 2), minval=-1, maxval=1)
+        reward = -jnp.sum(jnp.abs(action - 0.5), axis=-1) / 4
+        state, losses = learner.update(state, Batch(ones, ones, ones, action, reward), hparams)
+        return learner.update_target(state, hparams), losses
+
+    state, _ = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
+    obs = {"observation": ones[:1], "desired_goal": ones[:1], "achieved_goal": ones[:1]}
+    np.testing.assert_allclose(learner.act(state, obs, hparams)[0], [0.5, 0.5], atol=0.15)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in ("td3", "redq", "tqc") else []) for name in NAMES]
+)
+def test_the_point_mass_is_learned_and_a_lane_is_that_run_alone(name):
+    learner, config = made(name, policy_delay=2)
+    hparams = HParams(gamma=0.9, polyak=0.9, action_l2=0.1, entropy_weight=0.03, noise_std=0.2)
+    if not learner.actor.has_target:
+        hparams = hparams._replace(action_l2=0.0, random_eps=0.1)
+    program = make_train(PointMass(), config, learner=learner)
+    lanes = jax.tree.map(lambda x: jnp.full(2, x, jnp.float32), hparams)
+    states = jax.jit(jax.vmap(program.init))(jax.random.split(jax.random.key(0)), lanes)
+    alone = jax.tree.map(lambda x: x[1], states)
+    epoch, epochs = jax.jit(program.epoch), jax.jit(jax.vmap(program.epoch))
+    for number in range(7):
+        states, metrics = epochs(states)
+        if number < 2:
+            alone, one = epoch(alone)
+            for key in ("critic_loss", "q_mean", "actor_loss", "train_return_mean"):
+                np.testing.assert_allclose(metrics[key][1], one[key], rtol=2e-3, atol=1e-5, err_msg=key)
+    assert int(alone.learner.num_updates) == 200
+    assert float(metrics["success_rate"].min()) > 0.9
+    assert float(metrics["reset_success_rate"].max()) < 0.3
+    policy = learner.export(jax.device_get(jax.tree.map(lambda x: x[0], states.learner)), hparams)
+    assert isinstance(policy, Policy)
+
+
+def test_delays_move_targets_and_actor_when_they_are_due():
+    """What is called in 12 updates, for delays and periods that divide one another; a learner writes it down."""
+    for delay, period, expected in [
+        (1, 1, "uT uT uT uT uT uT uT uT uT uT uT uT"),
+        (3, 1, "cT cT uT cT cT uT cT cT uT cT cT uT"),
+        (2, 4, "c u c uT c u c uT c u c uT"),
+        (4, 2, "c cT c uT c cT c uT c cT c uT"),
+        (2, 2, "c uT c uT c uT c uT c uT c uT"),
+    ]:
+        config = dataclasses.replace(
+            SMALL, updates_per_cycle=12, cycles_per_epoch=1, target_period=period, policy_delay=delay, num_critics=1
+        )
+        assert calls(config) == expected.split(), (delay, period)
+
+
+def calls(config):
+    """Returns the updates of a cycle: u (whole) or c (of critics), with T where the targets move after it."""
+    learner = learners.make("td3", config, SIZES, "mlp")
+
+    class Noting(ActorCritic):
+        """Notes in the first numbers of `key` that a step was made; nothing is learned."""
+
+        def init(self, key):
+            return {"log": jnp.zeros(100, jnp.int32), "at": jnp.int32(0), "state": super().init(key)}
+
+        def note(self, state, code, forward=1):
+            at = state["at"] + forward
+            return {**state, "log": state["log"].at[at - 1].add(code), "at": at}
+
+        def update(self, state, batch, hparams):
+            return self.note(state, 1), {"loss": jnp.float32(0)}
+
+        def update_critic(self, state, batch, hparams):
+            return self.note(state, 2), {"loss": jnp.float32(0)}
+
+        def update_target(self, state, hparams):
+            return self.note(state, 10, forward=0)
+
+        def act(self, state, obs, hparams):
+            return super().act(state["state"], obs, hparams)
+
+        def explore(self, state, obs, noise, hparams):
+            return super().explore(state["state"], obs, noise, hparams)
+
+        def update_normalizers(self, state, observation, goal, hparams, valid):
+            return state
+
+        def summary(self, state):
+            return {}
+
+    noting = Noting(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
+    program = make_train(PointMass(), config, learner=noting)
+    state, _ = jax.jit(program.epoch)(program.init(jax.random.key(0), HParams()))
+    names = {0: "", 1: "u", 2: "c", 11: "uT", 12: "cT"}
+    return [names[int(code)] for code in state.learner["log"] if code]
+
+
+def seven(action_size, hidden_sizes, dtype, heads=networks.PLAIN):
+    """Makes networks whose critic gives seven numbers, whatever it is asked for."""
+    return networks.mlp(action_size, hidden_sizes, dtype, heads._replace(critic_size=7))
+
+
+def test_what_does_not_combine_is_refused_by_name():
+    hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
+    for name in NAMES:
+        with pytest.raises(ValueError, match=f"learner_kernels hopper computes learner ddpg; it is {name}"):
+            learners.make(name, hopper, SIZES)
+        with pytest.raises(ValueError, match=rf"learner {name} needs networks that are a function .*heads"):
+            learners.make(name, SMALL, SIZES, lambda action_size, hidden_sizes, dtype: networks.mlp(2, (8,)))
+        with pytest.raises(ValueError, match=f"for learner {name} the critic must give"):
+            learners.make(name, SMALL, SIZES, seven)
+    with pytest.raises(ValueError, match=r"dropped_quantiles must be less than num_quantiles \(5\); got 5"):
+        made("tqc", dropped_quantiles=5)
+    with pytest.raises(ValueError, match=r"subset_critics must be at most num_critics \(3\); got 4"):
+        made("redq", subset_critics=4)
+
+
+@pytest.mark.parametrize(("delay", "period"), [(3, 2), (40, 1), (3, 4)])
+def test_a_delay_that_no_round_has_is_refused(delay, period):
+    config = dataclasses.replace(SMALL, policy_delay=delay, target_period=period)
+    with pytest.raises(ValueError, match=f"policy_delay must divide target_period .*got {delay}"):
+        make_train(PointMass(), config)

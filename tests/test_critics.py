@@ -1,0 +1,140 @@
+"""What is made of the values of several critics, beside numbers by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mjx_dher.learners import critics
+from mjx_dher.learners.critics import Critics
+from mjx_dher.networks import Critic
+from mjx_dher.types import Sizes
+
+KEY = jax.random.key(0)
+TWO = jnp.array([[[-1.0], [-4.0]], [[-2.0], [-3.0]]])  # two critics, two samples
+
+
+def test_the_smallest_of_each_sample():
+    np.testing.assert_array_equal(critics.smallest(TWO, KEY), [[-2.0], [-4.0]])
+
+
+def test_the_smallest_of_a_subset_is_as_likely_as_its_critics_are():
+    """Of three critics with values 1, 2 and 3 two are drawn: the smaller is 1 in two of three pairs, else 2; never 3."""
+    values = jnp.array([1.0, 2.0, 3.0])[:, None, None]
+    combine = critics.smallest_of(2)
+    drawn = np.asarray(jax.vmap(lambda key: combine(values, key))(jax.random.split(KEY, 3000))).ravel()
+    assert set(drawn) == {1.0, 2.0}
+    assert abs((drawn == 1.0).mean() - 2 / 3) < 4 * np.sqrt(2 / 9 / 3000)
+    np.testing.assert_array_equal(critics.smallest_of(3)(values, KEY), [[1.0]])
+
+
+def test_the_subset_is_the_same_for_the_whole_batch():
+    values = jnp.tile(jnp.arange(10.0)[:, None, None], (1, 50, 1))
+    assert np.unique(critics.smallest_of(1)(values, KEY)).size == 1
+
+
+def test_truncation_pools_the_quantiles_and_drops_the_largest():
+    """Two critics with three quantiles each, one dropped a critic: of six numbers the four smallest, in order."""
+    values = jnp.array([[[3.0, 1.0, 2.0]], [[9.0, -1.0, 2.0]]])
+    np.testing.assert_array_equal(critics.truncated(1)(values, KEY), [[-1.0, 1.0, 2.0, 2.0]])
+    np.testing.assert_array_equal(critics.truncated(0)(values, KEY), [[-1.0, 1.0, 2.0, 2.0, 3.0, 9.0]])
+    np.testing.assert_array_equal(critics.truncated(2)(values, KEY), [[-1.0, 1.0]])
+
+
+@pytest.fixture(params=["cpu", "gpu"])
+def backend(request, monkeypatch):
+    """The way of adding up that each of them has; both are computed here."""
+    monkeypatch.setattr(jax, "default_backend", lambda: request.param)
+
+
+def test_the_least_are_those_of_a_sort(backend):
+    numbers = jnp.round(3 * jax.random.normal(KEY, (40, 9)))  # with many ties
+    np.testing.assert_array_equal(critics.least(numbers, 3), np.sort(numbers, axis=-1)[:, :3])
+    assert np.isnan(critics.least(numbers.at[0, 1].set(jnp.nan), 3)[0]).any()
+
+
+def test_squared_error_by_hand():
+    # First critic: (1 + 4) / 2 to targets -2, -2; second: (0 + 1) / 2.
+    np.testing.assert_allclose(critics.squared_error(TWO, jnp.array([[-2.0], [-2.0]])), 2.5 + 0.5)
+
+
+def test_quantile_huber_by_hand():
+    """One sample, quantiles 0 and 1 (tau 1/4 and 3/4), atoms -2, 1/2 and 3."""
+    values, atoms = jnp.array([[[0.0, 1.0]]]), jnp.array([[-2.0, 0.5, 3.0]])
+    # huber(u): |u| - 1/2 beyond 1, else u^2 / 2. To 0: u = -2, 1/2, 3; to 1: u = -3, -1/2, 2.
+    of_0 = 0.75 * 1.5 + 0.25 * 0.125 + 0.25 * 2.5
+    of_1 = 0.25 * 2.5 + 0.25 * 0.125 + 0.75 * 1.5
+    loss, gradient = jax.value_and_grad(critics.quantile_huber)(values, atoms)
+    np.testing.assert_allclose(loss, (of_0 + of_1) / 6, rtol=1e-6)
+    # huber's slope is u clipped to [-1, 1]: to 0 it is -1, 1/2, 1; to 1 -1, -1/2, 1.
+    slopes = [0.75 * -1 + 0.25 * 0.5 + 0.25 * 1, 0.25 * -1 + 0.25 * -0.5 + 0.75 * 1]
+    np.testing.assert_allclose(gradient, [[[-slopes[0] / 6, -slopes[1] / 6]]], rtol=1e-6)
+
+
+def plain_loss(values, atoms):
+    """The loss as it is written in the paper, pair by pair."""
+    tau = (np.arange(values.shape[-1]) + 0.5) / values.shape[-1]
+    u = atoms[None, :, None, :] - values[..., None]
+    huber = jnp.where(jnp.abs(u) <= 1, 0.5 * u**2, jnp.abs(u) - 0.5)
+    return jnp.sum(jnp.mean(jnp.abs(tau[:, None] - (u < 0)) * huber, axis=(1, 2, 3)))
+
+
+def test_quantile_huber_and_its_gradient_are_those_of_the_formula(backend):
+    values, atoms = (2.0 * jax.random.normal(jax.random.key(i), shape) for i, shape in enumerate(((3, 5, 4), (5, 7))))
+    ours, formula = (jax.value_and_grad(loss)(values, atoms) for loss in (critics.quantile_huber, plain_loss))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7), ours, formula)
+    lanes = jax.vmap(jax.grad(critics.quantile_huber))(jnp.stack([values, -values]), jnp.stack([atoms, atoms]))
+    np.testing.assert_allclose(lanes[0], formula[1], rtol=2e-5, atol=1e-7)
+    assert not np.any(jax.grad(critics.quantile_huber, argnums=1)(values, atoms))  # a target stays where it is
+
+
+def test_quantiles_of_a_known_distribution_are_found():
+    """Atoms are draws of a uniform distribution on [-100, 0], wide beside kappa: quantile m goes to 100 tau_m - 100."""
+    optimizer, values = optax.adam(1.0), jnp.zeros((1, 1, 4)) - 50.0
+
+    def step(carry, key):
+        values, moments, rate = carry
+        atoms = jax.random.uniform(key, (1, 64), minval=-100.0, maxval=0.0)
+        direction, moments = optimizer.update(jax.grad(critics.quantile_huber)(values, atoms), moments)
+        return (values + rate * direction, moments, rate * 0.998), None
+
+    start = values, optimizer.init(values), jnp.float32(1.0)
+    (values, *_), _ = jax.lax.scan(step, start, jax.random.split(KEY, 3000))
+    np.testing.assert_allclose(values[0, 0], [-87.5, -62.5, -37.5, -12.5], atol=1.5)
+
+
+def test_judges_of_actions():
+    values = jnp.array([[[-1.0, -3.0]], [[-6.0, -4.0]]])  # means -2 and -5
+    np.testing.assert_allclose(critics.lowest(values), [-5.0])
+    np.testing.assert_allclose(critics.mean(values), [-3.5])
+    params = {"w": jnp.arange(6.0).reshape(3, 2)}
+    parts = Critics(3, 1, critics.smallest, critics.squared_error, critics.lowest, num_judges=1)
+    np.testing.assert_array_equal(parts.judges(params)["w"], [[0.0, 1.0]])
+
+
+def test_critics_begin_apart_and_are_each_that_critic_alone():
+    sizes, network = Sizes(5, 3, 2), Critic((16,), size=4)
+    params = Critics(3, 4, critics.smallest, critics.squared_error, critics.mean).init(network, KEY, sizes)
+    inputs = [jax.random.normal(jax.random.key(i), (7, size)) for i, size in enumerate(sizes)]
+    values = critics.values(network, params, *inputs)
+    assert values.shape == (3, 7, 4)
+    assert not np.allclose(values[0], values[1])
+    for i in range(3):
+        alone = network.apply(jax.tree.map(lambda x, i=i: x[i], params), *inputs)
+        np.testing.assert_allclose(values[i], alone, rtol=1e-5, atol=1e-6)
+
+
+def test_layer_norm_normalizes_before_each_relu():
+    """Of the default critic with layer_norm, by hand: (x - mean) / sqrt(var + 1e-6), then scale, bias and ReLU."""
+    network, inputs = Critic((4, 4), layer_norm=True), [jnp.array([[0.3, -2.0]]), jnp.array([[1.0]]), jnp.array([[0.5]])]
+    params = network.init(KEY, *inputs)
+    layers = params["params"]
+    assert set(layers) == {"Dense_0", "LayerNorm_0", "Dense_1", "LayerNorm_1", "Dense_2"}
+    x = np.concatenate(inputs, axis=-1)
+    for i in range(2):
+        x = x @ np.asarray(layers[f"Dense_{i}"]["kernel"]) + np.asarray(layers[f"Dense_{i}"]["bias"])
+        x = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+        x = np.maximum(x * np.asarray(layers[f"LayerNorm_{i}"]["scale"]) + np.asarray(layers[f"LayerNorm_{i}"]["bias"]), 0)
+    expected = x @ np.asarray(layers["Dense_2"]["kernel"]) + np.asarray(layers["Dense_2"]["bias"])
+    np.testing.assert_allclose(network.apply(params, *inputs), expected[:, 0], rtol=1e-4)
