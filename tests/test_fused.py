@@ -1,11 +1,13 @@
 """The fused kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_dher import envs
+from mjx_dher.envs.engines.base import Physics
 from mjx_dher.envs.engines.fused import kernel, setup
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
@@ -20,7 +22,7 @@ NUM = 48  # environments
 @pytest.fixture(scope="module", autouse=True)
 def quick_compiler():
     """A third of the time, and code that is slower but computes the same."""
-    kernel.make(0).module.options["optimization_level"] = 0
+    kernel.make(0, 1, 15).module.options["optimization_level"] = 0
 
 
 def floats(x):
@@ -146,11 +148,17 @@ def test_fields_of_memory_follow_one_another():
     assert numbers == sorted(numbers)
     model = envs.make("push", engine="native").model
     contacts, dofs = setup.contacts_of(model), setup.dofs_of(model)
-    layout = setup.layout_of(model, setup.world_of(model, contacts), contacts, dofs)
-    begin, length = layout.begin.numpy(), layout.length.numpy()
-    assert begin[0] == 0
-    assert begin[1] == 3 * model.nbody  # places, three numbers each
-    assert layout.size == begin[-1] + length[-1]
+    for rows in (10, 96):
+        layout = setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs)
+        begin = dict(zip(names, layout.begin.numpy()))
+        passing = [begin[name] for name in ("moment", "inertia", "force", "turning", "momentum")]
+        stay = [begin[name] for name in names if name not in ("moment", "inertia", "force", "turning", "momentum", "jacobian")]
+        assert passing == sorted(passing)
+        assert stay == sorted(stay)
+        assert begin["jacobian"] == passing[0] == 0
+        assert begin["inertia"] == 3 * model.nbody  # moments, three numbers each
+        assert stay[0] == max(6 * model.nv + begin["momentum"], rows * model.nv)  # neither reaches into what stays
+        assert layout.size == begin["change"] + rows
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
 
 
@@ -189,10 +197,22 @@ def test_what_the_kernel_leaves_out_is_named(model, what):
     assert found == [] if what is None else any(name.startswith(what) for name in found), found
 
 
-@pytest.mark.parametrize("option", ["contacts", "constraints"])
-def test_its_memory_cannot_be_set(option):
-    with pytest.raises(ValueError, match=f"{option} cannot be set with fused=True"):
-        envs.make("push", engine="warp", fused=True, allow_cpu=True, **{option: 8})
+def test_its_contacts_cannot_be_set():
+    with pytest.raises(ValueError, match="contacts cannot be set with fused=True"):
+        envs.make("push", engine="warp", fused=True, allow_cpu=True, contacts=8)
+
+
+def test_contacts_that_there_is_no_room_for_are_told():
+    """Slide's puck, between the fingers or in the table, needs more than 12 rows, 6 of them the weld's."""
+    made = envs.make("slide", engine="warp", fused=True, allow_cpu=True, constraints=12)
+    model = envs.make("slide", engine="native").model
+    (qpos, qvel, inputs), engine = touching(model), made.engine
+    physics = Physics(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros_like(qvel))))
+    after = jax.jit(jax.vmap(engine.advance))(physics, jnp.asarray(inputs[:, :7]), jnp.asarray(inputs[:, 7:]))
+    assert np.isfinite(after.qpos).all()
+    with pytest.raises(ValueError, match=r"left out contacts .*constraints=12; constraints=\d+ are always enough"):
+        engine.check()
+    engine.check()  # told once
 
 
 def test_the_engine_follows_native():

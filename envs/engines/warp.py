@@ -47,10 +47,11 @@ class WarpEngine:
         sets the pace, and 50 with `fused`, where each stops by itself.
       ls_iterations: maximum steps of the solver's line search; by default 8, and 20 with `fused`.
       contacts: contacts per environment (a mean over the batch) that fit into memory; by default, all that can occur.
-      constraints: constraint rows that fit into memory in each environment; by default, all that can occur.
+      constraints: constraint rows that fit into memory in each environment; by default, all that can occur, and up to 96 with
+        `fused`.
       fused: whether one kernel of this library takes the whole step instead of MuJoCo Warp's many. It follows MuJoCo C to
         rounding, the puck's cylinder included, its sums do not depend on the order of threads, and it has memory for all
-        contacts (`contacts` and `constraints` cannot be set). Not yet as fast (docs/design.md).
+        contacts (`contacts` cannot be set). Not yet as fast (docs/design.md).
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
@@ -74,7 +75,7 @@ class WarpEngine:
         if not allow_cpu:
             _check_gpu()
         if fused:
-            _check_fused(model, contacts, constraints)
+            _check_fused(model, contacts)
         self._fused = fused
         self._model = copy.copy(model) if fused else with_stand_ins(model)
         self._model.opt.iterations = iterations or (fused_simulation.ITERATIONS if fused else 8)
@@ -82,9 +83,11 @@ class WarpEngine:
         # Box-box contacts are analytic, as in MuJoCo C, not from the general convex algorithm.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._substeps = substeps
-        self.most_contacts, self.most_constraints = (0, 0) if fused else capacities(self._model)
+        self.most_contacts, self.most_constraints = fused_simulation.capacities(model) if fused else capacities(self._model)
         self._contacts = contacts or self.most_contacts
-        self._constraints = constraints or self.most_constraints
+        self._constraints = constraints or (
+            min(fused_simulation.ROWS, self.most_constraints) if fused else self.most_constraints
+        )
         self._simulations: dict[tuple[str, int], Any] = {}
         self._lock = threading.Lock()
         self._loading: concurrent.futures.Future[None] | None = None
@@ -144,6 +147,11 @@ class WarpEngine:
         with self._lock:
             for simulation in self._simulations.values():
                 lost |= simulation.overflow()
+        if lost and self._fused:
+            raise ValueError(
+                f"the warp engine left out contacts that there was no room for: it was made with"
+                f" constraints={self._constraints}; constraints={self.most_constraints} are always enough"
+            )
         names = [name for name in _OVERFLOWS if lost & int(mujoco_warp.OverflowType[name])]
         if names:
             raise ValueError(
@@ -162,7 +170,7 @@ class WarpEngine:
     def _load(self) -> None:
         prepare()
         if self._fused:
-            fused_simulation.load(self._model)
+            fused_simulation.load(self._model, self._constraints)
             return
         _Simulation(self._model, 1, 1, self._contacts, self._constraints).run()
         wp.synchronize()
@@ -175,7 +183,7 @@ class WarpEngine:
         key = (str(device), num_envs)
         if key not in self._simulations:
             self._simulations[key] = (
-                fused_simulation.FusedSimulation(self._model, num_envs, self._substeps)
+                fused_simulation.FusedSimulation(self._model, num_envs, self._substeps, rows=self._constraints)
                 if self._fused
                 else _Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
             )
@@ -252,10 +260,9 @@ def _check_gpu() -> None:
         )
 
 
-def _check_fused(model: mujoco.MjModel, contacts: int | None, constraints: int | None) -> None:
-    given = [name for name, size in (("contacts", contacts), ("constraints", constraints)) if size is not None]
-    if given:
-        raise ValueError(f"{' and '.join(given)} cannot be set with fused=True, which has memory for all that can occur")
+def _check_fused(model: mujoco.MjModel, contacts: int | None) -> None:
+    if contacts is not None:
+        raise ValueError("contacts cannot be set with fused=True, which has memory for all that can occur")
     left_out = fused_simulation.unsupported(model)
     if left_out:
         raise ValueError(f"fused=True leaves out what the model has: {', '.join(left_out)}; make the engine without it")

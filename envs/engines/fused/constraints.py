@@ -26,7 +26,9 @@ def _impedance(soft: Softness, depth: float) -> float:
         return 0.5 * (least + most)
     x = wp.min(wp.abs(depth) / width, 1.0)
     y = x
-    if power > 1.0:
+    if power == 2.0:
+        y = wp.where(x <= middle, x * x / middle, 1.0 - (1.0 - x) * (1.0 - x) / (1.0 - middle))
+    elif power > 1.0:
         if x <= middle:
             y = wp.pow(x, power) / wp.pow(middle, power - 1.0)
         else:
@@ -39,7 +41,7 @@ def _ask(memory: Memory, row: int, soft: Softness, residual: float, depth: float
     """Sets what a row asks for."""
     imp = _impedance(soft, depth)
     memory.weight[row] = 1.0 / wp.max(inverse_inertia * (1.0 - imp) / imp, _TINY)
-    memory.aref[row] = -soft[0] * imp * residual - soft[1] * velocity
+    memory.residual[row] = -soft[0] * imp * residual - soft[1] * velocity
 
 
 @wp.func
@@ -68,7 +70,7 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, la
         for k in range(3):
             memory.jacobian[k * nv + i] = along[k]
             memory.jacobian[(3 + k) * nv + i] = about[k]
-    if lane == 0:
+    for k in range(lane, 3, lanes):
         place = memory.pos[target] - memory.pos[body]
         between = times(inverse, goal)
         turn_left = wp.vec3(between[1], between[2], between[3])
@@ -81,16 +83,22 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, la
         # With qacc 0: the body's acceleration, and the second derivative of the turn.
         bend = _at(bias, arm) + wp.cross(omega, speed)
         curl = times(times(inverse, wp.vec4(0.25 * wp.dot(omega, omega), 0.5 * alpha[0], 0.5 * alpha[1], 0.5 * alpha[2])), goal)
-        for k in range(3):
-            _ask(memory, k, world.weld_soft, place[k], depth, world.weld_weight[0], -speed[k])
-            memory.aref[k] = memory.aref[k] + bend[k]
-            _ask(memory, 3 + k, world.weld_soft, turn_left[k], depth, world.weld_weight[1], -0.5 * spin[k + 1])
-            memory.aref[3 + k] = memory.aref[3 + k] + curl[k + 1]
+        _ask(memory, k, world.weld_soft, place[k], depth, world.weld_weight[0], -speed[k])
+        memory.residual[k] = memory.residual[k] + bend[k]
+        _ask(memory, 3 + k, world.weld_soft, turn_left[k], depth, world.weld_weight[1], -0.5 * spin[k + 1])
+        memory.residual[3 + k] = memory.residual[3 + k] + curl[k + 1]
 
 
 @wp.func
-def number(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
-    """Gives a row to each joint at its limit, and a number of rows to each contact within its margin."""
+def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: wp.array(dtype=int), lane: int, lanes: int):
+    """Gives a row to each joint at its limit, and a number of rows to each contact within its margin.
+
+    Contacts for which there is no room are left out, and counted in `lost`.
+    """
+    for s in range(lane, contacts.slots, lanes):
+        pair = contacts.pair[s]
+        memory.touching[s] = wp.where(memory.distance[s] < contacts.margin[pair], _edges(contacts.dim[pair]), 0)
+    sync(lanes)
     if lane == 0:
         rows = int(6)
         for k in range(dofs.limits):
@@ -100,12 +108,14 @@ def number(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int
                 rows += 1
         touching = int(0)
         for s in range(contacts.slots):
-            pair = contacts.pair[s]
-            if memory.distance[s] < contacts.margin[pair]:
+            edges = memory.touching[s]
+            if edges > 0 and rows + edges > world.rows:
+                wp.atomic_add(lost, 0, 1)
+            elif edges > 0:
                 memory.touching[touching] = s
                 memory.slot[touching] = rows
                 touching += 1
-                rows += _edges(contacts.dim[pair])
+                rows += edges
         memory.counts[0] = touching
         memory.counts[1] = rows
     sync(lanes)
@@ -149,32 +159,35 @@ def limit(
 def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
     """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent."""
     nv = dofs.number
-    for at in range(lane, memory.counts[0] * nv, lanes):
-        i = at % nv
-        s = memory.touching[at // nv]
-        row = memory.slot[at // nv]
+    for c in range(memory.counts[0]):
+        s = memory.touching[c]
+        row = memory.slot[c]
         pair = contacts.pair[s]
-        sign = float(0.0)
-        if (bodies.moved_by[contacts.geom_body[contacts.geom2[pair]]] >> i) & 1 == 1:
-            sign += 1.0
-        if (bodies.moved_by[contacts.geom_body[contacts.geom1[pair]]] >> i) & 1 == 1:
-            sign -= 1.0
-        motion = sign * memory.motion[i]
-        velocity = _at(motion, memory.place[s] - memory.pos[bodies.root[dofs.body[i]]])
+        dim = contacts.dim[pair]
         normal = memory.normal[s]
         friction = contacts.friction[pair]
-        along = wp.dot(velocity, normal)
-        if contacts.dim[pair] == 1:
-            memory.jacobian[row * nv + i] = along
-        else:
-            for k in range(contacts.dim[pair] - 1):
-                aside = friction[2] * wp.dot(wp.spatial_top(motion), normal)
-                if k == 0:
-                    aside = friction[0] * wp.dot(velocity, tangent(normal))
-                elif k == 1:
-                    aside = friction[1] * wp.dot(velocity, wp.cross(normal, tangent(normal)))
-                memory.jacobian[(row + 2 * k) * nv + i] = along + aside
-                memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
+        first = tangent(normal)
+        second = friction[1] * wp.cross(normal, first)
+        first = friction[0] * first
+        turning = friction[2] * normal
+        moves2 = bodies.moved_by[contacts.geom_body[contacts.geom2[pair]]]
+        moves1 = bodies.moved_by[contacts.geom_body[contacts.geom1[pair]]]
+        for i in range(lane, nv, lanes):
+            sign = float((moves2 >> i) & 1) - float((moves1 >> i) & 1)
+            motion = sign * memory.motion[i]
+            velocity = _at(motion, memory.place[s] - memory.pos[bodies.root[dofs.body[i]]])
+            along = wp.dot(velocity, normal)
+            if dim == 1:
+                memory.jacobian[row * nv + i] = along
+            else:
+                for k in range(dim - 1):
+                    aside = wp.dot(wp.spatial_top(motion), turning)
+                    if k == 0:
+                        aside = wp.dot(velocity, first)
+                    elif k == 1:
+                        aside = wp.dot(velocity, second)
+                    memory.jacobian[(row + 2 * k) * nv + i] = along + aside
+                    memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
     sync(lanes)
 
 

@@ -7,15 +7,15 @@ from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch,
 from mjx_dher.envs.engines.fused.contacts import collide
 from mjx_dher.envs.engines.fused.kinematics import integrate, move, place, push, strain, turn, weigh
 from mjx_dher.envs.engines.fused.lanes import sync
-from mjx_dher.envs.engines.fused.memory import carve
+from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, World
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.host.warp_setup import wp
 
 
 @functools.cache
-def make(shared: int) -> Any:
-    """Returns the kernel whose blocks have so many floats of shared memory; 0 on a CPU."""
+def make(shared: int, count: int, nv: int) -> Any:
+    """Returns the kernel for `count` lanes and `nv` degrees of freedom, with so many floats of shared memory; 0 on a CPU."""
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -26,7 +26,7 @@ def make(shared: int) -> Any:
         layout: Layout,
         spare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         substeps: int,
-        lanes: int,
+        lost: wp.array(dtype=int),  # type: ignore[valid-type]
         inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
         old_qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
         old_qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -38,17 +38,17 @@ def make(shared: int) -> Any:
         """Computes coordinates, velocities and the solver's first guess `substeps` timesteps later.
 
         `spare` [num_envs, size of `layout`] is the memory on a CPU; `inputs` [num_envs, 7 + nu] has the mocap body's pose and
-        the controls.
+        the controls. `lost` [1] counts contacts that there is no room for.
         """
         env, lane = wp.tid()  # type: ignore[misc]
+        lanes = wp.static(count)  # so that the compiler knows them
+        size = wp.static(nv)
         if wp.static(shared > 0):
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
         memory = carve(layout, spare[env % spare.shape[0]], lanes)
-        for i in range(lane, qpos.shape[1], lanes):
-            memory.qpos[i] = old_qpos[env, i]
-        for i in range(lane, dofs.number, lanes):
-            memory.qvel[i] = old_qvel[env, i]
-            memory.qacc[i] = old_guess[env, i]
+        copy(old_qpos[env], memory.qpos, lane, lanes)
+        copy(old_qvel[env], memory.qvel, lane, lanes)
+        copy(old_guess[env], memory.qacc, lane, lanes)
         sync(lanes)
         given = inputs[env]
         for _substep in range(substeps):
@@ -59,18 +59,16 @@ def make(shared: int) -> Any:
             push(bodies, dofs, memory, given, lane, lanes)
             weigh(bodies, dofs, memory, lane, lanes)
             collide(contacts, memory, lane, lanes)
-            number(dofs, contacts, memory, lane, lanes)
+            number(world, dofs, contacts, memory, lost, lane, lanes)
             weld(world, bodies, dofs, memory, lane, lanes)
             limit(dofs, contacts, memory, lane, lanes)
             touch(bodies, dofs, contacts, memory, lane, lanes)
             press(dofs, contacts, memory, lane, lanes)
-            solve(world, dofs, memory, lane, lanes)
-            accelerate(world, dofs, memory, lane, lanes)
+            solve(world, memory, size, lane, lanes)
+            accelerate(world, dofs, memory, size, lane, lanes)
             integrate(world, bodies, memory, lane, lanes)
-        for i in range(lane, qpos.shape[1], lanes):
-            qpos[env, i] = memory.qpos[i]
-        for i in range(lane, dofs.number, lanes):
-            qvel[env, i] = memory.qvel[i]
-            guess[env, i] = memory.qacc[i]
+        copy(memory.qpos, qpos[env], lane, lanes)
+        copy(memory.qvel, qvel[env], lane, lanes)
+        copy(memory.qacc, guess[env], lane, lanes)
 
     return advance

@@ -75,13 +75,25 @@ def place(
         memory.pos[b] = pos
         memory.quat[b] = quat
     sync(lanes)
+    # One lane goes along the tree, twice, with as little to do as can be; the rest is done side by side.
     if lane == 0:
         for b in range(1, bodies.number):
             parent = bodies.parent[b]
             if parent > 0:
-                quat = memory.quat[parent]
-                memory.pos[b] = memory.pos[parent] + turned(quat, memory.pos[b])
-                memory.quat[b] = wp.normalize(times(quat, memory.quat[b]))
+                memory.quat[b] = times(memory.quat[parent], memory.quat[b])
+    sync(lanes)
+    for b in range(lane, bodies.number, lanes):
+        parent = bodies.parent[b]
+        if parent > 0:
+            memory.pos[b] = turned(memory.quat[parent], memory.pos[b])
+    sync(lanes)
+    if lane == 0:
+        for b in range(1, bodies.number):
+            parent = bodies.parent[b]
+            if parent > 0:
+                memory.pos[b] = memory.pos[b] + memory.pos[parent]
+    for b in range(lane, bodies.number, lanes):
+        memory.quat[b] = wp.normalize(memory.quat[b])
     sync(lanes)
 
 

@@ -95,7 +95,7 @@ class World:
     weld_target: int
     weld_soft: Softness
     weld_weight: wp.vec2  # inverse inertia of translation and rotation
-    rows: int  # most rows of constraints
+    rows: int  # of constraints that there is room for
     tolerance: float
     iterations: int  # of Newton's method, at most
     ls_iterations: int
@@ -112,25 +112,26 @@ class Memory:
     Spatial vectors have the angular part first and refer to the place of the tree's first body.
     """
 
+    # These are of no use once forces and the mass matrix are known: `jacobian` takes their place.
+    moment: _vec3s  # [nbody] mass times place of the centre of mass
+    inertia: _matrices
+    force: _spatial  # that `bias` needs
+    turning: _spatial  # [nv] acceleration for one unit of qvel
+    momentum: _spatial  # [nv] of the body and what is below it, for one unit of qvel
+    # Those that stay.
     pos: _vec3s  # [nbody]
     quat: _quats
     mat: _matrices
-    moment: _vec3s  # mass times place of the centre of mass
-    inertia: _matrices
     velocity: _spatial
     bias: _spatial  # acceleration without qacc and gravity
-    force: _spatial  # that this acceleration needs
     motion: _spatial  # [nv] velocity for one unit of qvel
-    turning: _spatial  # [nv] acceleration for one unit of qvel
-    momentum: _spatial  # [nv] of the body and what is below it, for one unit of qvel
     mass: _floats  # [nv * nv]
     smooth: _floats  # [nv] forces except those of constraints
     qacc: _floats  # [nv]
     inert: _floats  # [nv] mass matrix times qacc
     search: _floats  # [nv] direction of Newton's method
     step: _floats  # [nv] mass matrix times search
-    factor: _floats  # [(nv + 1) * nv] Cholesky factor, and below it the right-hand side
-    pivot: _floats  # [nv]
+    factor: _floats  # [nv * nv] Cholesky factor
     qpos: _floats  # [nq]
     qvel: _floats  # [nv]
     distance: _floats  # [nslot]
@@ -140,12 +141,10 @@ class Memory:
     slot: _ints  # [nslot] first row of each of those contacts
     limited: _ints  # [nlimit] row of each joint at its limit, or -1
     counts: _ints  # [2] how many contacts, how many rows
-    jacobian: _floats  # [rows * nv]
     weight: _floats  # [rows] D, the inverse of a row's softness
-    aref: _floats  # [rows]
-    residual: _floats  # [rows] J qacc - aref
-    pull: _floats  # [rows] D of rows that act, 0 of others
+    residual: _floats  # [rows] aref, and from the solver on J qacc - aref
     change: _floats  # [rows] J search
+    jacobian: _floats  # [rows * nv]
 
 
 @wp.struct

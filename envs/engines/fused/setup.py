@@ -178,8 +178,8 @@ def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]
     return mujoco.mjtGeom(first).name[len("mjGEOM_") :], mujoco.mjtGeom(second).name[len("mjGEOM_") :]
 
 
-def world_of(model: mujoco.MjModel, contacts: Any) -> Any:
-    """Returns `World` of a model."""
+def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
+    """Returns `World` of a model, with room for up to `most_rows` rows of constraints."""
     body, target = int(model.eq_obj2id[0]), int(model.eq_obj1id[0])
     dims = np.asarray(model.pair_dim)[contacts.pair.numpy()]
     return _fill(
@@ -190,7 +190,7 @@ def world_of(model: mujoco.MjModel, contacts: Any) -> Any:
         weld_target=target,
         weld_soft=_softness(model, model.eq_solref[0], model.eq_solimp[0]),
         weld_weight=wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
-        rows=6 + int(np.count_nonzero(model.jnt_limited)) + int(np.where(dims == 1, 1, 2 * dims - 2).sum()),
+        rows=min(most_rows, 6 + int(np.count_nonzero(model.jnt_limited)) + int(np.where(dims == 1, 1, 2 * dims - 2).sum())),
         tolerance=model.opt.tolerance,
         iterations=model.opt.iterations,
         ls_iterations=model.opt.ls_iterations,
@@ -203,19 +203,25 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any) -> An
     nb, nv, rows = model.nbody, model.nv, world.rows
     lengths = {
         **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
-        **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "pivot", "qvel"), nv),
+        **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "qvel"), nv),
         "mass": nv * nv,
-        "factor": (nv + 1) * nv,
+        "factor": nv * nv,
         "qpos": model.nq,
         **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
         **dict.fromkeys(("touching", "slot"), contacts.slots),
         "limited": dofs.limits,
         "counts": 2,
         "jacobian": rows * nv,
-        **dict.fromkeys(("weight", "aref", "residual", "pull", "change"), rows),
+        **dict.fromkeys(("weight", "residual", "change"), rows),
     }
     fields: dict[str, Any] = Memory.vars  # type: ignore[attr-defined]
     length = np.array([lengths[name] for name in fields])
     floats = length * [np.prod(getattr(field.type.dtype, "_shape_", ()), dtype=int) for field in fields.values()]
     end = np.cumsum(floats)
-    return _fill(Layout, size=int(end[-1]), begin=end - floats, length=length)
+    begin, names = end - floats, list(fields)
+    # The last field begins with the first ones, whose place it takes.
+    passing, stays, jacobian = begin[names.index("pos")], slice(names.index("pos"), -1), floats[-1]
+    begin[stays] += max(0, jacobian - passing)
+    size = int(end[-2] + max(0, jacobian - passing))
+    begin[-1] = 0
+    return _fill(Layout, size=size, begin=begin, length=length)

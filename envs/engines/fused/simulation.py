@@ -9,6 +9,7 @@ from mjx_dher.envs.engines.fused import kernel, setup
 from mjx_dher.host.warp_setup import wp
 
 LANES = 32  # threads that share an environment
+ROWS = 96  # of constraints that an environment has room for
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
 
@@ -21,42 +22,54 @@ class FusedSimulation:
         line search.
       num_envs: number of environments.
       substeps: timesteps an environment step.
+      rows: of constraints that there is room for.
       lanes: threads that share an environment, a power of 2 up to 32; 1 on a CPU.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, lanes: int = LANES):
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, lanes: int = LANES, rows: int = ROWS):
         bodies, dofs, contacts = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model)
-        world = setup.world_of(model, contacts)
+        world = setup.world_of(model, contacts, rows)
         self.layout = setup.layout_of(model, world, contacts, dofs)
         cpu = wp.get_device().is_cpu
         self.lanes = 1 if cpu else lanes
         self._block = 1 if cpu else 32
         self.memory = wp.zeros((num_envs if cpu else 1, self.layout.size if cpu else 1), dtype=float)
-        self._kernel = kernel_of(self.layout.size, self.lanes)
+        self._kernel = kernel_of(self.layout.size, self.lanes, model.nv)
         self._kept = (world, bodies, dofs, contacts, self.layout, self.memory)
+        self._lost = wp.zeros(1, dtype=int)
         self._substeps, self._num_envs = substeps, num_envs
 
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
         wp.launch(
             self._kernel,
             dim=(self._num_envs, self.lanes),
-            inputs=[*self._kept, self._substeps, self.lanes, inputs, *state],
+            inputs=[*self._kept, self._substeps, self._lost, inputs, *state],
             outputs=list(result),
             block_dim=self._block,
         )
 
     def overflow(self) -> int:
-        return 0  # there is memory for all contacts and constraints
+        """Returns how many contacts were left out since the last call, because there was no room for their rows."""
+        lost = int(self._lost.numpy()[0])
+        if lost:
+            self._lost.zero_()
+        return lost
 
 
-def kernel_of(size: int, lanes: int) -> Any:
+def kernel_of(size: int, lanes: int, nv: int) -> Any:
     """Returns the kernel for environments of `size` floats, as many in a block as share a warp, or one."""
-    return kernel.make(0 if wp.get_device().is_cpu else size * max(1, 32 // lanes))
+    return kernel.make(0 if wp.get_device().is_cpu else size * max(1, 32 // lanes), lanes, nv)
 
 
-def load(model: mujoco.MjModel) -> None:
+def capacities(model: mujoco.MjModel) -> tuple[int, int]:
+    """Returns the most contacts, and rows of constraints, that an environment can have."""
+    contacts = setup.contacts_of(model)
+    return contacts.slots, setup.world_of(model, contacts, 10**6).rows
+
+
+def load(model: mujoco.MjModel, rows: int) -> None:
     """Compiles the kernel for the current device, or takes it from Warp's cache."""
-    simulation = FusedSimulation(model, 1, 1)
+    simulation = FusedSimulation(model, 1, 1, rows=rows)
     simulation._kernel.module.load(wp.get_device(), simulation._block)
 
 

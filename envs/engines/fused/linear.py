@@ -1,0 +1,178 @@
+# mypy: disable-error-code="empty-body,valid-type"
+"""Linear equations of one environment: its rows of constraints added up, Cholesky's factors, and the solution.
+
+On a GPU each lane has whole rows of the matrix in its registers, and lanes hand each other numbers: a factorization in shared
+memory would wait for it at every step. L lanes have R rows each, N = L R at least as many as there are.
+"""
+
+from mjx_dher.host.warp_setup import wp
+
+_ON_A_GPU = """
+    const unsigned group = lanes == 32 ? ~0u : ((1u << lanes) - 1u) << (threadIdx.x & 31 & ~(lanes - 1));
+    auto run = [&](auto& h, auto& counter) {
+        constexpr int R = sizeof(counter), N = sizeof(h) / sizeof(float) / R, L = N / R;
+        float b[R], mine[R], inverse[N];
+        float gain = 0.0f;
+        #pragma unroll
+        for (int r = 0; r < R; ++r) {
+            const int i = lane + r * L;
+            const bool is_row = lane < L && i < n;
+            b[r] = is_row ? right.data[i] : 0.0f;
+            #pragma unroll
+            for (int j = 0; j < N; ++j) h[r * N + j] = is_row && j <= i ? matrix.data[i * n + j] : 0.0f;
+        }
+        for (int row = 0; row < rows; ++row) {
+            const float lacks = residual.data[row];
+            if (row < 6 || lacks < 0.0f) {
+                const float* const j_row = jacobian.data + row * n;
+                const float w = weight.data[row], left = w * lacks;
+                #pragma unroll
+                for (int r = 0; r < R; ++r) {
+                    const int i = lane + r * L;
+                    mine[r] = lane < L && i < n ? j_row[i] : 0.0f;
+                    b[r] -= mine[r] * left;
+                    mine[r] *= w;
+                }
+                if (stiff) {
+                    #pragma unroll
+                    for (int j = 0; j < N; ++j) {
+                        if (j < n) {
+                            const float other = j_row[j];
+                            #pragma unroll
+                            for (int r = 0; r < R; ++r) h[r * N + j] += mine[r] * other;
+                        }
+                    }
+                }
+            }
+        }
+        #pragma unroll
+        for (int k = 0; k < N; ++k) {
+            if (k < n) {
+                const float inv = rsqrtf(fmaxf(__shfl_sync(group, h[k / L * N + k], k % L, lanes), 1.0e-20f));
+                const float y = inv * __shfl_sync(group, b[k / L], k % L, lanes);
+                inverse[k] = inv;
+                gain += y * y;
+                #pragma unroll
+                for (int r = 0; r < R; ++r) {
+                    const int i = lane + r * L;
+                    h[r * N + k] *= inv;
+                    b[r] = i == k ? y : i > k ? b[r] - h[r * N + k] * y : b[r];
+                }
+                #pragma unroll
+                for (int j = k + 1; j < N; ++j) {
+                    if (j < n) {
+                        const float other = __shfl_sync(group, h[j / L * N + k], j % L, lanes);
+                        #pragma unroll
+                        for (int r = 0; r < R; ++r) h[r * N + j] -= h[r * N + k] * other;
+                    }
+                }
+            }
+        }
+        #pragma unroll
+        for (int r = 0; r < R; ++r) {
+            const int i = lane + r * L;
+            #pragma unroll
+            for (int j = 0; j < N; ++j) {
+                if (lane < L && i < n && j < i) factor.data[i * n + j] = h[r * N + j];
+            }
+        }
+        __syncwarp(group);
+        #pragma unroll
+        for (int k = N - 1; k >= 0; --k) {
+            if (k < n) {
+                const float x = inverse[k] * __shfl_sync(group, b[k / L], k % L, lanes);
+                #pragma unroll
+                for (int r = 0; r < R; ++r) {
+                    const int i = lane + r * L;
+                    if (lane < L && i < k) b[r] -= factor.data[k * n + i] * x;
+                    if (lane < L && i == k) solution.data[i] = x;
+                }
+            }
+        }
+        __syncwarp(group);
+        return gain;
+    };
+    char r1[1], r2[2], r4[4], r8[8];
+    if (n <= 16) {
+        if (lanes >= 16) { float h[16]; return run(h, r1); }
+        if (lanes == 8) { float h[32]; return run(h, r2); }
+        float h[64]; return run(h, r4);
+    }
+    if (lanes == 32) { float h[32]; return run(h, r1); }
+    if (lanes == 16) { float h[64]; return run(h, r2); }
+    if (lanes == 8) { float h[128]; return run(h, r4); }
+    float h[256]; return run(h, r8);
+"""
+_ON_A_CPU = """
+    float gain = 0.0f;
+    for (int i = 0; i < n; ++i) {
+        solution.data[i] = right.data[i];
+        for (int j = 0; j <= i; ++j) factor.data[i * n + j] = matrix.data[i * n + j];
+    }
+    for (int row = 0; row < rows; ++row) {
+        const float lacks = residual.data[row], w = weight.data[row], left = w * lacks;
+        if (row < 6 || lacks < 0.0f) {
+            const float* const j_row = jacobian.data + row * n;
+            for (int i = 0; i < n; ++i) {
+                solution.data[i] -= j_row[i] * left;
+                if (stiff) for (int j = 0; j <= i; ++j) factor.data[i * n + j] += w * j_row[i] * j_row[j];
+            }
+        }
+    }
+    for (int k = 0; k < n; ++k) {
+        const float pivot = factor.data[k * n + k];
+        const float inverse = 1.0f / sqrtf(pivot > 1.0e-20f ? pivot : 1.0e-20f);
+        factor.data[k * n + k] = inverse;
+        solution.data[k] *= inverse;
+        gain += solution.data[k] * solution.data[k];
+        for (int i = k + 1; i < n; ++i) {
+            factor.data[i * n + k] *= inverse;
+            solution.data[i] -= factor.data[i * n + k] * solution.data[k];
+            for (int j = k + 1; j <= i; ++j) factor.data[i * n + j] -= factor.data[i * n + k] * factor.data[j * n + k];
+        }
+    }
+    for (int k = n - 1; k >= 0; --k) {
+        solution.data[k] *= factor.data[k * n + k];
+        for (int i = 0; i < k; ++i) solution.data[i] -= factor.data[k * n + i] * solution.data[k];
+    }
+    return gain;
+"""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_ON_A_GPU}
+#else
+{_ON_A_CPU}
+#endif
+""")
+def direction(
+    matrix: wp.array(dtype=float),
+    right: wp.array(dtype=float),
+    jacobian: wp.array(dtype=float),
+    weight: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    factor: wp.array(dtype=float),
+    solution: wp.array(dtype=float),
+    n: int,
+    rows: int,
+    stiff: int,
+    lane: int,
+    lanes: int,
+) -> float:
+    """Solves (M + J' D J) x = right - J' D residual, without J' D J where `stiff` is 0.
+
+    D is the weight of rows that act: the first six, and those whose residual is below 0.
+
+    Args:
+      matrix: M [n * n], symmetric.
+      right: [n].
+      jacobian: J [rows * n].
+      weight, residual: [rows].
+      factor: [n * n] to compute in.
+      solution: x [n] is written here.
+
+    Returns:
+      x' (M + J' D J) x.
+    """
+    ...
