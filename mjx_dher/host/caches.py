@@ -15,7 +15,7 @@ def user_cache() -> Path:
 def keep_compiled_programs() -> None:
     """Makes JAX keep compiled programs in the user's cache folder, unless the user has chosen another.
 
-    JAX cannot keep a program that calls back to Python, as every program with native physics does.
+    JAX cannot keep a program that calls back to Python, as one on a GPU with native physics does.
     """
     import jax
 

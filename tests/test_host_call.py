@@ -1,0 +1,87 @@
+"""Calls of the host by a name: values, batches, errors, a second process that has compiled nothing."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher.envs.engines import host_call
+
+ROWS = jnp.arange(12.0).reshape(4, 3)
+
+
+def double(rows):
+    return np.concatenate([2 * rows, rows.sum(-1, keepdims=True)], axis=-1, dtype=np.float32)
+
+
+def test_a_function_is_called_once_for_all_batch_axes():
+    seen = []
+
+    def noting(rows):
+        seen.append(rows.shape)
+        return double(rows)
+
+    host_call.register("test_noting", noting)
+    call = lambda row: host_call.call("test_noting", (4,), row)  # noqa: E731
+    np.testing.assert_array_equal(jax.jit(call)(ROWS[1]), double(np.asarray(ROWS[1])))
+    nested = jax.jit(jax.vmap(jax.vmap(call)))(ROWS.reshape(2, 2, 3))
+    np.testing.assert_array_equal(nested.reshape(4, 4), double(np.asarray(ROWS)))
+    scanned = jax.jit(lambda x: jax.lax.scan(lambda x, _: (call(x)[:3], None), x, length=3)[0])(ROWS[1])
+    np.testing.assert_array_equal(scanned, 8 * ROWS[1])
+    assert seen == [(3,), (2, 2, 3), (3,), (3,), (3,)]
+
+
+def test_the_last_function_of_a_name_is_called_also_by_what_is_compiled():
+    host_call.register("test_two", double)
+    call = jax.jit(lambda row: host_call.call("test_two", (4,), row))
+    first = call(ROWS[0])
+    host_call.register("test_two", lambda rows: -double(rows))
+    np.testing.assert_array_equal(call(ROWS[0]), -first)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda rows: 1 / 0, "ZeroDivisionError: division by zero"),
+        (lambda rows: rows[:2], r"must give \[4\]; it gives \(2,\)"),
+        (lambda rows: None, r"must give \[4\]; it gives \(\)"),
+    ],
+)
+def test_an_error_ends_the_program_with_its_message(function, message):
+    host_call.register("test_error", function)
+    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match=message):
+        jax.block_until_ready(jax.jit(lambda row: host_call.call("test_error", (4,), row))(ROWS[0]))
+
+
+PROGRAM = """
+import sys
+import jax
+jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+from mjx_dher import envs
+from mjx_dher.rollout import rollout
+hits = []
+jax.monitoring.register_event_listener(lambda name, **_: hits.append(name))
+env = envs.make("reach", engine="native", num_threads=1)
+play = jax.jit(lambda key, a: rollout(env, lambda a, obs: a, key, 2, a))
+_, outcome = play(jax.random.key(0), jax.numpy.zeros((50, 2, 4)))
+print(outcome.rewards.sum() if hasattr(outcome, "rewards") else outcome[0].sum())
+print(hits.count("/jax/compilation_cache/cache_hits"))
+"""
+
+
+def test_a_program_with_native_physics_is_kept_for_the_next_process(tmp_path):
+    results = []
+    for _ in range(2):
+        ran = subprocess.run(
+            [sys.executable, "-c", PROGRAM, str(tmp_path)], capture_output=True, text=True, check=True, timeout=300
+        )
+        results.append(ran.stdout.split())
+    (first, none), (second, hits) = results
+    assert first == second
+    assert int(hits) > int(none)
+    assert list(tmp_path.glob("jit__lambda*"))
