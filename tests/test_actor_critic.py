@@ -19,6 +19,13 @@ from mjx_dher.types import Batch, Sizes
 from point_mass import PointMass
 
 NAMES = ("td3", "sac", "redq", "tqc", "dtqc")
+
+
+def at_night(*names):
+    """All learners; those that are not among `names` with the slow tests."""
+    return [pytest.param(name, marks=() if name in names else pytest.mark.slow) for name in NAMES]
+
+
 SIZES = Sizes(2, 2, 2)
 SMALL = Config(
     num_envs=16,
@@ -80,7 +87,7 @@ def linear(actor, parts):
     """A learner of these networks; its second critic thinks less of everything by 1/2, by a goal's weight of 1/2 and 3/8."""
     module = Networks(LinearActor() if isinstance(actor, Deterministic) else Moments(), LinearCritic(parts.size))
     learner = ActorCritic(Sizes(1, 1, 1), module, module, actor, parts)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     lower = {"params": {"abcd": state.target.critic["params"]["abcd"].at[1, 1].add(0.125)}}
     return learner, dataclasses.replace(state, target=dataclasses.replace(state.target, critic=lower))
 
@@ -91,14 +98,14 @@ SECOND = np.array([-0.125, -0.5])  # what the second critic adds: 1/8 of the goa
 @pytest.mark.parametrize(("size", "combine"), [(1, critics.smallest), (1, critics.smallest_of(2))])
 def test_the_target_of_the_smaller_critic_by_hand(size, combine):
     learner, state = linear(Deterministic(), Critics(2, size, combine, critics.squared_error, critics.lowest))
-    got = learner.target(state, BATCH, HP, jax.random.key(1))
+    got = jax.jit(learner.target)(state, BATCH, HP, jax.random.key(1))
     np.testing.assert_allclose(got[:, 0], [-1 + 0.5 * (Q[0] + SECOND[0]), 0.5 * (Q[1] + SECOND[1])], rtol=1e-6)
 
 
 def test_the_target_of_truncated_quantiles_by_hand():
     """Of six quantiles, three a critic and 0.1 apart, the two largest are dropped: both of the first critic, or one of each."""
     learner, state = linear(Deterministic(), Critics(2, 3, critics.truncated(1), critics.quantile_huber, critics.mean))
-    got = learner.target(state, BATCH, HP, jax.random.key(1))
+    got = jax.jit(learner.target)(state, BATCH, HP, jax.random.key(1))
     steps = np.array([0.0, 0.1, 0.2])
     for i, reward in enumerate((-1.0, 0.0)):
         pooled = np.sort(np.concatenate([Q[i] + steps, Q[i] + SECOND[i] + steps]))[:4]
@@ -108,7 +115,7 @@ def test_the_target_of_truncated_quantiles_by_hand():
 def test_the_target_of_a_soft_value_takes_off_alpha_log_pi():
     parts = Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest)
     learner, state = linear(Gaussian(), parts)
-    draws = jax.vmap(lambda key: learner.target(state, BATCH, HP, key))(jax.random.split(jax.random.key(1), 20_000))
+    draws = jax.jit(jax.vmap(lambda key: learner.target(state, BATCH, HP, key)))(jax.random.split(jax.random.key(1), 20_000))
     u = np.array([0.0, 2.0])[:, None] + 0.5 * np.random.default_rng(0).normal(size=(2, 200_000))
     log_pi = -0.5 * ((u.T - [0.0, 2.0]) / 0.5) ** 2 - np.log(0.5 * np.sqrt(2 * np.pi)) - np.log1p(-(np.tanh(u.T) ** 2))
     values = np.array([-0.25 - 0.125, -2.0 - 0.5]) + 0.5 * np.tanh(u.T)
@@ -119,7 +126,7 @@ def test_the_target_of_a_soft_value_takes_off_alpha_log_pi():
 @pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
 def test_targets_are_clipped_to_what_returns_can_be(reward, clipped):
     learner, state = linear(Deterministic(), Critics(2, 1, critics.smallest, critics.squared_error, critics.lowest))
-    got = learner.target(state, BATCH.replace(reward=jnp.full(2, reward)), HP, jax.random.key(1))
+    got = jax.jit(learner.target)(state, BATCH.replace(reward=jnp.full(2, reward)), HP, jax.random.key(1))
     np.testing.assert_array_equal(got, [[clipped], [clipped]])
 
 
@@ -128,8 +135,9 @@ def test_a_target_takes_its_actions_from_the_slower_actor():
     quick = dataclasses.replace(state.params, actor={"params": {"w": jnp.float32(-1.0)}})
     moved = dataclasses.replace(state, params=quick)
     key = jax.random.key(1)
-    np.testing.assert_array_equal(learner.target(moved, BATCH, HP, key), learner.target(state, BATCH, HP, key))
-    target = learner.update_target(moved, HP._replace(polyak=0.75)).target
+    target_of = jax.jit(learner.target)
+    np.testing.assert_array_equal(target_of(moved, BATCH, HP, key), target_of(state, BATCH, HP, key))
+    target = jax.jit(learner.update_target)(moved, HP._replace(polyak=0.75)).target
     np.testing.assert_allclose(target.actor["params"]["w"], 0.5)
 
 
@@ -157,66 +165,73 @@ def made(name, **changes):
     return learners.make(name, config, SIZES, "layer_norm"), config
 
 
-@pytest.mark.parametrize("name", ["td3", "dtqc"])
+@pytest.mark.slow  # the soft value is the same way
+@pytest.mark.parametrize("name", ["dtqc", "td3"])
 def test_critics_learn_a_known_value(name):
     """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma) = -5, whatever the action."""
     learner, _ = made(name)
     hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.003)
-    np.testing.assert_allclose(learned_value(learner, hparams), -5.0, atol=0.1)
+    np.testing.assert_allclose(learned_value(learner)(hparams), -5.0, atol=0.1)
 
 
-@pytest.mark.parametrize("name", ["sac", "redq", "tqc"])
+@pytest.mark.parametrize("name", ["sac", *(pytest.param(name, marks=pytest.mark.slow) for name in ("redq", "tqc"))])
 def test_critics_learn_a_known_soft_value(name):
     """The same chain, for a policy that stays as it is: Q = (-1 - gamma alpha E log pi) / (1 - gamma), or -5 without pay."""
     learner, _ = made(name, dropped_quantiles=0)  # the pay is noise to a critic, whose largest quantiles count here, too
     hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.003, actor_lr=0.0, entropy_weight=0.3)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     ones = jnp.ones((20_000, 2))
-    normalized = common.normalize_batch(state, Batch(ones, ones, ones, ones, ones[:, 0]), hparams)
-    inputs = normalized.observation, normalized.desired_goal
-    _, cost = learner.actor.next_action(learner.networks.actor, state.params.actor, *inputs, jax.random.key(3), hparams)
+    obs = {"observation": ones, "desired_goal": ones, "achieved_goal": ones}
+
+    @jax.jit
+    def costs(state, key):
+        inputs = common.normalize_obs(state, obs, hparams)
+        return learner.actor.next_action(learner.networks.actor, state.params.actor, *inputs, key, hparams)[1]
+
+    cost = costs(state, jax.random.key(3))
     expected = (-1.0 - 0.8 * float(cost.mean())) / (1 - 0.8)
     assert expected > -4.8  # the pay is to be seen
-    np.testing.assert_allclose(learned_value(learner, hparams), expected, atol=0.15)
-    np.testing.assert_allclose(learned_value(learner, hparams._replace(entropy_weight=0.0)), -5.0, atol=0.1)
+    learned = learned_value(learner)
+    np.testing.assert_allclose(learned(hparams), expected, atol=0.15)
+    np.testing.assert_allclose(learned(hparams._replace(entropy_weight=0.0)), -5.0, atol=0.1)
 
 
-def learned_value(learner, hparams):
-    state = learner.init(jax.random.key(0))
+def learned_value(learner):
+    """Returns a function of HParams: the value that the critics come to in the chain."""
     ones = jnp.ones((32, 2))
 
     @jax.jit
-    def step(state, key):
-        action = jax.random.uniform(key, (32, 2), minval=-1, maxval=1)
-        state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
-        return learner.update_target(state, hparams), losses
+    def value(hparams):
+        def step(state, key):
+            action = jax.random.uniform(key, (32, 2), minval=-1, maxval=1)
+            state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+            return learner.update_target(state, hparams), losses["q_mean"]
 
-    _, losses = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
-    return losses["q_mean"][-100:].mean()
+        _, values = jax.lax.scan(step, learner.init(jax.random.key(0)), jax.random.split(jax.random.key(1), 1500))
+        return values[-100:].mean()
+
+    return value
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", at_night("sac", "dtqc"))
 def test_the_best_action_of_a_bandit_is_found(name):
     """The reward is -|a - 0.5| / 4 for each number of the action, and the next state is worth the same as all others."""
     learner, _ = made(name)
     hparams = HParams(gamma=0.0, action_l2=0.0, entropy_weight=0.01, critic_lr=0.003, actor_lr=0.003)
-    state, ones = learner.init(jax.random.key(0)), jnp.ones((64, 2))
+    state, ones = jax.jit(learner.init)(jax.random.key(0)), jnp.ones((64, 2))
 
-    @jax.jit
     def step(state, key):
         action = jax.random.uniform(key, (64, 2), minval=-1, maxval=1)
         reward = -jnp.sum(jnp.abs(action - 0.5), axis=-1) / 4
         state, losses = learner.update(state, Batch(ones, ones, ones, action, reward), hparams)
         return learner.update_target(state, hparams), losses
 
-    state, _ = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))
+    state, _ = jax.jit(lambda *args: jax.lax.scan(step, *args))(state, jax.random.split(jax.random.key(1), 1500))
     obs = {"observation": ones[:1], "desired_goal": ones[:1], "achieved_goal": ones[:1]}
-    np.testing.assert_allclose(learner.act(state, obs, hparams)[0], [0.5, 0.5], atol=0.15)
+    np.testing.assert_allclose(jax.jit(learner.act)(state, obs, hparams)[0], [0.5, 0.5], atol=0.15)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in ("td3", "redq", "tqc") else []) for name in NAMES]
-)
+@pytest.mark.parametrize("name", at_night("dtqc"))
 def test_the_point_mass_is_learned_and_a_lane_is_that_run_alone(name):
     learner, config = made(name, policy_delay=2)
     hparams = HParams(gamma=0.9, polyak=0.9, action_l2=0.1, entropy_weight=0.03, noise_std=0.2)
@@ -240,19 +255,22 @@ def test_the_point_mass_is_learned_and_a_lane_is_that_run_alone(name):
     assert isinstance(policy, Policy)
 
 
-def test_delays_move_targets_and_actor_when_they_are_due():
-    """What is called in 12 updates, for delays and periods that divide one another; a learner writes it down."""
-    for delay, period, expected in [
-        (1, 1, "uT uT uT uT uT uT uT uT uT uT uT uT"),
+@pytest.mark.parametrize(
+    ("delay", "period", "expected"),
+    [
         (3, 1, "cT cT uT cT cT uT cT cT uT cT cT uT"),
         (2, 4, "c u c uT c u c uT c u c uT"),
-        (4, 2, "c cT c uT c cT c uT c cT c uT"),
-        (2, 2, "c uT c uT c uT c uT c uT c uT"),
-    ]:
-        config = dataclasses.replace(
-            SMALL, updates_per_cycle=12, cycles_per_epoch=1, target_period=period, policy_delay=delay, num_critics=1
-        )
-        assert calls(config) == expected.split(), (delay, period)
+        pytest.param(1, 1, "uT uT uT uT uT uT uT uT uT uT uT uT", marks=pytest.mark.slow),
+        pytest.param(4, 2, "c cT c uT c cT c uT c cT c uT", marks=pytest.mark.slow),
+        pytest.param(2, 2, "c uT c uT c uT c uT c uT c uT", marks=pytest.mark.slow),
+    ],
+)
+def test_delays_move_targets_and_actor_when_they_are_due(delay, period, expected):
+    """What is called in 12 updates, for delays and periods that divide one another; a learner writes it down."""
+    config = dataclasses.replace(
+        SMALL, updates_per_cycle=12, cycles_per_epoch=1, target_period=period, policy_delay=delay, num_critics=1
+    )
+    assert calls(config) == expected.split()
 
 
 def calls(config):
@@ -292,7 +310,7 @@ def calls(config):
 
     noting = Noting(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
     program = make_train(PointMass(), config, learner=noting)
-    state, _ = jax.jit(program.epoch)(program.init(jax.random.key(0), HParams()))
+    state, _ = jax.jit(program.epoch)(jax.jit(program.init)(jax.random.key(0), HParams()))
     names = {0: "", 1: "u", 2: "c", 11: "uT", 12: "cT"}
     return [names[int(code)] for code in state.learner["log"] if code]
 

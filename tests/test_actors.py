@@ -1,5 +1,7 @@
 """Actors: how they act, explore, and are paid, beside numbers by hand."""
 
+import functools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -44,6 +46,12 @@ def zeros(*shape):
     return jnp.zeros(shape)
 
 
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def draw(params, number, size=2):
+    """Actions of as many states, and their log probabilities."""
+    return actors.draw(Fixed(), params, zeros(number, size), zeros(number, 1), KEY)
+
+
 def test_a_target_s_actions_are_smoothed_within_bounds():
     actions = jnp.tile(jnp.array([[0.0, 0.95]]), (20_000, 1))
     smoothed, cost = Deterministic().next_action(Straight(), {}, actions, zeros(20_000, 1), KEY, HP)
@@ -67,7 +75,7 @@ def test_a_deterministic_actor_s_loss_by_hand():
 
 @pytest.mark.parametrize(("mean", "std"), [(0.0, 1.0), (0.7, 0.3), (-3.0, 2.0)])
 def test_log_probabilities_are_those_of_a_gaussian_under_tanh(mean, std):
-    actions, log_prob = actors.draw(Fixed(), gaussian(mean, std), zeros(500, 2), zeros(500, 1), KEY)
+    actions, log_prob = draw(gaussian(mean, std), 500)
     u = np.arctanh(np.clip(np.asarray(actions, np.float64), -1 + 1e-12, 1 - 1e-12))
     inside = (np.abs(actions) < 0.999).all(-1)  # where float32 still tells actions apart
     expected = (scipy.stats.norm.logpdf(u, mean, std) - np.log1p(-(np.tanh(u) ** 2))).sum(-1)
@@ -81,15 +89,13 @@ def test_the_entropy_is_that_of_the_density():
     density = scipy.stats.norm.pdf(np.arctanh(a), 0.5, 0.8) / (1 - a**2)
     np.testing.assert_allclose(np.trapezoid(density, a), 1.0, atol=1e-3)
     entropy = -np.trapezoid(density * np.log(density + 1e-300), a)
-    _, log_prob = actors.draw(Fixed(), gaussian(0.5, 0.8), zeros(40_000, 1), zeros(40_000, 1), KEY)
+    _, log_prob = draw(gaussian(0.5, 0.8), 40_000, 1)
     assert abs(-float(log_prob.mean()) - entropy) < 4 * float(log_prob.std()) / np.sqrt(40_000)
 
 
 def test_far_out_log_probabilities_stay_finite():
     wide = {"network": {"params": {"mean": jnp.float32(30.0), "log_std": jnp.float32(50.0)}}, "log_alpha": jnp.float32(0)}
-    value, gradient = jax.value_and_grad(
-        lambda params: actors.draw(Fixed(), params, zeros(64, 2), zeros(64, 1), KEY)[1].mean()
-    )(wide)
+    value, gradient = jax.value_and_grad(lambda params: draw(params, 64)[1].mean())(wide)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(gradient))
     assert gradient["network"]["params"]["log_std"] == 0  # beyond its bound
@@ -98,8 +104,8 @@ def test_far_out_log_probabilities_stay_finite():
 def test_a_gaussian_actor_s_target_costs_alpha_log_pi():
     params = gaussian(0.3, 0.5, log_alpha=np.log(4.0))
     action, cost = Gaussian().next_action(Fixed(), params, zeros(16, 2), zeros(16, 1), KEY, HP)
-    drawn, log_prob = actors.draw(Fixed(), params, zeros(16, 2), zeros(16, 1), KEY)
-    np.testing.assert_array_equal(action, drawn)
+    drawn, log_prob = draw(params, 16)
+    np.testing.assert_allclose(action, drawn, rtol=1e-6)
     np.testing.assert_allclose(cost, 0.5 * 4.0 * log_prob, rtol=1e-6)
 
 
@@ -109,7 +115,7 @@ def test_a_gaussian_actor_s_loss_by_hand():
     (loss, metrics), gradient = jax.value_and_grad(
         lambda params: Gaussian().loss(Fixed(), params, *arguments, judge, KEY, HP), has_aux=True
     )(params)
-    action, log_prob = actors.draw(Fixed(), params, *arguments, KEY)
+    action, log_prob = draw(params, 16)
     target = -2.0 * 2  # entropy_target for each of two numbers
     expected = (2.0 * log_prob - 3.0 * action[:, 0]).mean() - np.log(4.0) * (log_prob.mean() + target)
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
