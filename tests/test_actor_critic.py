@@ -231,7 +231,8 @@ def test_the_best_action_of_a_bandit_is_found(name):
     np.testing.assert_allclose(jax.jit(learner.act)(state, obs, hparams)[0], [0.5, 0.5], atol=0.15)
 
 
-@pytest.mark.parametrize("name", at_night("dtqc"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_the_point_mass_is_learned_and_a_lane_is_that_run_alone(name):
     learner, config = made(name, policy_delay=2)
     hparams = HParams(gamma=0.9, polyak=0.9, action_l2=0.1, entropy_weight=0.03, noise_std=0.2)

@@ -74,6 +74,7 @@ print(hits.count("/jax/compilation_cache/cache_hits"))
 """
 
 
+@pytest.mark.slow  # two processes
 def test_a_program_with_native_physics_is_kept_for_the_next_process(tmp_path):
     results = []
     for _ in range(2):

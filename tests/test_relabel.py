@@ -164,8 +164,12 @@ def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
 
 def test_one_step_ahead_is_the_transition(ring):
     """Drawn alike with one step and several: the same transitions and goals; with one, the reward and gamma themselves."""
-    args = ring, jax.random.key(5), (300,), samplers.make("future"), ENV.compute_reward, HP, replay.cumulative_priority(ring)
-    single, several = draw_batches(*args), draw_batches(*args, n_step=4)
+    args = jax.random.key(5), (300,), samplers.make("future"), ENV.compute_reward, HP
+
+    def draw(ring, n_step):
+        return draw_batches(ring, *args, replay.cumulative_priority(ring), n_step)
+
+    single, several = (jax.jit(draw, static_argnums=1)(ring, n_step) for n_step in (1, 4))
     assert single.discount is None
     for name in ("observation", "action", "desired_goal"):
         np.testing.assert_array_equal(getattr(single, name), getattr(several, name))
