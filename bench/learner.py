@@ -55,7 +55,7 @@ def flops(learner: Any, batch_size: int) -> float:
     delay, parts = getattr(learner, "policy_delay", 1), getattr(learner, "critics", None)
     number, size = (1, 1) if parts is None else (parts.number, parts.size)
     judges = number if parts is None or parts.num_judges is None else parts.num_judges
-    heads = 1 if parts is None or learner.actor.has_target else 2
+    heads = 2 if parts is not None and learner.actor.is_gaussian else 1
     actor, critic = hidden + heads * 4 * sizes[-1], hidden + 4 * sizes[1] + size * sizes[-1]
     return 2 * batch_size * (actor * (1 + 3 / delay) + critic * (4 * number + 2 * judges / delay))
 

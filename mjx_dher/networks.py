@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from mjx_dher import names
 from mjx_dher.spec import NETWORKS
-from mjx_dher.types import Array
+from mjx_dher.types import Array, Sizes
 
 
 def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, layer_norm: bool = False) -> Array:
@@ -127,3 +128,22 @@ def check_heads(make_networks: NetworksFn, learner: str) -> None:
             f"learner {learner} needs networks that are a function ({', '.join(_PARAMETERS)}, heads), with the outputs that"
             f" networks.Heads says; these are {make_networks!r}"
         ) from None
+
+
+def check_outputs(learner: str, networks: Networks, sizes: Sizes, heads: Heads = PLAIN) -> None:
+    """Refuses networks whose outputs have other shapes than `heads` says.
+
+    Raises:
+      ValueError: names the network, the shapes and what it gives.
+    """
+    key, (obs, goal, action) = jax.random.key(0), (jax.ShapeDtypeStruct((2, size), jnp.float32) for size in sizes)
+    numbers: Any = (2, sizes.action)
+    for part, inputs, expected in (
+        ("actor", (obs, goal), (numbers, numbers) if heads.gaussian else numbers),
+        ("critic", (obs, goal, action), (2,) if heads.critic_size is None else (2, heads.critic_size)),
+    ):
+        output = jax.eval_shape(getattr(networks, part).init_with_output, key, *inputs)[0]
+        if jax.tree.map(lambda x: getattr(x, "shape", None), output) != expected:
+            raise ValueError(
+                f"networks: for learner {learner} the {part} must give {list(expected)} for a batch of 2; it gives {output}"
+            )

@@ -1,15 +1,16 @@
-"""Environments whose answers are known, and another program's lock."""
+"""Environments whose answers are known, a network and a batch that are followed by hand, and another program's lock."""
 
 from __future__ import annotations
 
 import contextlib
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from filelock import FileLock
 from flax import struct
 
-from mjx_dher.types import Array
+from mjx_dher.types import Array, Batch
 from point_mass import PointMass, PointState
 
 
@@ -65,3 +66,20 @@ class Explodes(PointMass):
             failed = state.failed
             obs = obs | {"observation": jnp.where(step == 3, self.value, obs["observation"])}
         return ExplodingState(obs, following.reward, following.success, step, failed)
+
+
+class LinearActor(nn.Module):
+    """tanh(w * observation): one number in, one out."""
+
+    @nn.compact
+    def __call__(self, observation, goal):
+        return jnp.tanh(self.param("w", nn.initializers.constant(1.0), ()) * observation)
+
+
+BATCH = Batch(
+    observation=jnp.array([[1.0], [0.0]]),
+    next_observation=jnp.array([[0.0], [2.0]]),
+    desired_goal=jnp.array([[-1.0], [-4.0]]),
+    action=jnp.array([[1.0], [-1.0]]),
+    reward=jnp.array([-1.0, 0.0]),
+)

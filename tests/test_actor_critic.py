@@ -17,6 +17,7 @@ from mjx_dher.networks import Networks
 from mjx_dher.policy import Policy
 from mjx_dher.types import Batch, Sizes
 from point_mass import PointMass
+from probes import BATCH, LinearActor
 
 NAMES = ("td3", "sac", "redq", "tqc", "dtqc")
 
@@ -44,14 +45,6 @@ SMALL = Config(
 HP = HParams(gamma=0.5, action_l2=0.0, target_noise=0.0, entropy_weight=0.25)
 
 
-class LinearActor(nn.Module):
-    """tanh(w * observation): one number in, one out."""
-
-    @nn.compact
-    def __call__(self, observation, goal):
-        return jnp.tanh(self.param("w", nn.initializers.constant(1.0), ()) * observation)
-
-
 class Moments(nn.Module):
     """Mean w * observation, standard deviation 1/2."""
 
@@ -73,13 +66,6 @@ class LinearCritic(nn.Module):
         return value + abcd[3] * jnp.arange(self.size)
 
 
-BATCH = Batch(
-    observation=jnp.array([[1.0], [0.0]]),
-    next_observation=jnp.array([[0.0], [2.0]]),
-    desired_goal=jnp.array([[-1.0], [-4.0]]),
-    action=jnp.array([[1.0], [-1.0]]),
-    reward=jnp.array([-1.0, 0.0]),
-)
 Q = np.array([-0.25, -2 + 0.5 * np.tanh(2)])  # of the next states, where the policy is tanh: see test_ddpg.py
 
 

@@ -11,16 +11,9 @@ from mjx_dher.learners.common import Params
 from mjx_dher.learners.ddpg import DDPG
 from mjx_dher.networks import Actor, Critic, Networks, mlp
 from mjx_dher.types import Batch, Sizes
+from probes import BATCH, LinearActor
 
 HP = HParams(gamma=0.5, action_l2=0.25)
-
-
-class LinearActor(nn.Module):
-    """tanh(w * observation): one number in, one out."""
-
-    @nn.compact
-    def __call__(self, observation, goal):
-        return jnp.tanh(self.param("w", nn.initializers.constant(1.0), ()) * observation)
 
 
 class LinearCritic(nn.Module):
@@ -40,15 +33,6 @@ update = jax.jit(LEARNER.update)
 @pytest.fixture
 def state():
     return LEARNER.init(jax.random.key(0))
-
-
-BATCH = Batch(
-    observation=jnp.array([[1.0], [0.0]]),
-    next_observation=jnp.array([[0.0], [2.0]]),
-    desired_goal=jnp.array([[-1.0], [-4.0]]),
-    action=jnp.array([[1.0], [-1.0]]),
-    reward=jnp.array([-1.0, 0.0]),
-)
 
 
 def test_target_value_by_hand(state):

@@ -11,7 +11,7 @@ import pytest
 from mjx_dher import envs
 from mjx_dher.envs import engines
 from mjx_dher.envs.engines import warp_substep
-from mjx_dher.envs.engines.base import with_stand_ins
+from mjx_dher.envs.engines.base import last_below, with_stand_ins
 from mjx_dher.envs.engines.warp import capacities, mujoco_warp, wp
 
 
@@ -161,7 +161,7 @@ def test_bodies_below_one_another_are_neighbours():
     body = "<body>{}</body>".format
     tree = body(body(body("")) + body(body(""))) + body("")
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{tree}</worldbody></mujoco>")
-    assert warp_substep.last_below(model).tolist() == [6, 5, 3, 3, 5, 5, 6]
+    assert last_below(model).tolist() == [6, 5, 3, 3, 5, 5, 6]
 
 
 @pytest.mark.parametrize(("memory", "kind"), [({"contacts": 1}, "narrowphase"), ({"constraints": 8}, "nefc")])

@@ -21,6 +21,15 @@ class Physics:
     warmstart: Array  # [nv] initial guess of the constraint solver (qacc_warmstart)
 
 
+def last_below(model: mujoco.MjModel) -> np.ndarray:
+    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
+    last = np.arange(model.nbody, dtype=np.int32)
+    for body in range(model.nbody - 1, 0, -1):
+        parent = model.body_parentid[body]
+        last[parent] = max(last[parent], last[body])
+    return last
+
+
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
     """Returns a copy of the model in which a geom called NAME_stand_in replaces one geom of each cylinder-box contact pair.
 

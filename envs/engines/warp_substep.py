@@ -18,6 +18,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_dher.envs.engines.base import last_below
 from mjx_dher.host import private_api
 from mjx_dher.host.warp_setup import wp
 
@@ -91,15 +92,6 @@ def _springs(model: mujoco.MjModel) -> tuple[Any, Any, Any]:
     stiffness[dofs], index[dofs] = model.jnt_stiffness[joints], model.jnt_qposadr[joints]
     rest[dofs] = model.qpos_spring[index[dofs]]
     return wp.array(stiffness, dtype=float), wp.array(index, dtype=int), wp.array(rest, dtype=float)
-
-
-def last_below(model: mujoco.MjModel) -> np.ndarray:
-    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
-    last = np.arange(model.nbody, dtype=np.int32)
-    for body in range(model.nbody - 1, 0, -1):
-        parent = model.body_parentid[body]
-        last[parent] = max(last[parent], last[body])
-    return last
 
 
 def _constraints(m: Any, d: Any, last: Any) -> None:

@@ -10,7 +10,7 @@ The bounds are those of returns whose rewards lie in [-1, 0], for entropy's pay,
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from mjx_dher.learners import common, critics
 from mjx_dher.learners.actors import ActorKind
 from mjx_dher.learners.common import Params
 from mjx_dher.learners.critics import Critics
-from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads
+from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, check_outputs
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
@@ -179,23 +179,9 @@ def make(name: str, config: Config, sizes: Sizes, networks: NetworksFn, actor: A
     if config.learner_kernels == "hopper":
         raise ValueError(f"learner_kernels hopper computes learner ddpg; it is {name}")
     check_heads(networks, name)
-    heads = Heads(gaussian=not actor.has_target, critic_size=parts.size)
+    heads = Heads(gaussian=actor.is_gaussian, critic_size=parts.size)
     playing, learning = (
         networks(sizes.action, config.hidden_sizes, dtype, heads) for dtype in ("float32", config.learner_dtype)
     )
-    _check_outputs(name, playing, sizes, heads)
+    check_outputs(name, playing, sizes, heads)
     return ActorCritic(sizes, playing, learning, actor, parts, config.policy_delay)
-
-
-def _check_outputs(name: str, networks: Networks, sizes: Sizes, heads: Heads) -> None:
-    key, (obs, goal, action) = jax.random.key(0), (jax.ShapeDtypeStruct((2, size), jnp.float32) for size in sizes)
-    shape: Any = (2, sizes.action)
-    for part, inputs, expected in (
-        ("actor", (obs, goal), (shape, shape) if heads.gaussian else shape),
-        ("critic", (obs, goal, action), (2, heads.critic_size)),
-    ):
-        output = jax.eval_shape(getattr(networks, part).init_with_output, key, *inputs)[0]
-        if jax.tree.map(lambda x: x.shape, output) != expected:
-            raise ValueError(
-                f"networks: for learner {name} the {part} must give {expected} for a batch of 2; it gives {output}"
-            )

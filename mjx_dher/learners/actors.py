@@ -26,6 +26,9 @@ class ActorKind(Protocol):
     """What a learner asks of its actor, whose module is `network` and whose parameters are `params`."""
 
     @property
+    def is_gaussian(self) -> bool: ...  # whether its network gives moments: `networks.Heads.gaussian`
+
+    @property
     def has_target(self) -> bool: ...  # whether the critics' targets take their actions from a slower copy of it
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
@@ -58,6 +61,7 @@ class ActorKind(Protocol):
 class Deterministic:
     """A deterministic actor: it explores under noise, and a target's actions are smoothed by clipped noise (TD3)."""
 
+    is_gaussian: bool = False
     has_target: bool = True
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
@@ -106,6 +110,7 @@ class Gaussian:
     that the mean of log pi becomes -`entropy_target` A.
     """
 
+    is_gaussian: bool = True
     has_target: bool = False
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:

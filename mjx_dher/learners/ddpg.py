@@ -15,7 +15,7 @@ from mjx_dher import normalizer
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
 from mjx_dher.learners.common import Losses, Params
-from mjx_dher.networks import Actor, Critic, Networks, NetworksFn
+from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, check_outputs
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
@@ -151,16 +151,8 @@ def make(config: Config, sizes: Sizes, networks: NetworksFn) -> DDPG:
       ValueError: kernels that cannot compute this run's gradients, or networks that give the wrong shapes.
     """
     playing, learning = (networks(sizes.action, config.hidden_sizes, dtype) for dtype in ("float32", config.learner_dtype))
-    _check_networks(playing, sizes)
+    check_outputs("ddpg", playing, sizes)
     return DDPG(sizes, playing, learning, _choose_gradients(config, sizes, playing))
-
-
-def _check_networks(networks: Networks, sizes: Sizes) -> None:
-    key, (obs, goal, action) = jax.random.key(0), (jax.ShapeDtypeStruct((2, size), jnp.float32) for size in sizes)
-    for name, inputs, shape in (("actor", (obs, goal), (2, sizes.action)), ("critic", (obs, goal, action), (2,))):
-        output = jax.eval_shape(getattr(networks, name).init_with_output, key, *inputs)[0]
-        if getattr(output, "shape", None) != shape:
-            raise ValueError(f"networks: the {name} must give {list(shape)} for a batch of 2; it gives {output}")
 
 
 def _choose_gradients(config: Config, sizes: Sizes, networks: Networks) -> GradientFn:

@@ -5,6 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjx_dher.envs.engines.base import last_below
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
 from mjx_dher.host.warp_setup import wp
@@ -36,15 +37,6 @@ def _array(value: Any, dtype: Any) -> Any:
     if dtype not in (int, float, wp.int32, wp.float32):
         rows = rows.reshape(-1, *dtype._shape_)
     return wp.array(rows, dtype=dtype)
-
-
-def last_below(model: mujoco.MjModel) -> np.ndarray:
-    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
-    last = np.arange(model.nbody, dtype=np.int32)
-    for body in range(model.nbody - 1, 0, -1):
-        parent = model.body_parentid[body]
-        last[parent] = max(last[parent], last[body])
-    return last
 
 
 def _matrices(quats: np.ndarray) -> np.ndarray:
