@@ -36,7 +36,7 @@ ARGUMENTS = [
     ({"num_threads": 10**9}, "num_threads must lie in [1, 4096]; got 1000000000"),
     ({"engine": "jax", "iterations": 0}, "iterations must lie in [1, 1000000]; got 0"),
     ({"engine": "jax", "ls_iterations": 2.5}, "ls_iterations must be an integer in [1, 1000000]; got 2.5"),
-    ({"engine": "warp", "allow_cpu": True, "contacts": 0}, "contacts must lie in [1, 1000000]; got 0"),
+    ({"engine": "warp", "allow_cpu": True, "constraints": 0}, "constraints must lie in [1, 1000000]; got 0"),
     ({"engine": "warp", "allow_cpu": True, "iterations": -1}, "iterations must lie in [1, 1000000]; got -1"),
 ]
 

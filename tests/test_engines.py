@@ -10,7 +10,7 @@ import pytest
 from conftest import load_recorded
 
 from mjx_dher import envs
-from mjx_dher.envs.engines.base import with_stand_ins
+from mjx_dher.envs.engines.mjx import with_stand_ins
 
 ENGINES = ("native", "jax")
 RECORDED = ("push", "pick_and_place", "slide")

@@ -1,4 +1,4 @@
-"""The fused kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
+"""The kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
 
 import jax
 import jax.numpy as jnp
@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from mjx_dher import envs
+from mjx_dher.envs import engines
 from mjx_dher.envs.engines.base import Physics
-from mjx_dher.envs.engines.fused import kernel, setup
+from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
-from mjx_dher.envs.engines.fused.simulation import FusedSimulation, unsupported
+from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps, unsupported
 from mjx_dher.host.warp_setup import wp
 
 TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
@@ -22,7 +23,16 @@ NUM = 48  # environments
 @pytest.fixture(scope="module", autouse=True)
 def quick_compiler():
     """A third of the time, and code that is slower but computes the same."""
-    kernel.make(0, 1, 15).module.options["optimization_level"] = 0
+    make = kernel.make
+
+    def quick(*args):
+        kernel_ = make(*args)
+        kernel_.module.options["optimization_level"] = 0
+        return kernel_
+
+    kernel.make = quick
+    yield
+    kernel.make = make
 
 
 def floats(x):
@@ -67,7 +77,7 @@ def test_a_timestep_is_mujoco_c_s(task):
     model = envs.make(task, engine="native").model
     model.opt.tolerance, (qpos, qvel, inputs) = 1e-12, touching(model)
     there = in_c(model, qpos, qvel, inputs)
-    simulation = FusedSimulation(model, NUM, substeps=1)
+    simulation = Simulation(model, NUM, substeps=1)
     result = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]
     simulation.advance((floats(qpos), floats(qvel), floats(np.zeros((NUM, model.nv)))), floats(inputs), tuple(result))
     here = [x.numpy() for x in result]
@@ -197,14 +207,36 @@ def test_what_the_kernel_leaves_out_is_named(model, what):
     assert found == [] if what is None else any(name.startswith(what) for name in found), found
 
 
-def test_its_contacts_cannot_be_set():
-    with pytest.raises(ValueError, match="contacts cannot be set with fused=True"):
-        envs.make("push", engine="warp", fused=True, allow_cpu=True, contacts=8)
+def test_such_a_model_is_refused():
+    model = mujoco.MjModel.from_xml_string(WELDED.format("", "sphere", 3))
+    with pytest.raises(ValueError, match=r"engine warp leaves out .*boxes and planes; use engine native"):
+        engines.make_engine("warp", model, 20, allow_cpu=True)
+
+
+def test_most_rows_are_what_all_pairs_can_give_at_once():
+    """slide: two fingers on the puck 5 contacts each of 6 rows, both on a plane 4 and the puck on the table 5 and on the
+    floor 4 of 4 rows; the weld 6 rows, and each finger's limits 1 at a time."""
+    assert most_rows(envs.make("slide", engine="native").model) == 6 + 2 + 2 * 5 * 6 + (4 + 4 + 5 + 4) * 4
+
+
+def test_a_block_has_as_many_warps_as_its_memory_has_room_for():
+    """A warp has two environments of 3,000 floats: 24,000 bytes."""
+    assert [most_warps(3000, shared) for shared in (24_000, 101_376, 232_448)] == [1, 4, simulation.WARPS]
+    with pytest.raises(ValueError, match="needs 24,000 bytes of a GPU's shared memory and has 23,999; fewer constraints"):
+        most_warps(3000, 23_999)
+
+
+def test_bodies_below_one_another_are_neighbours():
+    """1 has 2 and 4 below it, 2 has 3, 4 has 5."""
+    body = "<body>{}</body>".format
+    tree = body(body(body("")) + body(body(""))) + body("")
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{tree}</worldbody></mujoco>")
+    assert setup.bodies_of(model).last.numpy().tolist() == [6, 5, 3, 3, 5, 5, 6]
 
 
 def test_contacts_that_there_is_no_room_for_are_told():
     """Slide's puck, between the fingers or in the table, needs more than 12 rows, 6 of them the weld's."""
-    made = envs.make("slide", engine="warp", fused=True, allow_cpu=True, constraints=12)
+    made = envs.make("slide", engine="warp", allow_cpu=True, constraints=12)
     model = envs.make("slide", engine="native").model
     (qpos, qvel, inputs), engine = touching(model), made.engine
     physics = Physics(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros_like(qvel))))
@@ -217,9 +249,7 @@ def test_contacts_that_there_is_no_room_for_are_told():
 
 def test_the_engine_follows_native():
     """Thirty random steps of Slide: pucks are dragged and fall; under vmap, from a jitted scan."""
-    native, fused = (
-        envs.make("slide", engine=e, **o) for e, o in (("native", {}), ("warp", {"fused": True, "allow_cpu": True}))
-    )
+    native, warp = (envs.make("slide", engine=e, **o) for e, o in (("native", {}), ("warp", {"allow_cpu": True})))
     keys = jax.random.split(jax.random.key(0), 8)
     actions = jax.random.uniform(jax.random.key(1), (30, 8, 4), minval=-1)
     states = jax.jit(jax.vmap(native.reset))(keys)
@@ -231,9 +261,9 @@ def test_the_engine_follows_native():
 
         return jax.jit(lambda s: jax.lax.scan(step, s, actions)[1])(states)
 
-    (there, _), (here, failed) = play(native), play(fused)
+    (there, _), (here, failed) = play(native), play(warp)
     assert not failed.any()
     error = np.abs(here - there)[-1]
     assert error[:, :3].max() < 2e-3  # grip, m
     assert np.median(error[:, 3:6].max(axis=1)) < 1e-3  # puck, m
-    fused.check()
+    warp.check()

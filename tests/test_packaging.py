@@ -14,7 +14,7 @@ LAYERS = [
     "types names stats cli.output host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
     "config normalizer replay rollout host.caches host.warp_setup envs.base envs.kinematics envs.engines.base",
     "envs.engines.host_call",
-    "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx envs.engines.warp_substep tools.render",
+    "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
     "presets networks priorities samplers runs.identity runs.health testing.env",
     "envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
     "envs.engines.fused.memory envs.engines.fused.kinematics envs.engines.fused.contacts envs.engines.fused.linear",

@@ -39,12 +39,11 @@ def test_every_function_says_why_and_since_when():
     functions = [
         f for _, f in inspect.getmembers(private_api, callable) if getattr(f, "__module__", "") == private_api.__name__
     ]
-    assert len(functions) == 10
+    assert len(functions) == 5
     for function in functions:
-        if function is not private_api.mujoco_warp_kernels_to_move:
-            doc = inspect.getdoc(function)
-            assert re.search(r"\nPrivate: .*\nWhy: .*\nNeeded by: (mujoco-mjx|warp-lang|orbax-checkpoint) \d", doc, re.DOTALL)
-            assert "https://github.com/" in doc or "No upstream issue known" in doc
+        doc = inspect.getdoc(function)
+        assert re.search(r"\nPrivate: .*\nWhy: .*\nNeeded by: (mujoco-mjx|warp-lang|orbax-checkpoint) \d", doc, re.DOTALL)
+        assert "https://github.com/" in doc or "No upstream issue known" in doc
 
 
 def chain(length):
@@ -104,58 +103,16 @@ def test_mjx_still_drops_the_velocity_term_of_a_weld():
 def test_mjx_still_brings_a_mujoco_warp_of_its_own():
     required = importlib.metadata.requires("mujoco-mjx") or []
     assert not any(re.match(r"mujoco[-_]warp\b", line) for line in required), no_longer_needed(
-        "MJX depends on the package mujoco-warp", "mujoco_warp"
+        "MJX depends on the package mujoco-warp", "mujoco_warp_shapes, which that package has"
     )
 
 
-def test_vec10_is_still_private():
-    library = private_api.mujoco_warp()
-    assert not hasattr(library, "vec10"), no_longer_needed("MuJoCo Warp exports vec10", "vec10")
-    d = library.make_data(chain(1))
-    assert d.cinert.dtype is d.crb.dtype is private_api.vec10()
-
-
-def test_mujoco_warp_still_keeps_its_kernels_in_large_modules():
-    """Those in use are less than a third; moved ones are counted, too."""
-    moved = private_api.mujoco_warp_kernels_to_move()
-    total = sum(len([x for x in vars(module).values() if isinstance(x, wp.Kernel)]) for module in moved)
-    used = sum(map(len, moved.values()))
-    what = "most kernels in MuJoCo Warp's modules are used"
-    assert used < total / 2, no_longer_needed(what, "move_mujoco_warp_kernels")
-    private_api.move_mujoco_warp_kernels()
-    for module, names in moved.items():
-        new = {getattr(module, name).module.name for name in names}
-        assert new == {f"{private_api.__name__}.{module.__name__.rpartition('.')[2]}"}
-
-
-def test_the_parts_of_mujoco_warp_s_step_are_still_private():
-    library, parts = private_api.mujoco_warp(), vars(private_api.mujoco_warp_parts())
-    public = {id(x): name for name, x in vars(library).items() if not name.startswith("_")}
-    exported = [public[id(part)] for part in parts.values() if id(part) in public]
-    assert not exported, no_longer_needed(f"MuJoCo Warp exports {exported}", "mujoco_warp_parts' fields of these names")
-
-
 def test_the_shapes_of_mujoco_warp_are_still_private():
-    library, shapes = private_api.mujoco_warp(), vars(private_api.mujoco_warp_shapes())
+    shapes = vars(private_api.mujoco_warp_shapes())
+    from mujoco.mjx.third_party import mujoco_warp as library
+
     exported = [name for name in shapes if hasattr(library, name)]
     assert not exported, no_longer_needed(f"MuJoCo Warp exports {exported}", "mujoco_warp_shapes' fields of these names")
-
-
-@pytest.mark.slow
-def test_mujoco_warp_still_computes_constraints_before_velocities():
-    """So that a step depends on the velocities of bodies that its memory holds from before."""
-    library, model = private_api.mujoco_warp(), mujoco.MjModel.from_xml_string(WELDED)
-    stepped = []
-    for left_over in (0.0, 1.0):
-        m, d = library.put_model(model), library.make_data(model)
-        d.qvel = wp.array([[1.0, 2.0]], dtype=float)
-        d.cvel.fill_(left_over)
-        d.cdof_dot.fill_(left_over)
-        library.step(m, d)
-        stepped.append(d.qvel.numpy())
-    what = "MuJoCo Warp's step computes velocities before constraints, or takes them anew"
-    changed = np.abs(stepped[0] - stepped[1]).max()
-    assert changed > 1e-4, f"no longer needed: {what}; delete warp_substep._library_substep in favour of mujoco_warp.step"
 
 
 def test_warp_still_writes_the_number_of_a_trace_into_the_program():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 
 import jax
@@ -11,13 +12,38 @@ import mujoco
 import numpy as np
 
 from mjx_dher.config import check_count
-from mjx_dher.envs.engines.base import Physics, with_stand_ins
+from mjx_dher.envs.engines.base import Physics
 from mjx_dher.envs.kinematics import quat_multiply
 from mjx_dher.host import private_api
 from mjx_dher.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx
+
+
+def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Returns a copy of the model in which a geom called NAME_stand_in replaces one geom of each cylinder-box contact pair.
+
+    It replaces the box NAME if the box has a stand-in, else the cylinder NAME. Some engines have no cylinder-box contacts, or
+    inaccurate ones.
+
+    Raises:
+      ValueError: neither geom of a pair has a stand-in.
+    """
+    model = copy.copy(model)
+    cylinder, box = (int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("CYLINDER", "BOX"))
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    for ends, others in ((model.pair_geom1, model.pair_geom2), (model.pair_geom2, model.pair_geom1)):
+        for pair in np.flatnonzero((model.geom_type[ends] == cylinder) & (model.geom_type[others] == box)):
+            for side in (others, ends):
+                stand_in = f"{names[side[pair]]}_stand_in"
+                if stand_in in names:
+                    side[pair] = names.index(stand_in)
+                    break
+            else:
+                both = f"{names[ends[pair]]!r}, a cylinder, and {names[others[pair]]!r}, a box,"
+                raise ValueError(f"geoms {both} meet; one of them needs another to stand in for it, called NAME_stand_in")
+    return model
 
 
 class _Weld:

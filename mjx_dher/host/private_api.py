@@ -6,18 +6,20 @@ fails, naming the function to delete, once a newer version does without. The lib
 Two dependencies on internals stay where they are used, because they are not names of Python:
 
 - `trainer.compile_lowered` disables the pass triton-softmax-rewriter of XLA (jaxlib 0.10.2; no upstream issue known).
-- hopper/kernels.cu uses `wp::array_t` and `dynamic_smem_base` of Warp's C++ code, and numbers lanes in the order in which Warp
-  flattens the axes of `jax.vmap` (warp-lang 1.18.0; no upstream issue known).
+- envs/engines/fused/lanes.py and hopper/kernels.cu use `wp::array_t` and `dynamic_smem_base` of Warp's C++ code, and the latter
+  numbers lanes in the order in which Warp flattens the axes of `jax.vmap` (warp-lang 1.18.0; no upstream issue known).
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import io
+import importlib
 import logging
+import os
+import sys
 from collections.abc import Iterator
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 
@@ -59,106 +61,30 @@ def shift_reference_acceleration(data: Any, shift: Any) -> Any:
 
 
 @functools.cache
-def mujoco_warp() -> Any:
-    """Returns MuJoCo Warp as MJX brings it.
-
-    Private: `mujoco.mjx.third_party`.
-    Why: MJX works with this version, whereas the separate package mujoco-warp need not match MuJoCo's.
-    Needed by: mujoco-mjx 3.17.0, which does not depend on mujoco-warp. No upstream issue known.
-    """
-    with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line while it looks for Warp
-        from mujoco.mjx.third_party import mujoco_warp
-    return mujoco_warp
-
-
-def vec10() -> Any:
-    """Returns the Warp type of a body's inertia about its tree's centre of mass.
-
-    Private: `mujoco_warp._src.types.vec10`.
-    Why: kernels that read or write `Data.cinert` and `Data.crb` must declare it.
-    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
-    """
-    from mujoco.mjx.third_party.mujoco_warp._src import types
-
-    return types.vec10
-
-
-@functools.cache
 def mujoco_warp_shapes() -> SimpleNamespace:
     """Returns the functions of MuJoCo Warp's kernels that find the contacts of two shapes.
 
-    Private: both, in `mujoco_warp._src.collision_primitive_core`.
-    Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows.
+    Private: both, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be imported
+      without what the packages around it import.
+    Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows. To import
+      the packages takes 3.4 s, the module alone 0.3 s.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
-    from mujoco.mjx.third_party.mujoco_warp._src import collision_primitive_core as core
+    import mujoco
 
+    names = ["mjx", "mjx.third_party", "mjx.third_party.mujoco_warp", "mjx.third_party.mujoco_warp._src"]
+    packages = {f"mujoco.{name}": os.path.join(mujoco.__path__[0], *name.split(".")) for name in names}
+    bare = {} if "mujoco.mjx" in sys.modules else packages
+    for name, folder in bare.items():
+        sys.modules[name] = ModuleType(name)
+        sys.modules[name].__path__ = [folder]
+    try:
+        core = importlib.import_module(f"{[*packages][-1]}.collision_primitive_core")
+    finally:
+        if bare:  # so that others import the packages whole
+            for name in [name for name in sys.modules if f"{name}.".startswith("mujoco.mjx.")]:
+                del sys.modules[name]
     return SimpleNamespace(box_box=core.box_box, plane_cylinder=core.plane_cylinder)
-
-
-@functools.cache
-def move_mujoco_warp_kernels() -> None:
-    """Moves the kernels of MuJoCo Warp that `warp_substep` launches into modules of their own.
-
-    The move is global: every other user of MJX's MuJoCo Warp in this process launches the moved kernels, too. They compute the
-    same; kernels that are not listed stay where they are.
-
-    Private: the kernels below, `Kernel.func`, `Kernel.options` and `Module.options`.
-    Why: Warp compiles a module whole, and the kernels below are less than a third of theirs.
-    Needed by: mujoco-mjx 3.17.0 with warp-lang 1.18.0.
-      https://github.com/google-deepmind/mujoco_warp/pull/682 (open) would give costly kernels modules of their own.
-    """
-    import warp as wp
-
-    for source, names in mujoco_warp_kernels_to_move().items():
-        target = f"{__name__}.{source.__name__.rpartition('.')[2]}"
-        for name in names:
-            kernel = getattr(source, name)
-            wp.get_module(target).options.update(kernel.module.options)
-            setattr(source, name, wp.kernel(kernel.func, module=target, **kernel.options))
-
-
-def mujoco_warp_kernels_to_move() -> dict[Any, list[str]]:
-    """Returns the names of the kernels that `move_mujoco_warp_kernels` moves, by the Python module that holds them."""
-    from mujoco.mjx.third_party.mujoco_warp._src import forward, smooth, solver
-
-    names = {
-        forward: "_actuator_force _actuator_velocity _next_activation _next_position _next_velocity _qfrc_actuator"
-        " _qfrc_actuator_gravcomp_limits",
-        smooth: "_M _cacc_branch _cacc_world _cdof _cfrc _cinert _compute_body_inertial_frames _compute_body_matrices"
-        " _comvel_branch _comvel_root _geom_local_to_global _kinematics_branch _site_local_to_global _transmission",
-        solver: "_inertia_scale _qfrc_constraint_from_grad _solve_init_efc _update_gradient_h_incremental"
-        " _zero_change_counters",
-    }
-    return {module: listed.split() for module, listed in names.items()}
-
-
-@functools.cache
-def mujoco_warp_parts() -> SimpleNamespace:
-    """Returns the kernels and functions inside MuJoCo Warp's step that `warp_substep` composes anew; moves kernels first.
-
-    Private: all of them, in `mujoco_warp._src.forward` and `mujoco_warp._src.smooth`.
-    Why: MuJoCo Warp's step launches more than twice as many kernels as these models need, and computes constraints before the
-      velocities that a weld's reference acceleration depends on.
-    Needed by: mujoco-mjx 3.17.0. No upstream issue known; the order matters since
-      https://github.com/google-deepmind/mujoco_warp/pull/1294.
-    """
-    from mujoco.mjx.third_party.mujoco_warp._src import forward, smooth
-
-    move_mujoco_warp_kernels()
-    return SimpleNamespace(
-        # kernels
-        actuator_velocity=forward._actuator_velocity,
-        cdof=smooth._cdof,
-        cinert=smooth._cinert,
-        mass=smooth._M,
-        # functions
-        advance=forward._advance,
-        factor_solve=smooth.factor_solve_i,
-        rne_cacc_forward=smooth._rne_cacc_forward,
-        rne_cacc_world=smooth._rne_cacc_world,
-        rne_cfrc=smooth._rne_cfrc,
-    )
 
 
 def reset_call_id(callable_: Any) -> None:

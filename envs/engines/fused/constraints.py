@@ -14,6 +14,19 @@ _MOST = wp.constant(6)  # edges of a pyramid of condim 4, which has most
 _TINY = wp.constant(1e-15)  # MuJoCo's smallest number
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    struct Once { static __device__ __noinline__ float power(float x, float y) { return powf(x, y); } };
+    return Once::power(x, exponent);
+#else
+    return powf(x, exponent);
+#endif
+""")
+def _to_the(x: float, exponent: float) -> float:
+    """Returns a power; its code is there once, because a GPU waits for instructions that do not fit into its cache."""
+    ...
+
+
 @wp.func
 def _impedance(soft: Softness, depth: float) -> float:
     """Returns how much of a constraint is enforced, between 0 and 1, at a distance from where it begins."""
@@ -30,9 +43,9 @@ def _impedance(soft: Softness, depth: float) -> float:
         y = wp.where(x <= middle, x * x / middle, 1.0 - (1.0 - x) * (1.0 - x) / (1.0 - middle))
     elif power > 1.0:
         if x <= middle:
-            y = wp.pow(x, power) / wp.pow(middle, power - 1.0)
+            y = _to_the(x, power) / _to_the(middle, power - 1.0)
         else:
-            y = 1.0 - wp.pow(1.0 - x, power) / wp.pow(1.0 - middle, power - 1.0)
+            y = 1.0 - _to_the(1.0 - x, power) / _to_the(1.0 - middle, power - 1.0)
     return least + y * (most - least)
 
 

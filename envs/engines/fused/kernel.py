@@ -6,7 +6,7 @@ from typing import Any
 from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide
 from mjx_dher.envs.engines.fused.kinematics import integrate, move, place, push, strain, turn, weigh
-from mjx_dher.envs.engines.fused.lanes import sync
+from mjx_dher.envs.engines.fused.lanes import gather, sync
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, World
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
@@ -14,8 +14,15 @@ from mjx_dher.host.warp_setup import wp
 
 
 @functools.cache
-def make(shared: int, count: int, nv: int) -> Any:
-    """Returns the kernel for `count` lanes and `nv` degrees of freedom, with so many floats of shared memory; 0 on a CPU."""
+def make(floats: int, lanes_of_one: int, warps: int, nv: int) -> Any:
+    """Returns the kernel for `nv` degrees of freedom.
+
+    Args:
+      floats: memory of an environment.
+      lanes_of_one: threads that share an environment.
+      warps: of 32 threads in a block; 0 on a CPU.
+    """
+    shared = warps * (32 // lanes_of_one) * floats
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -41,7 +48,7 @@ def make(shared: int, count: int, nv: int) -> Any:
         the controls. `lost` [1] counts contacts that there is no room for.
         """
         env, lane = wp.tid()  # type: ignore[misc]
-        lanes = wp.static(count)  # so that the compiler knows them
+        lanes = wp.static(lanes_of_one)  # so that the compiler knows them
         size = wp.static(nv)
         if wp.static(shared > 0):
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
@@ -52,20 +59,35 @@ def make(shared: int, count: int, nv: int) -> Any:
         sync(lanes)
         given = inputs[env]
         for _substep in range(substeps):
+            gather(wp.static(warps))
             place(bodies, memory, given, lane, lanes)
+            gather(wp.static(warps))
             move(bodies, memory, lane, lanes)
+            gather(wp.static(warps))
             turn(bodies, memory, lane, lanes)
+            gather(wp.static(warps))
             strain(world, bodies, dofs, memory, lane, lanes)
+            gather(wp.static(warps))
             push(bodies, dofs, memory, given, lane, lanes)
+            gather(wp.static(warps))
             weigh(bodies, dofs, memory, lane, lanes)
+            gather(wp.static(warps))
             collide(contacts, memory, lane, lanes)
+            gather(wp.static(warps))
             number(world, dofs, contacts, memory, lost, lane, lanes)
+            gather(wp.static(warps))
             weld(world, bodies, dofs, memory, lane, lanes)
+            gather(wp.static(warps))
             limit(dofs, contacts, memory, lane, lanes)
+            gather(wp.static(warps))
             touch(bodies, dofs, contacts, memory, lane, lanes)
+            gather(wp.static(warps))
             press(dofs, contacts, memory, lane, lanes)
+            gather(wp.static(warps))
             solve(world, memory, size, lane, lanes)
+            gather(wp.static(warps))
             accelerate(world, dofs, memory, size, lane, lanes)
+            gather(wp.static(warps))
             integrate(world, bodies, memory, lane, lanes)
         copy(memory.qpos, qpos[env], lane, lanes)
         copy(memory.qvel, qvel[env], lane, lanes)

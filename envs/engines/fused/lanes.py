@@ -21,6 +21,20 @@ def sync(lanes: int):  # type: ignore[no-untyped-def]
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    if (warps > 1) __syncthreads();
+#endif
+""")
+def gather(warps: int):  # type: ignore[no-untyped-def]
+    """Waits for the other warps of the block.
+
+    They need not wait for one another. But the kernel's instructions do not fit into the cache for them, and so the warps of a
+    multiprocessor get them two to four times as fast if all need the same ones at the same time.
+    """
+    ...
+
+
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     {_GROUP}

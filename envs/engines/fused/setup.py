@@ -5,7 +5,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.base import last_below
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
 from mjx_dher.host.warp_setup import wp
@@ -76,6 +75,15 @@ def _joints_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     return {"kind": kind, "qpos": qpos, "dof": dof, "moved_by": moved_by, "axis": axis, "anchor": anchor, "rest": rest}
 
 
+def _last_below(model: mujoco.MjModel) -> np.ndarray:
+    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
+    last = np.arange(model.nbody, dtype=np.int32)
+    for body in range(model.nbody - 1, 0, -1):
+        parent = model.body_parentid[body]
+        last[parent] = max(last[parent], last[body])
+    return last
+
+
 def bodies_of(model: mujoco.MjModel) -> Any:
     """Returns `Bodies` of a model."""
     return _fill(
@@ -83,7 +91,7 @@ def bodies_of(model: mujoco.MjModel) -> Any:
         number=model.nbody,
         parent=model.body_parentid,
         root=model.body_rootid,
-        last=last_below(model),
+        last=_last_below(model),
         pos=model.body_pos,
         quat=model.body_quat,
         com=model.body_ipos,

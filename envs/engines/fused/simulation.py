@@ -8,14 +8,15 @@ import numpy as np
 from mjx_dher.envs.engines.fused import kernel, setup
 from mjx_dher.host.warp_setup import wp
 
-LANES = 32  # threads that share an environment
+# Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
+LANES, WARPS = 16, 8
 ROWS = 96  # of constraints that an environment has room for
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
 
 
-class FusedSimulation:
-    """Environments that the fused kernel advances.
+class Simulation:
+    """Environments that the fused kernel advances, on Warp's current device.
 
     Args:
       model: a model that `unsupported` finds nothing in; its options have the most iterations of Newton's method and of its
@@ -23,26 +24,34 @@ class FusedSimulation:
       num_envs: number of environments.
       substeps: timesteps an environment step.
       rows: of constraints that there is room for.
-      lanes: threads that share an environment, a power of 2 up to 32; 1 on a CPU.
+
+    Raises:
+      ValueError: the device's shared memory does not suffice.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, lanes: int = LANES, rows: int = ROWS):
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = ROWS):
         bodies, dofs, contacts = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model)
         world = setup.world_of(model, contacts, rows)
-        self.layout = setup.layout_of(model, world, contacts, dofs)
-        cpu = wp.get_device().is_cpu
-        self.lanes = 1 if cpu else lanes
-        self._block = 1 if cpu else 32
-        self.memory = wp.zeros((num_envs if cpu else 1, self.layout.size if cpu else 1), dtype=float)
-        self._kernel = kernel_of(self.layout.size, self.lanes, model.nv)
-        self._kept = (world, bodies, dofs, contacts, self.layout, self.memory)
+        layout = setup.layout_of(model, world, contacts, dofs)
+        device = wp.get_device()
+        self._lanes = 1 if device.is_cpu else LANES
+        warps = 0 if device.is_cpu else most_warps(layout.size, device.max_shared_memory_per_block)
+        self._block = max(1, 32 * warps)
+        self._kernel = kernel.make(layout.size, self._lanes, warps, model.nv)
+        memory = wp.zeros((num_envs, layout.size) if device.is_cpu else (1, 1), dtype=float)
+        self._kept = (world, bodies, dofs, contacts, layout, memory)
         self._lost = wp.zeros(1, dtype=int)
         self._substeps, self._num_envs = substeps, num_envs
 
+    def load(self) -> None:
+        """Compiles the kernel, or takes it from Warp's cache."""
+        self._kernel.module.load(wp.get_device(), self._block)
+
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
+        """Advances coordinates, velocities and the solver's first guess by one environment step."""
         wp.launch(
             self._kernel,
-            dim=(self._num_envs, self.lanes),
+            dim=(self._num_envs, self._lanes),
             inputs=[*self._kept, self._substeps, self._lost, inputs, *state],
             outputs=list(result),
             block_dim=self._block,
@@ -56,21 +65,23 @@ class FusedSimulation:
         return lost
 
 
-def kernel_of(size: int, lanes: int, nv: int) -> Any:
-    """Returns the kernel for environments of `size` floats, as many in a block as share a warp, or one."""
-    return kernel.make(0 if wp.get_device().is_cpu else size * max(1, 32 // lanes), lanes, nv)
+def most_warps(size: int, shared: int) -> int:
+    """Returns how many warps a block has, whose environments take `size` floats each of `shared` bytes.
+
+    Raises:
+      ValueError: there is not enough for one.
+    """
+    a_warp = 4 * size * (32 // LANES)
+    if a_warp > shared:
+        raise ValueError(
+            f"the warp engine needs {a_warp:,} bytes of a GPU's shared memory and has {shared:,}; fewer constraints take less"
+        )
+    return min(WARPS, shared // a_warp)
 
 
-def capacities(model: mujoco.MjModel) -> tuple[int, int]:
-    """Returns the most contacts, and rows of constraints, that an environment can have."""
-    contacts = setup.contacts_of(model)
-    return contacts.slots, setup.world_of(model, contacts, 10**6).rows
-
-
-def load(model: mujoco.MjModel, rows: int) -> None:
-    """Compiles the kernel for the current device, or takes it from Warp's cache."""
-    simulation = FusedSimulation(model, 1, 1, rows=rows)
-    simulation._kernel.module.load(wp.get_device(), simulation._block)
+def most_rows(model: mujoco.MjModel) -> int:
+    """Returns the most rows of constraints that an environment can have."""
+    return int(setup.world_of(model, setup.contacts_of(model), 10**6).rows)
 
 
 # Model features by name -> whether a model has them.

@@ -153,6 +153,8 @@ def solve(world: World, memory: Memory, nv: int, lane: int, lanes: int):
         changed = _take(memory, far, rows, nv, lane, lanes)
         if changed == 0.0 and wp.abs(far - 1.0) < _WHOLE:
             break
+        if far * far * gain <= least:  # rounding lets the search go no further
+            break
 
 
 @wp.func
