@@ -160,6 +160,11 @@ def num_epochs(config: Config, episode_length: int) -> int:
     return math.ceil(config.total_steps / steps_per_epoch(config, episode_length))
 
 
+def num_updates(config: Config, episode_length: int) -> int:
+    """Returns the updates of the learner in a whole run."""
+    return num_epochs(config, episode_length) * config.cycles_per_epoch * config.updates_per_cycle
+
+
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
     """Refuses what is not a number of `kind` (int or float) in `interval`.
 

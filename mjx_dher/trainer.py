@@ -304,7 +304,6 @@ def as_arrays(hparams: HParams) -> HParams:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
 
 
-@jax.jit
 def is_finite(learner: PyTree) -> Array:
     """Returns [] whether all of a learner's numbers are finite: once they are not, no epoch will mend them."""
     floats = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.inexact)]

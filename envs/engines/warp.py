@@ -32,7 +32,7 @@ class WarpEngine:
       substeps: MuJoCo timesteps an environment step.
       iterations: maximum Newton iterations of the constraint solver; each environment stops by itself, most after one or two.
       ls_iterations: maximum steps of the solver's line search.
-      constraints: constraint rows that fit into memory in each environment; by default 96, or fewer if no more can occur.
+      constraints: constraint rows that fit into memory in each environment; by default all that can occur.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
@@ -53,7 +53,7 @@ class WarpEngine:
         if left_out := simulation.unsupported(model):
             raise ValueError(f"engine warp leaves out what the model has: {', '.join(left_out)}; use engine native")
         self.most_constraints = simulation.most_rows(model)
-        self._constraints = min(simulation.ROWS, self.most_constraints) if constraints is None else constraints
+        self._constraints = self.most_constraints if constraints is None else constraints
         for name, count in {
             "iterations": iterations,
             "ls_iterations": ls_iterations,

@@ -19,7 +19,6 @@ import numpy as np
 
 from mjx_dher import config as config_lib
 from mjx_dher import spec as spec_lib
-from mjx_dher import trainer
 from mjx_dher.host import files
 from mjx_dher.learners.stored import StoredPolicy
 from mjx_dher.runs import health, identity, loop, play, run_folder, sinks
@@ -35,7 +34,6 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.types import Env
 
 STOPPED = "stopped"
-_are_finite = jax.jit(jax.vmap(trainer.is_finite))
 
 
 class Result(NamedTuple):
@@ -238,9 +236,7 @@ class Watch:
 
     def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
         """Notes the lanes that have failed in an epoch, and reports each kind of trouble once."""
-        learner = progress.state.learner
-        batched = progress.state.env_steps.ndim > 0
-        finite = np.atleast_1d(_are_finite(learner) if batched else trainer.is_finite(learner))
+        finite = np.atleast_1d(progress.finite)
         for lane, (spec, row) in enumerate(zip(self._specs, rows)):
             if lane in self.failed:
                 continue

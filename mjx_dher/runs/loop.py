@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import concurrent.futures
+import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.host import memory
 from mjx_dher.rollout import check_steps
-from mjx_dher.trainer import Train, TrainState, as_arrays, make_train
-from mjx_dher.types import Env, Metrics, PRNGKey
+from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
+from mjx_dher.types import Array, Env, Metrics, PRNGKey
+
+# Updates, of all runs side by side, from which on the compiler's search for the fastest matrix products pays: on one H100 it
+# takes half a minute, and Push's epochs then take 0.83 of the time (docs/design.md).
+WORTH_A_SEARCH = 500_000
 
 
 class Start(NamedTuple):
@@ -36,13 +42,14 @@ class Progress(NamedTuple):
     epoch_seconds: float
     metrics: dict[str, Any]  # a float each; of runs side by side an array [L] each
     state: TrainState  # valid until the next epoch begins, which takes over its memory
+    finite: Any  # [] or [L] bool, whether all of the learner's numbers are
 
 
 class Compiled(NamedTuple):
     """A training loop, compiled."""
 
     init: Callable[[PRNGKey, HParams], TrainState]
-    epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
+    epoch: Callable[[TrainState], tuple[TrainState, Metrics, Array]]  # the last as `Progress.finite`
     nbytes: int  # memory that an epoch takes, all told, as the compiler planned it; 0 where it does not tell
 
 
@@ -79,7 +86,7 @@ def train(
     check_memory(program, config)
     on_compile(None)
     started = time.perf_counter()
-    compiled = compile_program(program, key, hparams)
+    compiled = compile_program(program, key, hparams, config_lib.num_updates(config, env.episode_length))
     check_program(compiled, config)
     check_steps(env)
     on_compile(time.perf_counter() - started)
@@ -104,7 +111,7 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
             running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)
-            state, metrics = running.result()
+            state, metrics, finite = running.result()
             check_steps(env)
             now = time.perf_counter()
             yield Progress(
@@ -116,23 +123,30 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
                 epoch_seconds=now - previous,
                 metrics=jax.device_get(metrics),
                 state=state,
+                finite=np.asarray(finite),
             )
             previous = time.perf_counter()
 
 
-def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
+def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0) -> Compiled:
     """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
 
-    Their values do not matter.
+    Their values do not matter. The compiler takes more trouble for a run of many `updates`.
     """
-    init, epoch = (jax.vmap(program.init), jax.vmap(program.epoch)) if key.ndim else (program.init, program.epoch)
+
+    def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:
+        state, metrics = program.epoch(state)
+        return state, metrics, is_finite(state.learner)
+
+    search = updates * (key.shape[0] if key.ndim else 1) >= WORTH_A_SEARCH
+    init, epoch = (jax.vmap(program.init), jax.vmap(epoch_and_check)) if key.ndim else (program.init, epoch_and_check)
     hparams = as_arrays(hparams)
     state = jax.eval_shape(init, key, hparams)
     lowered_init = jax.jit(init).lower(key, hparams)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         compiling = pool.submit(compile_lowered, lowered_init)
         lowered = jax.jit(epoch, donate_argnums=0).lower(state)
-        compiled = compile_lowered(lowered)
+        compiled = compile_lowered(lowered, search)
         compiled_init = compiling.result()
     sizes = compiled.memory_analysis()
     nbytes = 0
@@ -144,15 +158,18 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams) -> Compiled:
     return Compiled(init=lambda key, hparams: compiled_init(key, as_arrays(hparams)), epoch=compiled, nbytes=nbytes)
 
 
-def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-    """Compiles what `jax.jit(...).lower` gave, on a GPU without a pass that can take half the time and gains a learner nothing.
+def compile_lowered(lowered: jax.stages.Lowered, search: bool = False) -> jax.stages.Compiled:
+    """Compiles what `jax.jit(...).lower` gave, on a GPU without what takes most of the time there.
 
-    The pass makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many
-    tilings each, what else could go into them.
+    One pass makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many
+    tilings each, what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix
+    products compiled, with many tilings each, to be timed against those of cuBLAS, which has its own ready.
     """
     options: dict[str, str | bool] = {}
     if jax.default_backend() == "gpu":
         options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
+        if "xla_gpu_enable_triton_gemm" not in os.environ.get("XLA_FLAGS", ""):
+            options["xla_gpu_enable_triton_gemm"] = search
     return lowered.compile(compiler_options=options)
 
 

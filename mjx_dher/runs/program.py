@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_dher import config as config_lib
 from mjx_dher import learners, priorities, samplers, trainer
 from mjx_dher.config import HParams
 from mjx_dher.host import memory
@@ -95,7 +96,7 @@ def _compile(
 ) -> Compiled:
     report(f"{spec.env}: compiling for {title} ...")
     started = time.perf_counter()
-    compiled = loop.compile_program(train, keys, hparams)
+    compiled = loop.compile_program(train, keys, hparams, config_lib.num_updates(spec.config, env.episode_length))
     check_steps(env)
     seconds = time.perf_counter() - started
     report(f"{spec.env}: compiled in {seconds:.1f} s; {memory.format_bytes(compiled.nbytes)} of memory")

@@ -18,77 +18,115 @@ _box_box, _plane_cylinder = _shapes.box_box, _shapes.plane_cylinder
 
 
 @wp.func
-def collide(contacts: Contacts, memory: Memory, lane: int, lanes: int):
-    """Computes the distance, place and normal of each slot."""
+def collide_with_planes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Computes distance, place and normal of the slots of planes, and marks all others as empty."""
     for p in range(lane, contacts.pairs, lanes):
-        geom1 = contacts.geom1[p]
-        geom2 = contacts.geom2[p]
-        mat1 = _mat(contacts, memory, geom1)
-        mat2 = _mat(contacts, memory, geom2)
-        pos1 = _pos(contacts, memory, geom1)
-        pos2 = _pos(contacts, memory, geom2)
-        size1 = contacts.geom_size[geom1]
-        size2 = contacts.geom_size[geom2]
-        margin = contacts.margin[p]
         first = contacts.first[p]
-        kind = contacts.kind[p]
         for i in range(contacts.most[p]):
             memory.distance[first + i] = FAR
+        kind = contacts.kind[p]
         if kind == _PLANE_BOX or kind == _PLANE_CYLINDER:
+            geom1 = contacts.geom1[p]
+            geom2 = contacts.geom2[p]
+            mat1 = _mat(contacts, memory, geom1)
+            pos1 = _pos(contacts, memory, geom1)
+            pos2 = _pos(contacts, memory, geom2)
+            margin = contacts.margin[p]
             normal = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
             if wp.dot(pos2 - pos1, normal) <= contacts.geom_reach[geom2] + margin:
+                mat2 = _mat(contacts, memory, geom2)
+                size2 = contacts.geom_size[geom2]
                 if kind == _PLANE_BOX:
                     _corners(memory, first, margin, pos1, normal, pos2, mat2, size2)
                 else:
                     _rim(memory, first, pos1, normal, pos2, mat2, size2)
-        elif _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2):
-            if kind == _CYLINDER_BOX:
-                distance, at, normal_of_one = cylinder_box(pos1, mat1, size1, pos2, mat2, size2, margin)
-                memory.distance[first] = distance
-                memory.place[first] = at
-                memory.normal[first] = normal_of_one
-            elif _near(pos2, contacts.geom_reach[geom2] + margin, pos1, mat1, size1):
-                number, distances, places, normal_of_all = _box_box(pos1, mat1, size1, pos2, mat2, size2, margin)
+    sync(lanes)
+
+
+@wp.func
+def collide_boxes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Computes distance, place and normal of the slots of two boxes."""
+    for p in range(lane, contacts.pairs, lanes):
+        if contacts.kind[p] == _BOX_BOX:
+            geom1 = contacts.geom1[p]
+            geom2 = contacts.geom2[p]
+            mat1 = _mat(contacts, memory, geom1)
+            mat2 = _mat(contacts, memory, geom2)
+            pos1 = _pos(contacts, memory, geom1)
+            pos2 = _pos(contacts, memory, geom2)
+            size1 = contacts.geom_size[geom1]
+            size2 = contacts.geom_size[geom2]
+            margin = contacts.margin[p]
+            if _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2) and _near(
+                pos2, contacts.geom_reach[geom2] + margin, pos1, mat1, size1
+            ):
+                first = contacts.first[p]
+                number, distances, places, normal = _box_box(pos1, mat1, size1, pos2, mat2, size2, margin)
                 for i in range(number):
                     memory.distance[first + i] = distances[i]
                     memory.place[first + i] = places[i]
-                    memory.normal[first + i] = normal_of_all
+                    memory.normal[first + i] = normal
     sync(lanes)
-    _tilt(contacts, memory, lane, lanes)
+
+
+@wp.func
+def collide_cylinders(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+    """Computes distance, place and normal of the slots of a cylinder and a box.
+
+    The first contact is that of the two as they lie; four more are looked for with both tilted by a little about the first one,
+    as MuJoCo C does.
+    """
+    for round in range(contacts.rounds):  # not twice in the code, which is long
+        for at in range(lane, wp.where(round == 0, 1, 4) * contacts.pairs, lanes):
+            p = wp.where(round == 0, at, at // 4)
+            if contacts.kind[p] == _CYLINDER_BOX:
+                _meet(contacts, memory, p, round, at % 4)
+        sync(lanes)
     _thin(contacts, memory, lane, lanes)
 
 
 @wp.func
-def _tilt(contacts: Contacts, memory: Memory, lane: int, lanes: int):
-    """Looks for four more contacts of a cylinder and a box, both tilted by a little about the first one, as MuJoCo C does."""
-    for at in range(lane, 4 * contacts.pairs, lanes):
-        p = at // 4
-        first = contacts.first[p]
-        if contacts.kind[p] == _CYLINDER_BOX and memory.distance[first] < contacts.margin[p]:
-            geom1 = contacts.geom1[p]
-            geom2 = contacts.geom2[p]
+def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int):
+    """Sets a slot of a cylinder and a box: the first one, or one of those with both tilted in a direction."""
+    geom1 = contacts.geom1[p]
+    geom2 = contacts.geom2[p]
+    mat1 = _mat(contacts, memory, geom1)
+    mat2 = _mat(contacts, memory, geom2)
+    pos1 = _pos(contacts, memory, geom1)
+    pos2 = _pos(contacts, memory, geom2)
+    size2 = contacts.geom_size[geom2]
+    margin = contacts.margin[p]
+    first = contacts.first[p]
+    near = bool(True)
+    if round == 0:
+        near = _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2)
+    else:
+        near = memory.distance[first] < margin
+    if near:
+        if round > 0:
             centre = memory.place[first]
             normal = memory.normal[first]
             axis = tangent(normal)
-            if at % 4 >= 2:
+            if direction >= 2:
                 axis = wp.cross(normal, axis)
-            half = _TILT * wp.where(at % 2 == 0, -0.5, 0.5)
+            half = _TILT * wp.where(direction % 2 == 0, -0.5, 0.5)
             turn = wp.quat_to_matrix(wp.quat(wp.sin(half) * axis, wp.cos(half)))
             back = wp.transpose(turn)
-            distance, place, tilted = cylinder_box(
-                centre + turn * (_pos(contacts, memory, geom1) - centre),
-                turn * _mat(contacts, memory, geom1),
-                contacts.geom_size[geom1],
-                centre + back * (_pos(contacts, memory, geom2) - centre),
-                back * _mat(contacts, memory, geom2),
-                contacts.geom_size[geom2],
-                contacts.margin[p],
-            )
-            if distance < contacts.margin[p]:
-                memory.distance[first + 1 + at % 4] = memory.distance[first]
-                memory.place[first + 1 + at % 4] = place
-                memory.normal[first + 1 + at % 4] = tilted
-    sync(lanes)
+            pos1 = centre + turn * (pos1 - centre)
+            mat1 = turn * mat1
+            pos2 = centre + back * (pos2 - centre)
+            mat2 = back * mat2
+        distance, place, normal_of_one = cylinder_box(pos1, mat1, contacts.geom_size[geom1], pos2, mat2, size2, margin)
+        slot = first
+        if round > 0:
+            slot = first + 1 + direction
+        if round == 0:
+            memory.distance[slot] = distance
+        elif distance < margin:
+            memory.distance[slot] = memory.distance[first]
+        if distance < margin:
+            memory.place[slot] = place
+            memory.normal[slot] = normal_of_one
 
 
 @wp.func

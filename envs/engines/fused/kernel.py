@@ -4,23 +4,75 @@ import functools
 from typing import Any
 
 from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
-from mjx_dher.envs.engines.fused.contacts import collide
+from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.kinematics import integrate, move, place, push, strain, turn, weigh
 from mjx_dher.envs.engines.fused.lanes import gather, sync
 from mjx_dher.envs.engines.fused.memory import carve, copy
-from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, World
+from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, Bodies, Contacts, Dofs, Layout, Memory, World
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.host.warp_setup import wp
 
 
+@wp.func
+def _forces(
+    world: World,
+    bodies: Bodies,
+    dofs: Dofs,
+    memory: Memory,
+    given: wp.array(dtype=float),  # type: ignore[valid-type]
+    warps: int,
+    lane: int,
+    lanes: int,
+):
+    """Computes places, velocities, the mass matrix and all forces but those of constraints."""
+    gather(warps)
+    place(bodies, memory, given, lane, lanes)
+    gather(warps)
+    move(bodies, memory, lane, lanes)
+    gather(warps)
+    turn(bodies, memory, lane, lanes)
+    gather(warps)
+    strain(world, bodies, dofs, memory, lane, lanes)
+    gather(warps)
+    push(bodies, dofs, memory, given, lane, lanes)
+    gather(warps)
+    weigh(bodies, dofs, memory, lane, lanes)
+
+
+@wp.func
+def _constraints(
+    world: World,
+    bodies: Bodies,
+    dofs: Dofs,
+    contacts: Contacts,
+    memory: Memory,
+    lost: wp.array(dtype=int),  # type: ignore[valid-type]
+    warps: int,
+    lane: int,
+    lanes: int,
+):
+    """Computes the rows of constraints."""
+    gather(warps)
+    number(world, dofs, contacts, memory, lost, lane, lanes)
+    gather(warps)
+    weld(world, bodies, dofs, memory, lane, lanes)
+    gather(warps)
+    limit(dofs, contacts, memory, lane, lanes)
+    gather(warps)
+    touch(bodies, dofs, contacts, memory, lane, lanes)
+    gather(warps)
+    press(dofs, contacts, memory, lane, lanes)
+
+
 @functools.cache
-def make(floats: int, lanes_of_one: int, warps: int, nv: int) -> Any:
+def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, ...]) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
 
     Args:
       floats: memory of an environment.
       lanes_of_one: threads that share an environment.
       warps: of 32 threads in a block; 0 on a CPU.
+      kinds: of pairs of geoms that there are; the code for others is left out.
     """
     shared = warps * (32 // lanes_of_one) * floats
 
@@ -59,30 +111,16 @@ def make(floats: int, lanes_of_one: int, warps: int, nv: int) -> Any:
         sync(lanes)
         given = inputs[env]
         for _substep in range(substeps):
+            _forces(world, bodies, dofs, memory, given, wp.static(warps), lane, lanes)
             gather(wp.static(warps))
-            place(bodies, memory, given, lane, lanes)
-            gather(wp.static(warps))
-            move(bodies, memory, lane, lanes)
-            gather(wp.static(warps))
-            turn(bodies, memory, lane, lanes)
-            gather(wp.static(warps))
-            strain(world, bodies, dofs, memory, lane, lanes)
-            gather(wp.static(warps))
-            push(bodies, dofs, memory, given, lane, lanes)
-            gather(wp.static(warps))
-            weigh(bodies, dofs, memory, lane, lanes)
-            gather(wp.static(warps))
-            collide(contacts, memory, lane, lanes)
-            gather(wp.static(warps))
-            number(world, dofs, contacts, memory, lost, lane, lanes)
-            gather(wp.static(warps))
-            weld(world, bodies, dofs, memory, lane, lanes)
-            gather(wp.static(warps))
-            limit(dofs, contacts, memory, lane, lanes)
-            gather(wp.static(warps))
-            touch(bodies, dofs, contacts, memory, lane, lanes)
-            gather(wp.static(warps))
-            press(dofs, contacts, memory, lane, lanes)
+            collide_with_planes(contacts, memory, lane, lanes)
+            if wp.static(BOX_BOX in kinds):
+                gather(wp.static(warps))
+                collide_boxes(contacts, memory, lane, lanes)
+            if wp.static(CYLINDER_BOX in kinds):
+                gather(wp.static(warps))
+                collide_cylinders(contacts, memory, lane, lanes)
+            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), lane, lanes)
             gather(wp.static(warps))
             solve(world, memory, size, lane, lanes)
             gather(wp.static(warps))

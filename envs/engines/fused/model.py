@@ -83,6 +83,7 @@ class Contacts:
     weight: _floats  # inverse inertia, as a pyramid's rows have it
     slots: int
     pair: _ints  # pair of each slot
+    rounds: int  # 2, in which contacts of a cylinder and a box are looked for
 
 
 @wp.struct

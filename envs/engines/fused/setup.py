@@ -169,6 +169,7 @@ def contacts_of(model: mujoco.MjModel) -> Any:
         weight=weight * np.where(model.pair_dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
         slots=int(most.sum()),
         pair=np.repeat(np.arange(len(kind)), most),
+        rounds=2,
     )
 
 

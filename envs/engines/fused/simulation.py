@@ -10,7 +10,6 @@ from mjx_dher.host.warp_setup import wp
 
 # Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
 LANES, WARPS = 16, 8
-ROWS = 96  # of constraints that an environment has room for
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
 
@@ -23,13 +22,13 @@ class Simulation:
         line search.
       num_envs: number of environments.
       substeps: timesteps an environment step.
-      rows: of constraints that there is room for.
+      rows: of constraints that there is room for, if so many can occur.
 
     Raises:
       ValueError: the device's shared memory does not suffice.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = ROWS):
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = 10**6):
         bodies, dofs, contacts = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model)
         world = setup.world_of(model, contacts, rows)
         layout = setup.layout_of(model, world, contacts, dofs)
@@ -37,7 +36,7 @@ class Simulation:
         self._lanes = 1 if device.is_cpu else LANES
         warps = 0 if device.is_cpu else most_warps(layout.size, device.max_shared_memory_per_block)
         self._block = max(1, 32 * warps)
-        self._kernel = kernel.make(layout.size, self._lanes, warps, model.nv)
+        self._kernel = kernel.make(layout.size, self._lanes, warps, model.nv, tuple(sorted({*map(int, contacts.kind.numpy())})))
         memory = wp.zeros((num_envs, layout.size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (world, bodies, dofs, contacts, layout, memory)
         self._lost = wp.zeros(1, dtype=int)
