@@ -21,7 +21,7 @@ def measure(env: str, engine: str, preset: str) -> dict[str, float]:
     start = time.perf_counter()
     import dataclasses
 
-    from mjx_dher import envs, samplers
+    from mjx_dher import envs, learners, samplers, trainer
     from mjx_dher.host.caches import keep_compiled_programs
     from mjx_dher.runs.loop import train
 
@@ -32,7 +32,8 @@ def measure(env: str, engine: str, preset: str) -> dict[str, float]:
     environment = envs.make(env, engine=engine)
     ready = time.perf_counter()
     note = lambda seconds: compiled.append(seconds) if seconds else None  # noqa: E731
-    run = train(environment, config, spec.hparams, 0, note, sampler=samplers.make("weighted"))
+    learner = learners.make(spec.learner, config, trainer.env_sizes(environment), spec.networks)
+    run = train(environment, config, spec.hparams, 0, note, sampler=samplers.make("weighted"), learner=learner)
     first, second = next(run), next(run)
     run.close()
     return {

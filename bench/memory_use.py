@@ -21,7 +21,7 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
 
     import jax
 
-    from mjx_dher import envs, samplers, trainer
+    from mjx_dher import envs, learners, samplers, trainer
     from mjx_dher.host.memory import format_bytes
     from mjx_dher.runs.loop import train
 
@@ -31,7 +31,8 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
     )
     environment = envs.make(env, engine=engine)
     program = trainer.make_train(environment, config)
-    run = train(environment, config, spec.hparams, sampler=samplers.make("weighted"))
+    learner = learners.make(spec.learner, config, trainer.env_sizes(environment), spec.networks)
+    run = train(environment, config, spec.hparams, sampler=samplers.make("weighted"), learner=learner)
     next(run)
     run.close()
     found = [format_bytes(program.replay_bytes)]

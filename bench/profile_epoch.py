@@ -21,8 +21,8 @@ from pathlib import Path
 import jax
 from timing import print_table
 
-from mjx_dher import envs, presets, samplers
-from mjx_dher.trainer import make_train
+from mjx_dher import envs, learners, presets, samplers
+from mjx_dher.trainer import env_sizes, make_train
 
 
 def device_events(folder: Path):
@@ -58,7 +58,9 @@ def main() -> None:
         parser.error("this reads a GPU's profile, and JAX runs on a CPU here")
     spec = presets.preset(args.preset, args.env)
     config = dataclasses.replace(spec.config, cycles_per_epoch=1, updates_per_cycle=200)
-    program = make_train(envs.make(args.env), config, sampler=samplers.make("weighted"))
+    env = envs.make(args.env)
+    learner = learners.make(spec.learner, config, env_sizes(env), spec.networks)
+    program = make_train(env, config, sampler=samplers.make("weighted"), learner=learner)
     state = jax.jit(program.init)(jax.random.key(0), spec.hparams)
     epoch = jax.jit(program.epoch, donate_argnums=0)
     for _ in range(2):

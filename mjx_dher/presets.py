@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-from typing import Any, Literal, get_args
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, get_args
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.names import check_name
@@ -25,7 +26,7 @@ def machine_preset() -> str:
     return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
-def preset(name: str, env: str, **changes: Any) -> RunSpec:
+def preset(name: str, env: str, learner: str | None = None, networks: str | None = None, **changes: Any) -> RunSpec:
     """Returns the run of a preset in an environment, with `changes` to its fields, such as `sampler` or `seed`.
 
     `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
@@ -33,12 +34,23 @@ def preset(name: str, env: str, **changes: Any) -> RunSpec:
     Replay": its workers' episodes are rolled out side by side, and their averaged gradients are one gradient of the joint
     batch.
 
+    Args:
+      name: the preset.
+      env: the environment.
+      learner: the preset's unless given; `ddpg` and the preset's have numbers of their own, others those of `ddpg`.
+      networks: the preset's for that learner unless given.
+      **changes: other fields of the run.
+
     Raises:
       ValueError: no such preset.
     """
     check_name("preset", name, PRESETS)
-    config, hparams = {"cpu": _cpu, "gpu": _gpu, "paper": _paper}[name](env)
-    return RunSpec(env=env, config=config, hparams=hparams, **changes)
+    best = _GPU_LEARNERS.get(env, _DDPG) if name == "gpu" else _DDPG
+    if learner not in (None, best.learner):
+        best = _DDPG._replace(learner=str(learner))
+    setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "paper": _paper}[name]
+    config, hparams = setup(env)
+    return RunSpec(env=env, config=config, hparams=hparams, learner=best.learner, networks=networks or best.networks, **changes)
 
 
 def _cpu(env: str) -> tuple[Config, HParams]:
@@ -88,3 +100,30 @@ def _paper(env: str) -> tuple[Config, HParams]:
         total_steps=epochs * 50 * 2 * workers * 50,
     )
     return config, HParams()
+
+
+def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu(env)
+    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_500_000)
+    return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
+
+
+def _gpu_slide(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu(env)
+    config = dataclasses.replace(config, updates_per_cycle=1000, total_steps=5_000_000, n_step=3)
+    return config, hparams._replace(target_noise=0.0)
+
+
+class _Best(NamedTuple):
+    """A preset's learner for a task; `setup` is None where the settings are those of `ddpg`."""
+
+    learner: str
+    networks: str
+    setup: Callable[[str], tuple[Config, HParams]] | None
+
+
+_DDPG = _Best("ddpg", "mlp", None)
+_GPU_LEARNERS = {
+    "pick_and_place": _Best("tqc", "layer_norm", _gpu_pick_and_place),
+    "slide": _Best("dtqc", "layer_norm", _gpu_slide),
+}

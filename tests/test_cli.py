@@ -194,6 +194,22 @@ def test_the_machine_s_preset_is_taken(preset, monkeypatch):
     assert trials == [expected]
 
 
+def test_a_learner_that_is_not_the_preset_s_has_the_numbers_of_ddpg():
+    own = presets.preset("gpu", "slide")
+    ddpg = presets.preset("gpu", "slide", learner="ddpg")
+    assert (own.learner, own.networks, own.config.n_step) == ("dtqc", "layer_norm", 3)
+    assert (ddpg.learner, ddpg.networks, ddpg.config.n_step) == ("ddpg", "mlp", 1)
+    assert presets.preset("gpu", "slide", learner="sac") == dataclasses.replace(ddpg, learner="sac")
+    assert presets.preset("gpu", "slide", learner="dtqc", networks="mlp") == dataclasses.replace(own, networks="mlp")
+    gpu = ["--env", "slide", "--preset", "gpu"]
+    assert cli_train.parse_train_args(gpu).spec == cli_train.parse_train_args([*gpu, "--learner", "dtqc"]).spec == own
+    assert cli_train.parse_train_args([*gpu, "--learner=ddpg"]).spec == ddpg
+    _, trials = cli_sweep.parse_sweep_args(
+        ["--out", "x", *gpu, "--seeds", "1", "--sampler", "future", "--learner", "ddpg", "dtqc"]
+    )
+    assert trials == [ddpg, own]
+
+
 def test_help_names_every_option(capsys):
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out

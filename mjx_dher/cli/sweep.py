@@ -79,10 +79,10 @@ class SweepArgs:
     """Distances that closest, epsilon_closest and weighted go by: position, or module:attribute."""
     priority: tuple[str, ...] = ("eventful",)
     """Priorities of episodes in replay: eventful, or module:attribute."""
-    learner: tuple[str, ...] = ("ddpg",)
-    """Learners: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
-    networks: tuple[str, ...] = ("mlp",)
-    """Networks: mlp, or module:attribute."""
+    learner: tuple[str, ...] | None = None
+    """Learners; the preset's unless given: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
+    networks: tuple[str, ...] | None = None
+    """Networks; the preset's for the learner unless given: mlp, layer_norm, or module:attribute."""
     seeds: int = 10
     """Runs of each setting; every setting has the same seeds, and so the same first networks and resets."""
     first_seed: int = 0
@@ -137,7 +137,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
 def _check(args: SweepArgs) -> None:
     """Raises ValueError for an argument that cannot be used, whatever the preset."""
     for field in GRID:
-        if not getattr(args, field):
+        if getattr(args, field) == ():
             raise ValueError(f"{field} must be one or more names; got none")
     check_count("seeds", args.seeds)
     check_number("first_seed", args.first_seed, "[0, 4294967295]")
@@ -161,7 +161,7 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     specs = []
     changes = {name: value for name, value in vars(args.changes).items() if value is not None}
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
-    parts = [list(dict.fromkeys(getattr(args, field))) for field in GRID]
+    parts = [list(dict.fromkeys(getattr(args, field) or (None,))) for field in GRID]
     for env, *choice in itertools.product(*parts):
         base = presets.preset(preset, env, engine=args.engine, **dict(zip(GRID[1:], choice)))
         base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))

@@ -129,17 +129,18 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
+    early.add_argument("--learner")
     chosen, _ = early.parse_known_args(argv)
     check_name("preset", chosen.preset, ("auto", *PRESETS))
     if chosen.preset != "auto":
-        return _parse(argv, chosen.preset, chosen.env)
-    args = _parse(argv, "cpu", chosen.env)
+        return _parse(argv, chosen.preset, chosen)
+    args = _parse(argv, "cpu", chosen)
     preset = presets.machine_preset()
-    return args if preset == "cpu" else _parse(argv, preset, chosen.env)
+    return args if preset == "cpu" else _parse(argv, preset, chosen)
 
 
-def _parse(argv: list[str], preset: Any, env: str) -> TrainArgs:
-    default = TrainArgs(presets.preset(preset, env))
+def _parse(argv: list[str], preset: Any, chosen: argparse.Namespace) -> TrainArgs:
+    default = TrainArgs(presets.preset(preset, chosen.env, chosen.learner))
     args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,))
     problems = []
     for check in (lambda: spec.validate(args.spec, envs.list_envs()), args.options.check):
