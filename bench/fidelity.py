@@ -39,6 +39,7 @@ HEAD = ("task", "episodes", "run by", "grip, mean", "p95", "object, median", "p9
 MOVED = 0.02  # m
 SHIFTS = (0.0, 1e-4)  # m, of the yardstick
 DIRECTIONS = 4  # that the yardstick moves each start in
+FALLS = 1000  # episodes that are looked at for pucks that fall
 PUCK_SPEED, FRICTION, GRAVITY = 0.5, 0.1, 9.81  # m/s, -, m/s^2
 
 
@@ -114,6 +115,24 @@ def free_slide(engine):
     return float(jnp.linalg.norm(state.obs["achieved_goal"] - first))
 
 
+def falls(engine):
+    """How many of FALLS episodes of Slide end with the puck below the table: each pushes it on, whichever way it chose."""
+    import jax
+    import jax.numpy as jnp
+
+    from mjx_dher import envs
+
+    env = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
+
+    def episode(key):
+        start, way = jax.random.split(key)
+        action = jnp.append(jax.random.uniform(way, (2,), minval=-1), jnp.array([-0.1, 0.0]))
+        return jax.lax.fori_loop(0, env.episode_length, lambda _, state: env.step(state, action), env.reset(start))
+
+    ends = jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(0), FALLS)).obs["achieved_goal"]
+    return int(np.sum(np.asarray(ends)[:, 2] < env.task.object_height - 0.05))
+
+
 def between_engines(recorded, paths):
     """Lines on how the engines compare with one another on Slide."""
     script = recorded["policy"] == KINDS.index("script")
@@ -127,6 +146,9 @@ def between_engines(recorded, paths):
         f" {', '.join(f'{length:.1f} mm on `{engine}`' for engine, length in free.items())}; v²/(2μg) is {coulomb:.1f} mm.",
         f"- Hit by the recorded script, it goes {np.median(went):.0f} mm on `native` in the median; from there it ends "
         + ", ".join(f"{np.median(d):.1f} mm on `{engine}` (p95 {np.percentile(d, 95):.0f} mm)" for engine, d in apart.items())
+        + ".",
+        f"- Pushed on by the same action for an episode, of {FALLS:,} pucks "
+        + ", ".join(f"{falls(engine)} fall off the table on `{engine}`" for engine in ENGINES)
         + ".",
     ]
 

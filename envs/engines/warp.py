@@ -17,7 +17,7 @@ from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Physics
 from mjx_dher.envs.engines.fused import simulation
 from mjx_dher.host import private_api
-from mjx_dher.host.warp_setup import prepare, wp
+from mjx_dher.host.warp_setup import load, prepare, wp
 from mjx_dher.types import Array
 
 
@@ -50,6 +50,9 @@ class WarpEngine:
         constraints: int | None = None,
         allow_cpu: bool = False,
     ):
+        prepare()
+        if not allow_cpu:
+            _check_gpu()
         if left_out := simulation.unsupported(model):
             raise ValueError(f"engine warp leaves out what the model has: {', '.join(left_out)}; use engine native")
         self.most_constraints = simulation.most_rows(model)
@@ -60,14 +63,12 @@ class WarpEngine:
             "constraints": self._constraints,
         }.items():
             check_count(name, count)
-        if not allow_cpu:
-            _check_gpu()
         self._model = copy.copy(model)
         self._model.opt.iterations, self._model.opt.ls_iterations = iterations, ls_iterations
         self._substeps = substeps
         self._simulations: dict[tuple[str, int], simulation.Simulation] = {}
         self._lock = threading.Lock()
-        self._loading: concurrent.futures.Future[None] | None = None
+        self._loading: list[concurrent.futures.Future[None]] | None = None
         self._call = self._jax_callable()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -132,17 +133,14 @@ class WarpEngine:
     def _begin_loading(self) -> None:
         """Compiles the kernel in a thread while XLA compiles the rest: a quarter of a minute, once a machine."""
         if self._loading is None:
-            pool = concurrent.futures.ThreadPoolExecutor(1)
-            self._loading = pool.submit(self._load)
+            pool = concurrent.futures.ThreadPoolExecutor(2)
+            # Warp wants the module of the function that JAX calls, too, though there is no kernel in it.
+            self._loading = [pool.submit(self._made(1).load), pool.submit(load, wp.get_module(__name__))]
             pool.shutdown(wait=False)
 
-    def _load(self) -> None:
-        prepare()
-        self._made(1).load()
-
     def _wait(self) -> None:
-        if self._loading is not None:
-            self._loading.result()
+        for loading in self._loading or ():
+            loading.result()
 
     def _made(self, num_envs: int) -> simulation.Simulation:
         return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints)

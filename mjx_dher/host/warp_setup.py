@@ -1,24 +1,66 @@
 """Warp, imported quietly and set up for this library's kernels."""
 
+import atexit
 import contextlib
 import functools
 import io
+import os
+import shutil
+import tempfile
+import warnings
+from typing import Any
 
 with contextlib.redirect_stdout(io.StringIO()):
     import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING  # otherwise Warp prints a line for each of a hundred kernels
+wp.config.log_level = wp.LOG_WARNING  # otherwise Warp prints a line for each kernel
 
 
 @functools.cache
 def prepare() -> None:
-    """Sets how kernels are compiled. Call it before they are.
+    """Starts Warp and sets how kernels are compiled. Call it before anything else of Warp's.
 
     They may use the instructions that only Hopper GPUs have (see `hopper`), and are kept as machine code: what Warp keeps by
-    default, the driver would compile once more.
+    default, the driver would compile once more. Where Warp's cache folder cannot be used, a warning says so, and a folder of
+    this process takes its place.
     """
+    try:
+        wp.init()
+        with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir):
+            pass
+    except OSError as error:
+        folder = tempfile.mkdtemp(prefix="warp-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        warnings.warn(
+            f"Warp cannot keep compiled kernels ({error}): each program compiles them anew, for a quarter of a minute;"
+            " WARP_CACHE_PATH names another folder",
+            stacklevel=2,
+        )
+        os.environ["WARP_CACHE_PATH"] = folder
+        wp.config.kernel_cache_dir = folder
+        wp.init()
     devices = wp.get_cuda_devices()
     if devices and all(device.is_cubin_supported for device in devices):
         wp.config.cuda_output = "cubin"
     if devices and all(device.arch == 90 for device in devices):
         wp.config.cuda_arch_suffix = "a"
+
+
+def load(module: Any, block: int | None = None) -> None:
+    """Compiles a module of Warp's for the current device, or takes it from the cache, unless what is there is damaged.
+
+    Args:
+      module: the module.
+      block: threads of a block, which the module is compiled for; Warp's default where None.
+    """
+    block = (1 if wp.get_device().is_cpu else module.options["block_dim"]) if block is None else block
+    kept = os.path.join(str(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim=block))
+    was_there = os.path.isdir(kept)
+    try:
+        module.load(wp.get_device(), block)
+    except Exception as error:  # Warp has no narrower class
+        if not was_there:
+            raise
+        warnings.warn(f"{kept} cannot be used ({error}): its kernels are compiled anew", stacklevel=2)
+        shutil.rmtree(kept, ignore_errors=True)
+        module.load(wp.get_device(), block)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused import kernel, setup
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.host.warp_setup import load, wp
 
 # Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
 LANES, WARPS = 16, 8
@@ -44,7 +44,7 @@ class Simulation:
 
     def load(self) -> None:
         """Compiles the kernel, or takes it from Warp's cache."""
-        self._kernel.module.load(wp.get_device(), self._block)
+        load(self._kernel.module, self._block)
 
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
         """Advances coordinates, velocities and the solver's first guess by one environment step."""
