@@ -33,7 +33,7 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
 
     Args:
       name: one of `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
-      engine: "native" (MuJoCo C on the host's cores), "warp" (MuJoCo Warp on an NVIDIA GPU), "jax" (MJX) or "auto" (native on
+      engine: "native" (MuJoCo C on the host's cores), "warp" (a kernel for NVIDIA GPUs), "jax" (MJX) or "auto" (native on
         a CPU, warp on an NVIDIA GPU, else jax). A constructor that takes no `engine` is called without it.
       **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`.
 

@@ -31,7 +31,7 @@ class RunSpec:
     env: str = "push"
     """Environment: a name from `envs.list_envs()`, or module:attribute."""
     engine: Engine = "auto"
-    """Physics: native (MuJoCo C on all cores), warp (MuJoCo Warp on an NVIDIA GPU), jax (MJX) or auto, which picks."""
+    """Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto, which picks."""
     sampler: str = "future"
     """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest or weighted, or
     module:attribute."""

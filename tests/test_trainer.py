@@ -1,7 +1,6 @@
 import dataclasses
 import functools
 import itertools
-import types
 
 import jax
 import jax.numpy as jnp
@@ -287,36 +286,6 @@ def test_what_the_compiler_counts_as_too_much_is_refused_before_training(monkeyp
     large = dataclasses.replace(SMALL, cycles_per_epoch=1, replay_size=10**6, total_steps=1, batch_size=10**6)
     with pytest.raises(ValueError, match=r"an epoch needs .*, but only 300.0 MB of memory is free; .*batch_size 1000000"):
         next(iter(loop.train(ENV, large)))
-
-
-@pytest.mark.parametrize(
-    ("backend", "flags", "updates", "triton"),
-    [
-        ("cpu", "", 10**6, None),
-        ("gpu", "", 499_999, False),
-        ("gpu", "", 500_000, True),
-        ("gpu", "--xla_gpu_enable_triton_gemm=x", 1, None),
-    ],
-)
-def test_the_compiler_searches_for_fast_products_only_where_many_updates_follow(backend, flags, updates, triton, monkeypatch):
-    asked = []
-
-    class Compiled:
-        def memory_analysis(self):
-            return None
-
-    class Lowered:
-        def compile(self, compiler_options):
-            asked.append(compiler_options.get("xla_gpu_enable_triton_gemm"))
-            return Compiled()
-
-    program = make_train(ENV, SMALL)
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(loop.jax, "jit", lambda f, **options: types.SimpleNamespace(lower=lambda *args: Lowered()))
-    monkeypatch.setenv("XLA_FLAGS", flags)
-    loop.compile_program(program, jax.random.key(0), HParams(), updates)
-    init = None if triton is None else False
-    assert sorted(asked, key=str) == sorted([init, triton], key=str)  # of init, and of the epoch
 
 
 def test_observations_that_are_no_vector_are_refused():

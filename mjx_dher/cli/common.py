@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,6 +49,16 @@ def check_engine(engine: str | None) -> None:
     """Raises ValueError for a name that is no engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
+
+
+def settle_compiler(engine: str) -> None:
+    """Keeps a CPU from waiting for ever in programs of MJX; call it before JAX has started.
+
+    With jaxlib 0.10.2 some 300 environments of `jax` that have objects make XLA's CPU backend lose a task. Its older order of
+    operations does not (https://github.com/openxla/xla; no upstream issue known).
+    """
+    if engine == "jax" and "concurrency_optimized_scheduler" not in (flags := os.environ.get("XLA_FLAGS", "")):
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_enable_concurrency_optimized_scheduler=false".strip()
 
 
 def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:

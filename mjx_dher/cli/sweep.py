@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, print_table, refuse_foreign_flags, try_parts
+from mjx_dher.cli.common import Screen, print_table, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
@@ -210,6 +210,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
     """Trains what is left; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
 
+    settle_compiler(args.engine)
     prepare()
     for _, group in itertools.groupby(todo, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags, try_parts
+from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.host.files import FolderError
@@ -71,6 +71,7 @@ def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
     args = parse_train_args(argv)
     with run_folder.claim_new(args.out, args.spec) as folder:
+        settle_compiler(args.spec.engine)
         prepare()
         env = envs.make(args.spec.env, engine=args.spec.engine)
         try_parts(env, [args.spec], console)
@@ -85,6 +86,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     content = run_folder.read_content(args.run)
     with files.lock(args.run):
         run, options = _to_resume(args, content, console)
+        settle_compiler(args.engine or content["physics"])
         prepare()
         ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
         return _train(envs.make(run.env, engine=args.engine or ran), run, args.run, options, console)

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs
-from mjx_dher.cli.common import check_engine, print_summary, read_run
+from mjx_dher.cli.common import check_engine, print_summary, read_run, settle_compiler
 from mjx_dher.config import check_count
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
@@ -42,6 +42,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     check_engine(args.engine)
     check_count("episodes", args.episodes)
     run = read_run(args.run, console)
+    settle_compiler(args.engine or run.engine)
     from mjx_dher.envs.engines.native import usable_cores
     from mjx_dher.runs.load import check_fits, check_plain, load_policy
     from mjx_dher.runs.play import play, summarize

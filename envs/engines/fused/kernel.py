@@ -14,6 +14,22 @@ from mjx_dher.host.warp_setup import wp
 
 
 @wp.func
+def _begin(
+    memory: Memory,
+    qpos: wp.array(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array(dtype=float),  # type: ignore[valid-type]
+    guess: wp.array(dtype=float),  # type: ignore[valid-type]
+    lane: int,
+    lanes: int,
+):
+    """Takes an environment's state into its memory."""
+    copy(qpos, memory.qpos, lane, lanes)
+    copy(qvel, memory.qvel, lane, lanes)
+    copy(guess, memory.qacc, lane, lanes)
+    sync(lanes)
+
+
+@wp.func
 def _forces(
     world: World,
     bodies: Bodies,
@@ -64,6 +80,17 @@ def _constraints(
     press(dofs, contacts, memory, lane, lanes)
 
 
+@wp.func
+def _go_on(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, nv: int, warps: int, lane: int, lanes: int):
+    """Advances velocities and places."""
+    gather(warps)
+    solve(world, memory, nv, lane, lanes)
+    gather(warps)
+    accelerate(world, dofs, memory, nv, lane, lanes)
+    gather(warps)
+    integrate(world, bodies, memory, lane, lanes)
+
+
 @functools.cache
 def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, ...]) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
@@ -101,14 +128,10 @@ def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, 
         """
         env, lane = wp.tid()  # type: ignore[misc]
         lanes = wp.static(lanes_of_one)  # so that the compiler knows them
-        size = wp.static(nv)
         if wp.static(shared > 0):
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
         memory = carve(layout, spare[env % spare.shape[0]], lanes)
-        copy(old_qpos[env], memory.qpos, lane, lanes)
-        copy(old_qvel[env], memory.qvel, lane, lanes)
-        copy(old_guess[env], memory.qacc, lane, lanes)
-        sync(lanes)
+        _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], lane, lanes)
         given = inputs[env]
         for _substep in range(substeps):
             _forces(world, bodies, dofs, memory, given, wp.static(warps), lane, lanes)
@@ -121,12 +144,7 @@ def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, 
                 gather(wp.static(warps))
                 collide_cylinders(contacts, memory, lane, lanes)
             _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), lane, lanes)
-            gather(wp.static(warps))
-            solve(world, memory, size, lane, lanes)
-            gather(wp.static(warps))
-            accelerate(world, dofs, memory, size, lane, lanes)
-            gather(wp.static(warps))
-            integrate(world, bodies, memory, lane, lanes)
+            _go_on(world, bodies, dofs, memory, wp.static(nv), wp.static(warps), lane, lanes)
         copy(memory.qpos, qpos[env], lane, lanes)
         copy(memory.qvel, qvel[env], lane, lanes)
         copy(memory.qacc, guess[env], lane, lanes)

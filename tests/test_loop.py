@@ -1,0 +1,40 @@
+"""How the compiler is asked."""
+
+import types
+
+import jax
+import pytest
+
+from mjx_dher import Config, HParams, make_train
+from mjx_dher.runs import loop
+from probes import PointMass
+
+
+@pytest.mark.parametrize(
+    ("backend", "flags", "updates", "triton"),
+    [
+        ("cpu", "", 10**6, None),
+        ("gpu", "", 499_999, False),
+        ("gpu", "", 500_000, True),
+        ("gpu", "--xla_gpu_enable_triton_gemm=x", 1, None),
+    ],
+)
+def test_the_compiler_searches_for_fast_products_only_where_many_updates_follow(backend, flags, updates, triton, monkeypatch):
+    asked = []
+
+    class Compiled:
+        def memory_analysis(self):
+            return None
+
+    class Lowered:
+        def compile(self, compiler_options):
+            asked.append(compiler_options.get("xla_gpu_enable_triton_gemm"))
+            return Compiled()
+
+    program = make_train(PointMass(), Config())
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(loop.jax, "jit", lambda f, **options: types.SimpleNamespace(lower=lambda *args: Lowered()))
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    loop.compile_program(program, jax.random.key(0), HParams(), updates)
+    init = None if triton is None else False
+    assert sorted(asked, key=str) == sorted([init, triton], key=str)  # of init, and of the epoch
