@@ -250,6 +250,7 @@ def wait_for(condition, process):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     """SIGKILL after a checkpoint, then SIGTERM, then to the end: metrics and policy are those of a run in one go."""
     steps = ["--total-steps", "8000"]

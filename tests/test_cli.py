@@ -236,7 +236,7 @@ def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(t
 
 def progress(epoch, rate):
     metrics = {"success_rate": np.asarray(rate), "return_mean": np.asarray(-20.0)}
-    return Progress(epoch, 4, 1000 * epoch, 100 * epoch, 2.0 * epoch, 2.0, metrics, None)
+    return Progress(epoch, 4, 1000 * epoch, 100 * epoch, 2.0 * epoch, 2.0, metrics, None, True)
 
 
 @pytest.mark.parametrize("terminal", [True, False])
@@ -281,6 +281,7 @@ def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     assert len((out / "metrics.csv").read_text().splitlines()) == 1 + epochs
 
 
+@pytest.mark.slow
 def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
     out = tmp_path / "run"
     slow = [*POINT_MASS, *TINY, "--total-steps", "1000000000", "--num-envs", "1000", "--replay-size", "10000"]

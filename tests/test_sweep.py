@@ -204,6 +204,7 @@ def test_one_run_at_a_time_has_its_checkpoints_in_its_own_folder(tmp_path):
     assert not list(tmp_path.glob("**/checkpoints"))
 
 
+@pytest.mark.slow
 def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
     """`closest` is the first of two samplers, and was the second of three when it was cut short."""
     trials = make_grid(("future", "closest", "weighted"), (0,), static=LONGER)
@@ -270,6 +271,7 @@ def test_the_tables_hold_every_epoch_and_every_setting(tmp_path):
         assert learned({"observation": np.zeros(2), "achieved_goal": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
 
 
+@pytest.mark.slow
 def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, monkeypatch):
     """All four rings would fit; four whole programs do not."""
     trials = make_grid(("future",), seeds=range(4))
