@@ -76,8 +76,7 @@ class Loop:
     @property
     def num_updates(self) -> int:
         """Updates of the whole run."""
-        c = self.config
-        return config_lib.num_epochs(c, self.env.episode_length) * c.cycles_per_epoch * c.updates_per_cycle
+        return config_lib.num_updates(self.config, self.env.episode_length)
 
     @property
     def policy_delay(self) -> int:

@@ -105,7 +105,7 @@ class WarpEngine:
             graph_mode=wp.JaxCallableGraphMode.NONE,
             vmap_method="broadcast_all",
             output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "warmstart_out": (1, nv)},
-            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_load` does it; two at once would clash
+            module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it
         )
 
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:

@@ -48,14 +48,9 @@ def collide_boxes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
     """Computes distance, place and normal of the slots of two boxes."""
     for p in range(lane, contacts.pairs, lanes):
         if contacts.kind[p] == _BOX_BOX:
-            geom1 = contacts.geom1[p]
-            geom2 = contacts.geom2[p]
-            mat1 = _mat(contacts, memory, geom1)
-            mat2 = _mat(contacts, memory, geom2)
-            pos1 = _pos(contacts, memory, geom1)
-            pos2 = _pos(contacts, memory, geom2)
-            size1 = contacts.geom_size[geom1]
-            size2 = contacts.geom_size[geom2]
+            geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
+            pos1, mat1, size1 = _geom(contacts, memory, geom1)
+            pos2, mat2, size2 = _geom(contacts, memory, geom2)
             margin = contacts.margin[p]
             if _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2) and _near(
                 pos2, contacts.geom_reach[geom2] + margin, pos1, mat1, size1
@@ -88,13 +83,9 @@ def collide_cylinders(contacts: Contacts, memory: Memory, lane: int, lanes: int)
 @wp.func
 def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int):
     """Sets a slot of a cylinder and a box: the first one, or one of those with both tilted in a direction."""
-    geom1 = contacts.geom1[p]
-    geom2 = contacts.geom2[p]
-    mat1 = _mat(contacts, memory, geom1)
-    mat2 = _mat(contacts, memory, geom2)
-    pos1 = _pos(contacts, memory, geom1)
-    pos2 = _pos(contacts, memory, geom2)
-    size2 = contacts.geom_size[geom2]
+    geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
+    pos1, mat1, size1 = _geom(contacts, memory, geom1)
+    pos2, mat2, size2 = _geom(contacts, memory, geom2)
     margin = contacts.margin[p]
     first = contacts.first[p]
     near = bool(True)
@@ -116,7 +107,7 @@ def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int
             mat1 = turn * mat1
             pos2 = centre + back * (pos2 - centre)
             mat2 = back * mat2
-        distance, place, normal_of_one = cylinder_box(pos1, mat1, contacts.geom_size[geom1], pos2, mat2, size2, margin)
+        distance, place, normal_of_one = cylinder_box(pos1, mat1, size1, pos2, mat2, size2, margin)
         slot = first
         if round > 0:
             slot = first + 1 + direction
@@ -162,6 +153,12 @@ def _mat(contacts: Contacts, memory: Memory, geom: int) -> wp.mat33:
 def _pos(contacts: Contacts, memory: Memory, geom: int) -> wp.vec3:
     body = contacts.geom_body[geom]
     return memory.pos[body] + memory.mat[body] * contacts.geom_pos[geom]
+
+
+@wp.func
+def _geom(contacts: Contacts, memory: Memory, geom: int):
+    """Returns a geom's place, axes and size."""
+    return _pos(contacts, memory, geom), _mat(contacts, memory, geom), contacts.geom_size[geom]
 
 
 @wp.func
