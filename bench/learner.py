@@ -2,9 +2,10 @@
 
     python bench/learner.py [--learners ddpg td3 sac redq tqc dtqc] [--networks mlp] [--batch-sizes 256 512 1024] [--seeds 1]
         [--sampler weighted] [--dtype bfloat16 [--kernels hopper]] [--num-critics 2] [--policy-delay 1]
+        [--hidden-sizes 256 256 256] [--updates 500]
 
 As in training: as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
-until 500 updates or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one of
+until `--updates` or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one of
 them. The last column is the time of a learner's gradients over that of ddpg, each by its own products.
 """
 
@@ -24,8 +25,6 @@ from mjx_dher.spec import LEARNERS
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Episode, Sizes
 
-UPDATES = 500
-
 
 def compute_reward(achieved_goal, desired_goal):
     return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > 0.05).astype(jnp.float32)
@@ -44,13 +43,13 @@ def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayS
     return jax.jit(replay.add)(replay.init(shapes, num_episodes), episodes, priority)
 
 
-def flops(learner: Any, batch_size: int) -> float:
+def flops(learner: Any, batch_size: int, hidden_sizes: tuple[int, ...]) -> float:
     """Of the matrix products of an update, on average over a delayed actor's.
 
     In passes through a network of one kind, forward one and backward two, or one to the inputs alone: actors forward as target,
     forward and backward; critics forward as target, forward and backward, and for the actor forward and backward to the inputs.
     """
-    sizes = (28, *Config().hidden_sizes)
+    sizes = (28, *hidden_sizes)
     hidden = sum(a * b for a, b in itertools.pairwise(sizes))
     delay, parts = getattr(learner, "policy_delay", 1), getattr(learner, "critics", None)
     number, size = (1, 1) if parts is None else (parts.number, parts.size)
@@ -63,10 +62,10 @@ def flops(learner: Any, batch_size: int) -> float:
 class Timed:
     """Programs of a learner's updates, for a batch size and a number of seeds."""
 
-    def __init__(self, learner: Any, batch_size: int, seeds: int, sampler: Any):
+    def __init__(self, learner: Any, batch_size: int, seeds: int, sampler: Any, updates: int):
         self.delay = learners.policy_delay(learner)
         self.at_once = max(1, MAX_TRANSITIONS_PER_DRAW // batch_size // self.delay) * self.delay
-        self.draws = -(-UPDATES // self.at_once)
+        self.draws = -(-updates // self.at_once)
         self.shape = (self.at_once // self.delay, self.delay, batch_size)
         self.learner, self.sampler, self.ring = learner, sampler, full_ring()
         self.hparams = jax.tree.map(jnp.float32, HParams(priority_fraction=0.5))
@@ -119,6 +118,8 @@ def main() -> None:
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
     parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
+    parser.add_argument("--hidden-sizes", type=int, nargs="+", default=list(Config.hidden_sizes))
+    parser.add_argument("--updates", type=int, default=500, help="at least so many in each timed program")
     parser.add_argument("--num-critics", type=int, default=2)
     parser.add_argument("--policy-delay", type=int, default=1)
     args = parser.parse_args()
@@ -128,6 +129,7 @@ def main() -> None:
             batch_size=batch_size,
             learner_dtype=args.dtype,
             learner_kernels=args.kernels,
+            hidden_sizes=tuple(args.hidden_sizes),
             num_critics=args.num_critics,
             policy_delay=args.policy_delay,
         )
@@ -135,8 +137,8 @@ def main() -> None:
             learner = learners.make(name, config, Sizes(25, 3, 4), args.networks)
         except ValueError as error:
             parser.error(str(error))
-        both, update, draw = Timed(learner, batch_size, seeds, samplers.make(args.sampler)).seconds()
-        products = flops(learner, batch_size)
+        both, update, draw = Timed(learner, batch_size, seeds, samplers.make(args.sampler), args.updates).seconds()
+        products = flops(learner, batch_size, config.hidden_sizes)
         per_flop[batch_size, seeds, name] = update / products
         first = per_flop.get((batch_size, seeds, "ddpg"))
         rows.append(
