@@ -104,13 +104,15 @@ def _paper(env: str) -> tuple[Config, HParams]:
 
 def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu(env)
-    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_500_000)
+    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, n_step=3)
     return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
 
 
 def _gpu_slide(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu(env)
-    config = dataclasses.replace(config, updates_per_cycle=1000, total_steps=5_000_000, n_step=3)
+    config = dataclasses.replace(
+        config, updates_per_cycle=1000, total_steps=8_000_000, n_step=3, hidden_sizes=(512, 512, 512)
+    )
     return config, hparams._replace(target_noise=0.0)
 
 
