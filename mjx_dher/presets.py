@@ -110,9 +110,7 @@ def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
 
 def _gpu_slide(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu(env)
-    config = dataclasses.replace(
-        config, updates_per_cycle=1000, total_steps=8_000_000, n_step=3, hidden_sizes=(512, 512, 512)
-    )
+    config = dataclasses.replace(config, updates_per_cycle=1000, total_steps=8_000_000, n_step=3, hidden_sizes=(512, 512, 512))
     return config, hparams._replace(target_noise=0.0)
 
 
