@@ -1,258 +1,348 @@
-"""Beside gymnasium-robotics and Stable-Baselines3, on this machine's CPU, one after the other: who does what how fast?
+"""Beside Stable-Baselines3 and gymnasium-robotics: success over time on the same cores, with the same budget of wall clock.
 
-    python bench/peers.py --set-up [--parts env relabel train] [--minutes 20]
+    python bench/peers.py --env push --minutes 10 [--peers tqc sac] [--seeds 1] [--learner tqc] [--out DIR]
 
-`--set-up` makes an environment of their own in the user's cache folder (they need a MuJoCo older than ours); without it, name
-their Python with --python. Three comparisons on FetchPush, theirs and ours taking turns:
+Trains, one after the other, `python train.py --preset cpu` on the engine native, and sb3-contrib's TQC and Stable-Baselines3's
+SAC with HerReplayBuffer on the original task, and writes success.csv, success.png and a table. The peers have the settings of
+rl-baselines3-zoo (bench/peers_worker.py says which); `--peer-set batch_size=256 'net_arch=[256,256,256]'` changes them. They
+and the original tasks need a virtual environment of their own. The first call makes it in the user's cache folder with pip,
+whose configuration decides whether it gets a PyTorch for CPUs alone or a larger one; `--python` names one that is there.
 
-    env      environment steps a second with random actions: theirs in one process and in one process a core
-    relabel  hindsight transitions a second: HerReplayBuffer.sample against drawing and relabelling here
-    train    seconds and steps to a success of 0.90 in 100 episodes, evaluation not counted: their DDPG with HER with our
-             networks, batch, updates per step, discount, step sizes, relabelling and noise; it is stopped after --minutes
+Seconds are of training, evaluations included, on both sides; imports, compilation and the making of environments are not, and
+stand in the table as start-up. Ours evaluates after each epoch, a peer `--eval-every` seconds after the evaluation before. The
+budget ends no evaluation and no epoch that has begun. Ours may end earlier, at the preset's total_steps. The final success is
+that of the last policy in the original task, of both, over the same --final-episodes starts and goals.
+
+`--parts steps relabel` prints their rates: environment steps with random actions, in one process and in one process a core, and
+hindsight transitions that HerReplayBuffer draws. bench/throughput.py and bench/relabel.py print ours.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import io
+import csv
+import dataclasses
+import itertools
+import json
+import math
 import os
+import signal
+import subprocess
 import sys
 import time
-import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-import apart
-import numpy as np
+from peers_worker import EPISODE_LENGTH, FIRST_SEED, PEERS, ZOO, usable_cores
 
-from mjx_dher import presets
+from mjx_dher.config import check_count, check_number
+from mjx_dher.host import subprocesses
+from mjx_dher.host.caches import user_cache
+from mjx_dher.names import check_name, require_extra
+from mjx_dher.runs import run_folder, sinks
+from mjx_dher.spec import LEARNERS, SAMPLERS
+from mjx_dher.stats import wilson_interval
+from mjx_dher.tools import originals
 
-REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0", "stable-baselines3==2.9.2", "torch==2.13.0")
-TASK = "FetchPush-v4"
-NUM_ENVS, BATCH_SIZE, UPDATES = 32, 1024, 40  # of the preset `cpu`
-SUCCESS = 0.9
-
-
-def cores():  # their Python has no JAX, and so not this library's usable_cores
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-# Theirs: runs in their environment and prints a line of JSON. Neither JAX nor this library is there.
-
-
-def make_theirs(seed=0):
-    import gymnasium
-
-    with contextlib.redirect_stderr(io.StringIO()):  # a notice about other tasks, once a process
-        import gymnasium_robotics
-
-    gymnasium.register_envs(gymnasium_robotics)
-    env = gymnasium.make(TASK)
-    env.reset(seed=seed)
-    return env
+HERE = Path(__file__).resolve().parent
+REQUIREMENTS = (*originals.REQUIREMENTS, "stable-baselines3==2.9.2", "sb3-contrib==2.9.2", "torch==2.13.0")
+TASKS = ("push", "pick_and_place", "slide")
+COLUMNS = ("who", "env", "seed", "seconds", "env_steps", "success_rate", "return_mean")
+SUCCESS = 0.9  # the table says when it was first reached
 
 
-def vector(num_envs, processes):
-    from stable_baselines3.common.monitor import Monitor
-    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+@dataclasses.dataclass
+class Run:
+    """What one training run was, evaluation by evaluation."""
 
-    makers = [lambda seed=seed: Monitor(make_theirs(seed)) for seed in range(num_envs)]
-    return SubprocVecEnv(makers, start_method="fork") if processes else DummyVecEnv(makers)
+    who: str
+    env: str
+    seed: int
+    rows: list[dict[str, float]] = dataclasses.field(default_factory=list)  # COLUMNS from seconds on, and updates
+    startup: float = math.nan  # s
+    final_success: Sequence[int] = ()  # [final_episodes], 0 or 1
+    final_return: Sequence[float] = ()
 
-
-def their_env(_):
-    rates = {}
-    for name, num_envs in (("one process", 1), ("a process a core", cores())):
-        env = vector(num_envs, processes=num_envs > 1)
-        env.reset()
-        rng = np.random.default_rng(0)
-        start, steps = time.perf_counter(), 0
-        while time.perf_counter() - start < 10:
-            env.step(rng.uniform(-1, 1, (num_envs, 4)).astype(np.float32))
-            steps += num_envs
-        rates[name] = steps / (time.perf_counter() - start)
-        env.close()
-    return rates
+    def add(self, **row: float) -> None:
+        """Appends an evaluation and prints it."""
+        self.rows.append(row)
+        text = "{seconds:7.0f} s {env_steps:10,.0f} steps  success {success_rate:.2f}  return {return_mean:6.1f}"
+        print(f"{self.who}, seed {self.seed}: {text.format(**row)}", flush=True)
 
 
-def their_model(env, seed=0):
-    import torch
-    from stable_baselines3 import DDPG, HerReplayBuffer
-    from stable_baselines3.common.noise import NormalActionNoise
-
-    torch.set_num_threads(cores())
-    return DDPG(
-        "MultiInputPolicy",
-        env,
-        learning_rate=1e-3,
-        buffer_size=1_000_000,
-        learning_starts=NUM_ENVS * 50,
-        batch_size=BATCH_SIZE,
-        tau=0.02,
-        gamma=0.95,
-        train_freq=(50, "step"),
-        gradient_steps=UPDATES,
-        action_noise=NormalActionNoise(np.zeros(4), 0.4 * np.ones(4)),
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 16, "goal_selection_strategy": "future"},
-        policy_kwargs={"net_arch": [256, 256, 256]},
-        seed=seed,
-        device="cpu",
-    )
+# The environment of the peers.
 
 
-def their_relabel(_):
-    model = their_model(vector(NUM_ENVS, processes=True))
-    model.learn(NUM_ENVS * 50 * 8)
-    buffer = model.replay_buffer
-    buffer.sample(BATCH_SIZE)
-    times = []
-    for _ in range(50):
-        start = time.perf_counter()
-        buffer.sample(BATCH_SIZE)
-        times.append(time.perf_counter() - start)
-    model.env.close()
-    return {"transitions": BATCH_SIZE / float(np.median(times))}
+def find_python(given: Path | None) -> Path:
+    """Returns the Python that has the peers, made with pip unless it is there or `given`.
+
+    Raises:
+      ValueError: the one that is given lacks something, or pip failed; says what to do.
+    """
+    if given:
+        if not originals.is_ready(given, REQUIREMENTS):
+            raise ValueError(f"{given} must have {', '.join(REQUIREMENTS)}")
+        return given
+    environment = user_cache() / "peers"
+    python = originals.interpreter(environment)
+    if not originals.is_ready(python, REQUIREMENTS):
+        print(f"making the peers' environment in {environment} ...", flush=True)
+        try:
+            originals.set_up(environment, REQUIREMENTS)
+        except (ValueError, OSError, subprocess.SubprocessError) as error:
+            raise ValueError(
+                f"{error}\nThe peers need {', '.join(REQUIREMENTS)}: let pip reach a package index, or name with --python"
+                " the Python of an environment that has them"
+            ) from error
+    return python
 
 
-def their_train(minutes):
-    from stable_baselines3.common.callbacks import BaseCallback
-
-    test = make_theirs(seed=10_000)
-
-    class Watch(BaseCallback):
-        """Evaluates every 24,000 steps, as the preset does, with the clock stopped; ends at SUCCESS or when time is up."""
-
-        def __init__(self):
-            super().__init__()
-            self.started, self.paused, self.next, self.curve = time.perf_counter(), 0.0, 24_000, []
-
-        def _on_step(self):
-            if self.num_timesteps < self.next:
-                return True
-            self.next += 24_000
-            now = time.perf_counter()
-            seconds = now - self.started - self.paused
-            successes = 0
-            for _ in range(100):
-                obs, ended = test.reset()[0], False
-                while not ended:
-                    obs, _, _, ended, info = test.step(self.model.predict(obs, deterministic=True)[0])
-                successes += int(info["is_success"])
-            self.paused += time.perf_counter() - now
-            self.curve.append((round(seconds, 1), self.num_timesteps, successes / 100))
-            print(*self.curve[-1], file=sys.stderr, flush=True)
-            return successes < 100 * SUCCESS and seconds < 60 * minutes
-
-    watch = Watch()
-    their_model(vector(NUM_ENVS, processes=True)).learn(10**9, callback=watch)
-    return {"curve": watch.curve}
+def worker(python: Path, **request: Any) -> tuple[str, ...]:
+    """Returns the command of a part in the peers' Python."""
+    return (str(python), str(HERE / "peers_worker.py"), json.dumps(request))
 
 
-# Ours.
+def pin(cores: int) -> None:
+    """Keeps this process and all that it starts to its first `cores`, on Linux; raises ValueError where it has fewer."""
+    check_number("cores", cores, f"[1, {usable_cores()}]")
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
 
 
-def our_env():
-    """Steps a second of a compiled rollout of random actions, native."""
-    import jax
-    from timing import median_seconds
-
-    from mjx_dher import envs
-    from mjx_dher.rollout import rollout
-
-    env = envs.make("push", engine="native")
-    rates = {}
-    for num_envs in (NUM_ENVS, 128):
-        shape = (env.episode_length, num_envs, env.action_size)
-        actions = jax.random.uniform(jax.random.key(0), shape, minval=-1, maxval=1)
-        play = jax.jit(lambda key, n=num_envs, a=actions: rollout(env, lambda action, obs: action, key, n, a))
-        rates[num_envs] = num_envs * env.episode_length / median_seconds(lambda p=play: p(jax.random.key(1)))
-    return rates
+# Training.
 
 
-def our_relabel():
-    """Transitions a second, drawn as many at once as in training."""
-    import jax
-    from learner import compute_reward, full_ring
-    from timing import median_seconds
-
-    from mjx_dher import HParams, replay, samplers
-    from mjx_dher.relabel import draw_batches
-    from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW as NUM_DRAWN
-
-    ring, hparams = full_ring(), HParams()
-    cumulative = replay.cumulative_priority(ring)
-    rates = {}
-    for name in ("future", "weighted"):
-        sampler = samplers.make(name)
-        draw = jax.jit(lambda key, s=sampler: draw_batches(ring, key, (NUM_DRAWN,), s, compute_reward, hparams, cumulative))
-        rates[name] = NUM_DRAWN / median_seconds(lambda d=draw: d(jax.random.key(0)))
-    return rates
+@contextlib.contextmanager
+def started(command: Sequence[str], log: Path, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
+    """Starts a program whose messages go to a file, and kills it where the block is left before it has ended."""
+    with log.open("w") as file, subprocess.Popen(command, stdout=stdout or file, stderr=file, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
-def our_train():
-    """(seconds, env steps) to SUCCESS of the preset `cpu`, evaluations included and compilation apart; success there."""
-    from mjx_dher import envs, samplers
-    from mjx_dher.runs.loop import train
-
-    spec, sampler = presets.preset("cpu", "push"), samplers.make("weighted")
-    for progress in train(envs.make("push", engine="native"), spec.config, spec.hparams, seed=0, sampler=sampler):
-        if progress.metrics["success_rate"] >= SUCCESS:
-            break
-    return progress.wall_seconds, progress.env_steps, progress.metrics["success_rate"]
+def check_ended(process: subprocess.Popen[str], log: Path, allowed: Sequence[int] = (0,)) -> None:
+    """Waits for a program, and raises ValueError with the end of its log where its exit status is not `allowed`."""
+    if process.wait() not in allowed:
+        end = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
+        raise ValueError(f"{log.stem} failed with exit status {process.returncode}; the end of {log}:\n{end}")
 
 
-def measure(part, minutes):
-    """What `their_...` returns; their Python runs this."""
-    warnings.filterwarnings("ignore")
-    return {"env": their_env, "relabel": their_relabel, "train": their_train}[part](float(minutes))
+def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
+    """Runs train.py until it ends or the budget does, then its policy in the original task."""
+    folder, log = args.out / f"ours_seed{seed}", args.out / f"ours_seed{seed}.log"
+    options = {"env": args.env, "learner": args.learner, "sampler": args.sampler, "seed": seed, "out": folder}
+    options |= {"eval-episodes": args.episodes, "final-episodes": args.final_episodes}
+    given = [f"--{name}={value}" for name, value in options.items() if value is not None]
+    command = (sys.executable, str(HERE.parent / "train.py"), "--preset=cpu", "--engine=native", *given)
+    run, began, first, stopped = Run("mjx-dher", args.env, seed), time.perf_counter(), math.inf, False
+    with started(command, log) as process:
+        running = True
+        while running:
+            running = process.poll() is None  # before the rows are read: none is missed
+            for row in sinks.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
+                if not run.rows:
+                    first = time.perf_counter() - row["wall_seconds"]  # when training began
+                    spec = run_folder.read_spec(folder)
+                    run.who, run.startup = f"mjx-dher {spec.learner} {spec.sampler}", first - began
+                run.add(**{name: row["wall_seconds" if name == "seconds" else name] for name in (*COLUMNS[3:], "updates")})
+            if running and not stopped and time.perf_counter() - first >= 60 * args.minutes:
+                process.send_signal(signal.SIGTERM)  # it ends with the epoch; the next signal would end it at once
+                stopped = True
+            time.sleep(0.2)
+        check_ended(process, log, (0, 128 + signal.SIGTERM) if stopped else (0,))
+    outcome = originals.play_apart(folder, python, args.final_episodes, FIRST_SEED, usable_cores())
+    run.final_success, run.final_return = outcome["success"].astype(int).tolist(), outcome["ret"].tolist()
+    return run
 
 
-def compare(python, parts, minutes):
+def train_theirs(args: argparse.Namespace, learner: str, seed: int, python: Path) -> Run:
+    """Runs a learner of the peers for the budget, then its policy for the final episodes."""
+    changes = [f"{name}={value}".replace(" ", "") for name, value in args.settings.items() if value != ZOO[name]]
+    run, log = Run(" ".join((PEERS[learner], *changes)), args.env, seed), args.out / f"{learner}_seed{seed}.log"
+    request = {"task": originals.ORIGINALS[args.env], "learner": learner, "settings": args.settings, "seed": seed}
+    request |= {"seconds": 60 * args.minutes, "every": args.eval_every}
+    request |= {"episodes": args.episodes, "final": args.final_episodes}
+    began = time.perf_counter()
+    with started(worker(python, part="train", **request), log, subprocess.PIPE) as process:
+        for content in map(json.loads, process.stdout or ()):
+            if "started" in content:
+                run.startup = time.perf_counter() - began
+            elif "result" in content:
+                run.final_success, run.final_return = content["result"]["final_success"], content["result"]["final_return"]
+            else:
+                run.add(**content)
+        check_ended(process, log)
+    return run
+
+
+def train(args: argparse.Namespace, python: Path) -> None:
+    """Trains everybody in turns, and writes what there is after each run."""
+    print(f"{args.seeds * (1 + len(args.peers))} runs of {args.minutes:g} minutes at most, to {args.out}", flush=True)
+    args.out.mkdir(parents=True)
+    runs: list[Run] = []
+    for seed, who in itertools.product(range(args.seeds), (None, *args.peers)):
+        runs.append(train_theirs(args, who, seed, python) if who else train_ours(args, seed, python))
+        write_csv(runs, args.out / "success.csv")
+        draw(runs, args.out / "success.png", args.episodes)
+    print_runs(runs)
+
+
+# What comes out.
+
+
+def write_csv(runs: Sequence[Run], path: Path) -> None:
+    """Writes a line for each evaluation of each run."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for run, row in ((each, row) for each in runs for row in each.rows):
+            numbers = [f"{round(row[name], 4):.12g}" for name in COLUMNS[3:]]
+            writer.writerow((run.who, run.env, run.seed, *numbers))
+
+
+def draw(runs: Sequence[Run], path: Path, episodes: int) -> None:
+    """Draws success over seconds and over environment steps, a line a run, those of one learner alike."""
+    import matplotlib.pyplot as plt
+    from plot_time_to_success import LOOKS
+
+    looks = dict(zip(dict.fromkeys(run.who for run in runs), itertools.cycle(LOOKS)))
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6 + 0.2 * len(looks)), sharey=True, layout="constrained")
+    for axis, column in zip(axes, ("seconds", "env_steps")):
+        for run in runs:
+            color, dashes = looks[run.who]
+            look = {"color": color, "linestyle": dashes, "marker": "o", "markersize": 3, "linewidth": 1.3, "alpha": 0.8}
+            line = ([row[column] for row in run.rows], [row["success_rate"] for row in run.rows])
+            axis.plot(*line, **look, label=f"{'_' * (run.seed > 0)}{run.who}")  # one entry in the legend
+        axis.grid(alpha=0.25)
+    axes[0].set(xlim=(0, None), ylim=(-0.02, 1.02), xlabel="seconds of training, evaluations included")
+    axes[0].set(ylabel=f"success rate ({episodes} episodes)", title=f"{runs[0].env}, {usable_cores()} cores")
+    decades = [math.log10(row["env_steps"]) for run in runs for row in run.rows]
+    limits = (10 ** math.floor(min(decades)), 10 ** math.ceil(max(decades)))
+    axes[1].set(xscale="log", xlim=limits, xlabel="environment steps")
+    axes[1].xaxis.set_minor_formatter("")
+    figure.legend(*axes[1].get_legend_handles_labels(), fontsize=8, loc="outside lower center")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def print_runs(runs: Sequence[Run]) -> None:
+    """Prints a row for each run, its final success with a 95 % interval."""
     from timing import print_table
 
-    def theirs(part):
-        return apart.measured(__file__, (part, str(minutes)), python=str(python))
+    rows = []
+    for run in runs:
+        last, episodes = run.rows[-1], len(run.final_success)
+        low, high = wilson_interval(sum(run.final_success), episodes)
+        reached = next((f"{row['seconds']:.0f}" for row in run.rows if row["success_rate"] >= SUCCESS), "never")
+        evaluating = f"{sum(row['evaluation'] for row in run.rows):.0f}" if "evaluation" in last else "in each epoch"
+        counts = (
+            f"{run.startup:.0f}",
+            f"{last['seconds']:.0f}",
+            evaluating,
+            f"{last['env_steps']:,.0f}",
+            f"{last['updates']:,.0f}",
+        )
+        success = f"{sum(run.final_success) / episodes:.3f} ({low:.3f}-{high:.3f})"
+        ends = (f"{last['success_rate']:.2f}", success, f"{sum(run.final_return) / episodes:.1f}")
+        rows.append((run.who, run.seed, *counts, reached, *ends))
+    head = ("who", "seed", "start-up, s", "s", "evaluations, s", "env steps", "updates", f"s to {SUCCESS:g}", "last success")
+    print_table((*head, f"final success (95 %), {len(runs[0].final_success)} episodes", "mean return"), rows)
+
+
+def print_rates(parts: Sequence[str], env_name: str, python: Path) -> None:
+    """Measures `parts`, of `steps` and `relabel`, and prints a table; raises ValueError where the worker failed."""
+    from timing import print_table
 
     rows = []
-    if "env" in parts:
-        there, here = theirs("env"), our_env()
-        for name, rate in there.items():
-            for num_envs, ours in here.items():
-                rows.append(
-                    ("env steps/s", name, f"{rate:,.0f}", f"native, {num_envs} envs", f"{ours:,.0f}", f"{ours / rate:.1f}")
-                )
-    if "relabel" in parts:
-        rate, here = theirs("relabel")["transitions"], our_relabel()
-        for name, ours in here.items():
-            what = f"HerReplayBuffer, batch {BATCH_SIZE}"
-            rows.append(("transitions relabelled/s", what, f"{rate:,.0f}", name, f"{ours:,.0f}", f"{ours / rate:.1f}"))
-    if "train" in parts:
-        (seconds, steps, success), curve = our_train(), theirs("train")["curve"]
-        their_seconds, their_steps, their_success = curve[-1]
-        reached = their_success >= SUCCESS
-        there = f"{their_seconds:,.0f} s, {their_steps:,} steps: {their_success:.2f}"
-        here = f"{seconds:,.0f} s, {steps:,} steps: {success:.2f}"
-        ratio = f"{'' if reached else 'more than '}{their_seconds / seconds:.1f}"
-        rows.append((f"to {SUCCESS} on Push", "DDPG + HerReplayBuffer", there, "preset cpu, weighted", here, ratio))
-    print_table(("", "theirs", "", "ours", "", "ratio"), rows)
+    for part in parts:
+        answer = subprocesses.ask(worker(python, part=part, task=originals.ORIGINALS[env_name]))
+        if answer.failure:
+            raise ValueError(f"the part {part} failed: {answer.err.strip() or answer.failure}")
+        rows += [(name, f"{rate:,.0f}") for name, rate in answer.last_json()["result"].items()]
+    print_table((f"the peers on {originals.ORIGINALS[env_name]}", "a second"), rows)
 
 
-def main() -> None:
+# The command.
+
+
+def read_settings(changes: Sequence[str]) -> dict[str, Any]:
+    """Returns `ZOO` with changes NAME=VALUE, their values in JSON.
+
+    Raises:
+      ValueError: no such name, or a value of another kind; names it and what is allowed.
+    """
+    settings = dict(ZOO)
+    for name, _, text in (change.partition("=") for change in changes):
+        check_name("peer-set", name, ZOO)
+        kind, value = type(ZOO[name]), None
+        with contextlib.suppress(ValueError):
+            value = json.loads(text)
+        if not value or (kind is list) != isinstance(value, list):
+            raise ValueError(f"peer-set {name} must be in JSON, such as {json.dumps(ZOO[name])}; got {text!r}")
+        interval = "(0, 1]" if kind is float else "[1, 100000000]"
+        for number in value if kind is list else [value]:
+            check_number(f"peer-set {name}", number, interval, float if kind is float else int)
+        settings[name] = value
+    if settings["learning_starts"] < EPISODE_LENGTH * settings["n_envs"]:
+        raise ValueError(f"peer-set learning_starts must be {EPISODE_LENGTH} times n_envs or more: each ends an episode first")
+    return settings
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Returns the checked arguments; exits with a message where one cannot be used."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--parts", nargs="+", choices=("env", "relabel", "train"), default=("env", "relabel", "train"))
-    parser.add_argument("--minutes", type=float, default=20)
-    parser.add_argument("--set-up", action="store_true")
-    parser.add_argument("--python", type=Path)
-    args = parser.parse_args()
-    from mjx_dher.host.caches import user_cache
-    from mjx_dher.tools import originals
+    parser.add_argument("--env", choices=TASKS, default="push")
+    parser.add_argument("--parts", nargs="+", choices=("train", "steps", "relabel"), default=["train"])
+    parser.add_argument("--minutes", type=float, default=10, help="budget of each run (10)")
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each learner, with the seeds 0, 1, ... (1)")
+    parser.add_argument("--peers", nargs="+", choices=tuple(PEERS), default=list(PEERS))
+    parser.add_argument("--peer-set", nargs="+", default=[], metavar="NAME=VALUE", help=", ".join(ZOO))
+    parser.add_argument("--learner", choices=tuple(LEARNERS), help="ours; the preset's unless given")
+    parser.add_argument("--sampler", choices=SAMPLERS, help="ours; train.py's default unless given")
+    parser.add_argument("--episodes", type=int, default=100, help="of an evaluation (100)")
+    parser.add_argument("--final-episodes", type=int, default=100, help="of the last policy in the original task (100)")
+    parser.add_argument("--eval-every", type=float, help="seconds from one to a peer's next (60, or a quarter of the budget)")
+    parser.add_argument("--cores", type=int, default=min(2, usable_cores()), help="that each run is kept to (2)")
+    parser.add_argument("--out", type=Path, help="folder to write, which must not exist (runs/peers_ENV)")
+    parser.add_argument("--python", type=Path, help="of an environment that has the peers")
+    args = parser.parse_args(argv)
+    try:
+        check_number("minutes", args.minutes, "(0, 10000]", float)
+        args.eval_every = min(60.0, 15 * args.minutes) if args.eval_every is None else args.eval_every
+        check_number("eval-every", args.eval_every, "(0, 100000]", float)
+        for name in ("seeds", "episodes", "final_episodes"):
+            check_count(name.replace("_", "-"), getattr(args, name))
+        args.settings = read_settings(args.peer_set)
+        args.out = args.out or Path("runs") / f"peers_{args.env}"
+        if "train" in args.parts:
+            require_extra("success.png", "matplotlib", "plot")
+            if args.out.exists():
+                raise ValueError(f"out: {args.out} exists already; name a folder that does not")
+        pin(args.cores)
+    except ValueError as error:
+        parser.error(str(error))
+    return args
 
-    environment = user_cache() / "peers"
-    if args.set_up:
-        originals.set_up(environment, REQUIREMENTS)
-    compare(args.python or originals.interpreter(environment), args.parts, args.minutes)
+
+def main() -> int:
+    """Runs what the command line asks for; returns the exit status."""
+    args = parse()
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    try:
+        python = find_python(args.python)
+        if "train" in args.parts:
+            train(args, python)
+        if parts := [part for part in args.parts if part != "train"]:
+            print_rates(parts, args.env, python)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":
-    apart.main(measure, main)
+    sys.exit(main())
