@@ -38,3 +38,18 @@ def test_the_compiler_searches_for_fast_products_only_where_many_updates_follow(
     loop.compile_program(program, jax.random.key(0), HParams(), updates)
     init = None if triton is None else False
     assert sorted(asked, key=str) == sorted([init, triton], key=str)  # of init, and of the epoch
+
+
+@pytest.mark.parametrize(("backend", "level"), [("cpu", 0), ("gpu", None)])
+def test_a_plain_program_is_not_optimized_on_a_cpu(backend, level, monkeypatch):
+    asked = []
+    lowered = types.SimpleNamespace(compile=lambda compiler_options: asked.append(compiler_options))
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    loop.compile_lowered(lowered, plain=True)
+    loop.compile_lowered(lowered)
+    assert [options.get("xla_backend_optimization_level") for options in asked] == [level, None]
+
+
+def test_the_options_of_a_plain_program_are_known_to_the_compiler():
+    compiled = loop.compile_lowered(jax.jit(lambda x: x + 1).lower(1.0), plain=True)
+    assert compiled(1.0) == 2.0

@@ -158,14 +158,17 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     return Compiled(init=lambda key, hparams: compiled_init(key, as_arrays(hparams)), epoch=compiled, nbytes=nbytes)
 
 
-def compile_lowered(lowered: jax.stages.Lowered, search: bool = False) -> jax.stages.Compiled:
-    """Compiles what `jax.jit(...).lower` gave, on a GPU without what takes most of the time there.
+def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
+    """Compiles what `jax.jit(...).lower` gave, without what takes most of the time and gains little.
 
-    One pass makes Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many
-    tilings each, what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix
-    products compiled, with many tilings each, to be timed against those of cuBLAS, which has its own ready.
+    On a CPU a program of which physics takes nearly all the time need not be optimized (`plain`). On a GPU one pass makes
+    Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many tilings each,
+    what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix products compiled,
+    with many tilings each, to be timed against those of cuBLAS, which has its own ready.
     """
-    options: dict[str, str | bool] = {}
+    options: dict[str, str | bool | int] = {}
+    if plain and jax.default_backend() == "cpu":
+        options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     if jax.default_backend() == "gpu":
         options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
         if "xla_gpu_enable_triton_gemm" not in os.environ.get("XLA_FLAGS", ""):

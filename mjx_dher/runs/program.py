@@ -118,7 +118,7 @@ def _compile_evaluation(
     init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
     lowered = jax.jit(evaluate_all).lower(jax.eval_shape(init, keys, hparams), keys)
     pool = concurrent.futures.ThreadPoolExecutor(1)
-    compiling = pool.submit(loop.compile_lowered, lowered)
+    compiling = pool.submit(loop.compile_lowered, lowered, plain=True)
     pool.shutdown(wait=not beside)
     return cast("concurrent.futures.Future[EvaluateFn]", compiling)
 
