@@ -11,8 +11,9 @@ import mjx_dher
 
 # All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
-    "types names stats cli.output host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
-    "config normalizer replay rollout host.caches host.warp_setup envs.base envs.kinematics envs.engines.base",
+    "types names stats cli.commands cli.output tools.page host.files host.memory host.private_api host.subprocesses",
+    "hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
+    "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
     "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
     "presets networks priorities samplers runs.identity runs.health testing.env",
@@ -28,12 +29,14 @@ LAYERS = [
     "testing.learner learners.ddpg learners.actor_critic runs.loop runs.load runs.options runs.results",
     "learners.td3 learners.sac learners.redq learners.tqc",
     "envs.push envs.pick_and_place envs.slide envs.reach",
-    "envs testing.parts runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
+    "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program sweeps.tables tools.doctor tools.programs",
-    "runs.driver cli.common sweeps.comparison gym cli.doctor",
+    "runs.driver cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
     "cli.check cli.export cli.evaluate cli.render cli.transfer",
     "sweeps.sweep sweeps.plotting cli.train",
-    "cli.sweep",
+    "cli.sweep sweeps.report",
+    "cli.plot",
+    "cli.report",
     "cli",
 ]
 EMPTY = "envs.engines.fused hopper host runs sweeps tools"  # folders: they hold a docstring

@@ -19,6 +19,8 @@ class Options:
     """Epochs between checkpoints, from which a run goes on; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
     keep: int = 2
     """Checkpoints to keep, the newest (of runs side by side: one); they are deleted when the run has ended."""
+    keep_end: bool = False
+    """Checkpoint of the end, kept, from which `resume --total-steps` makes a single run longer; as large as the replay ring."""
     log: tuple[str, ...] = ()
     """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
     stop_at: float | None = None
@@ -29,6 +31,8 @@ class Options:
         check_count("final_episodes", self.final_episodes)
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
+        if not isinstance(self.keep_end, bool):
+            raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
         sinks.check(self.log)
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
