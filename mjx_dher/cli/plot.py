@@ -54,10 +54,11 @@ def plot_command(argv: list[str], console: Console) -> int:
     files.make_folder(out)
     if together:
         print_table(*curves.table(runs), console)
-    figure, name = (curves.draw_together(runs), TOGETHER) if together else (curves.draw(runs[0]), curves.CURVE)
-    for ending in args.formats:
-        figures.write(figure, out / f"{name}.{ending}")
-        console.print(f"wrote {out / f'{name}.{ending}'}", soft_wrap=True)
+    name = TOGETHER if together else curves.CURVE
+    for ending in args.formats:  # drawn anew: a figure that was written before has another layout
+        path = out / f"{name}.{ending}"
+        figures.write(curves.draw_together(runs) if together else curves.draw(runs[0]), path)
+        console.print(f"wrote {path}", soft_wrap=True)
     return 0
 
 

@@ -137,6 +137,7 @@ def _check(args: SweepArgs) -> None:
     if args.lanes is not None:
         check_count("lanes", args.lanes)
     args.options.check()
+    args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
     _parse_shard(args.shard)
     if args.out.exists() and not args.out.is_dir():

@@ -108,10 +108,8 @@ def train_runs(
     options = options or Options()
     options.check()
     _check_runs(env, specs, folders)
-    if options.stop_at is not None and (sweep or len(specs) > 1):
-        raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
-    if options.keep_end and (sweep or len(specs) > 1):
-        raise ValueError("keep_end is for one run alone: those of a sweep grow by another command of a longer sweep")
+    if sweep or len(specs) > 1:
+        options.check_many()
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     shared = folders[0].parent / "unfinished" if shared is None else shared

@@ -37,6 +37,13 @@ class Options:
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
 
+    def check_many(self) -> None:
+        """Raises ValueError for an option that several runs cannot have."""
+        if self.stop_at is not None:
+            raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
+        if self.keep_end:
+            raise ValueError("keep_end is for one run alone: a sweep with another total_steps has runs of its own")
+
     def is_reached(self, success_rates: Sequence[float]) -> bool:
         """Returns whether a run with these success rates, an epoch each, has reached `stop_at`."""
         last = success_rates[-3:]

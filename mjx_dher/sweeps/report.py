@@ -120,11 +120,7 @@ def _runs(trials: Sequence[dict[str, Any]]) -> str:
     for trial in trials:
         final, (*_, seconds) = trial["final"], (None, *trial["curve"].get("wall_seconds", ()))
         values = [_value(trial["settings"][name]) for name in varying]
-        numbers = [
-            _number(final.get("success_rate")),
-            _number(final.get("reset_success_rate")),
-            _number((seconds or [None])[-1]),
-        ]
+        numbers = map(_number, (final.get("success_rate"), final.get("reset_success_rate"), seconds))
         rows.append([trial["folder"].name, *values, trial["seed"], trial["status"], *numbers, trial["reason"]])
     return page.table(head, rows)
 
