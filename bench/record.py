@@ -91,7 +91,7 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
     engine = resolve_engine("auto")
     rates = [throughput.measure("push", engine, run.num_envs)[0] for _ in range(repeats)]
     made = learners.make("ddpg", run, Sizes(25, 3, 4))
-    timed = learner_bench.Timed(made, run.batch_size, 1, samplers.make("future"), 500)
+    timed = learner_bench.Timed(made, run.batch_size, 1, samplers.make("future"), 200)
     updates = [1 / timed.seconds()[0] for _ in range(repeats)]
     medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]))
     setup = {"preset": preset, "engine": engine, "num_envs": run.num_envs, "batch_size": run.batch_size, "repeats": repeats}
