@@ -28,7 +28,7 @@ def median_seconds(run: Callable[[], Any], repeats: int = 7) -> float:
 def machine() -> str:
     """One line: device, cores, versions."""
     versions = " ".join(f"{name} {metadata.version(name)}" for name in ("jax", "mujoco"))
-    return f"{jax.devices()[0].device_kind}, {_cpu()}, {usable_cores()} cores; Python {platform.python_version()} {versions}"
+    return f"{jax.devices()[0].device_kind}, {cpu()}, {usable_cores()} cores; Python {platform.python_version()} {versions}"
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -42,7 +42,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
             print("|" + "|".join("-" * (width + 2) for width in widths) + "|")
 
 
-def _cpu() -> str:
+def cpu() -> str:
     try:
         with open("/proc/cpuinfo") as file:
             names = [line.split(":")[1].strip() for line in file if line.startswith("model name")]

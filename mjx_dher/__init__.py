@@ -9,7 +9,7 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # In a checkout that was not installed, the environments lie beside this package, not in it.
 _checkout = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))

@@ -36,6 +36,11 @@ def check_name(field: str, value: str, allowed: Iterable[str], own: bool = False
     raise ValueError(f"{field} must be one of {', '.join(allowed)}{rest}; got {value!r}{_hint(str(value), allowed)}")
 
 
+def program() -> str:
+    """Returns what this program's command is called where it was started: mjx-dher if it is installed, else train.py."""
+    return "mjx-dher" if Path(sys.argv[0]).stem == "mjx-dher" else "train.py"
+
+
 def is_import_path(name: str) -> bool:
     """Returns whether a name is an import path "module:attribute", not a name that this library registers."""
     return ":" in str(name)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 from mjx_dher import config as config_lib
@@ -21,6 +23,7 @@ LEARNERS = {
     **{name: f"mjx_dher.learners.{name}:make" for name in ("ddpg", "td3", "sac", "redq", "tqc")},
     "dtqc": "mjx_dher.learners.tqc:make_deterministic",
 }
+Argument = bool | int | float | str  # of an environment's constructor
 NETWORKS = {name: f"mjx_dher.networks:{name}" for name in ("mlp", "layer_norm")}
 
 
@@ -29,9 +32,11 @@ class RunSpec:
     """Everything that decides what a run computes. Each part is a name, or an own one as module:attribute."""
 
     env: str = "push"
-    """Environment: a name from `envs.list_envs()`, or module:attribute."""
+    """Environment: push, pick_and_place, slide or reach, or module:attribute."""
     engine: Engine = "auto"
     """Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto, which picks."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments of the environment, NAME=VALUE each: reward_type=dense distance_threshold=0.03 episode_length=80."""
     sampler: str = "future"
     """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest or weighted, or
     module:attribute."""
@@ -53,6 +58,15 @@ class RunSpec:
     hparams: HParams = dataclasses.field(default_factory=HParams)
     """Numbers of the algorithm."""
 
+    def __post_init__(self) -> None:
+        with contextlib.suppress(ValueError, TypeError):  # `validate` says what is wrong
+            object.__setattr__(self, "env_kwargs", to_texts(to_arguments(self.env_kwargs)))
+
+    @property
+    def env_arguments(self) -> dict[str, Argument]:
+        """Arguments for `envs.make`, by name."""
+        return to_arguments(self.env_kwargs)
+
     @property
     def sampler_choice(self) -> tuple[str, str, str]:
         """Arguments of `samplers.make`."""
@@ -72,6 +86,41 @@ PARTS = {  # by field, the names that are built in; each field takes module:attr
     "learner": LEARNERS,
     "networks": NETWORKS,
 }
+
+
+def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
+    """Returns the arguments that "NAME=VALUE" texts stand for; a value is true, false, a number, or else a text.
+
+    Raises:
+      ValueError: one is no such text, a number is not finite, or a name comes twice or is that of an option of its own.
+    """
+    arguments: dict[str, Argument] = {}
+    for text in texts:
+        name, _, value = str(text).partition("=")
+        if not (isinstance(text, str) and name.isidentifier() and value):
+            raise ValueError(f"env_kwargs must be NAME=VALUE each, such as reward_type=dense; got {text!r}")
+        if name in arguments:
+            raise ValueError(f"env_kwargs has {name} twice")
+        if name == "engine":
+            raise ValueError("env_kwargs cannot have engine, which is a setting of its own: --engine")
+        arguments[name] = _to_argument(value)
+        if arguments[name] in (math.inf, -math.inf) or arguments[name] != arguments[name]:
+            raise ValueError(f"env_kwargs: {name} must be finite; got {value}")
+    return arguments
+
+
+def to_texts(arguments: Mapping[str, Argument]) -> tuple[str, ...]:
+    """Returns arguments as texts "NAME=VALUE" in the order of their names, the inverse of `to_arguments`."""
+    return tuple(f"{name}={str(x).lower() if isinstance(x, bool) else x}" for name, x in sorted(arguments.items()))
+
+
+def _to_argument(value: str) -> Argument:
+    if value in ("true", "false"):
+        return value == "true"
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return kind(value)
+    return value
 
 
 def own_parts(spec: RunSpec) -> list[str]:
@@ -103,7 +152,7 @@ def validate_values(spec: RunSpec) -> None:
       ValueError: names every field at fault, its value and what is allowed.
     """
     names = [(_check_text, name, getattr(spec, name)) for name in ("env", *PARTS)]
-    _check_all(spec, [*names, (config_lib.validate, spec.config, spec.hparams, 1)])
+    _check_all(spec, [*names, (to_arguments, spec.env_kwargs), (config_lib.validate, spec.config, spec.hparams, 1)])
 
 
 def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | None = None) -> None:
@@ -119,9 +168,17 @@ def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | No
       ValueError: names every field at fault, its value and what is allowed.
     """
     if episode_length is None:
-        episode_length = 1 if is_import_path(spec.env) else 50
+        episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
     names = [(check_name, field, getattr(spec, field), known, True) for field, known in (("env", env_names), *PARTS.items())]
-    _check_all(spec, [*names, (config_lib.validate, spec.config, spec.hparams, episode_length)])
+    checks = [(to_arguments, spec.env_kwargs), (config_lib.validate, spec.config, spec.hparams, episode_length)]
+    _check_all(spec, [*names, *checks])
+
+
+def _episode_length(spec: RunSpec) -> Any:
+    try:
+        return spec.env_arguments.get("episode_length", 50)
+    except (ValueError, TypeError):
+        return 50
 
 
 def _check_all(spec: RunSpec, checks: Sequence[tuple[Any, ...]]) -> None:

@@ -38,7 +38,8 @@ def finished(tmp_path_factory):
 
 def test_a_run_writes_its_folder(finished):
     out, _ = finished
-    assert {path.name for path in out.iterdir()} == {".lock", "config.json", "metrics.csv", "policy.npz", "result.json"}
+    names = {".lock", "config.json", "metrics.csv", "policy.npz", "result.json"}
+    assert {path.name for path in out.iterdir()} == names | {"curve.png"}
     content = json.loads((out / "config.json").read_text())
     assert (content["env"], content["sampler"], content["physics"]) == ("push", "weighted", "native")
     assert {"jax", "mujoco", "mjx_dher", "python"} <= set(content["versions"])
@@ -67,7 +68,7 @@ def test_a_run_says_what_it_does(finished):
     assert lines[5].startswith("success ")
     assert "95 % interval" in lines[5]
     assert "already at reset" in lines[5]
-    assert lines[6] == f"run folder: {out}"
+    assert lines[6:] == [f"run folder: {out}", f"learning curve: {out / 'curve.png'}"]
     assert done.stderr == ""
 
 
@@ -96,7 +97,7 @@ HUGE = str(10**20)
 BAD = [
     (["--learning-rate", "0.01"], ["--learning-rate is called --actor-lr and --critic-lr here"]),
     (["--buffer-size", "1000"], ["--buffer-size is called --replay-size here"]),
-    (["--tau=0.05"], ["--tau is called --polyak, which is 1 - tau here"]),
+    (["--tau=0.05"], ["--tau is called --polyak here, which is 1 - tau: tau 0.05 is --polyak 0.95"]),
     (["sweep", "--out", "x", "--share", "1/2"], ["--share is called --shard here"]),
     (["--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
     (["--cycles-per-epoch", HUGE], [f"cycles_per_epoch must lie in [1, 1000000]; got {HUGE}"]),
@@ -132,7 +133,7 @@ BAD = [
     (
         ["evall", "runs/x"],
         [
-            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, check, doctor;",
+            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, report, list, check, doctor,",
             "got 'evall' (did you mean 'eval'?)",
         ],
     ),

@@ -1,7 +1,11 @@
 import ast
+import os
+import re
 import shutil
 import subprocess
 import sys
+import tarfile
+import tomllib
 import zipfile
 
 import pytest
@@ -11,8 +15,9 @@ import mjx_dher
 
 # All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
-    "types names stats cli.output host.files host.memory host.private_api host.subprocesses hopper.layout runs.stopping",
-    "config normalizer replay rollout host.caches host.warp_setup envs.base envs.kinematics envs.engines.base",
+    "types names stats cli.commands cli.output tools.page host.files host.memory host.private_api host.subprocesses",
+    "hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
+    "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
     "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
     "presets networks priorities samplers runs.identity runs.health testing.env",
@@ -28,12 +33,14 @@ LAYERS = [
     "testing.learner learners.ddpg learners.actor_critic runs.loop runs.load runs.options runs.results",
     "learners.td3 learners.sac learners.redq learners.tqc",
     "envs.push envs.pick_and_place envs.slide envs.reach",
-    "envs testing.parts runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
+    "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program sweeps.tables tools.doctor tools.programs",
-    "runs.driver cli.common sweeps.comparison gym cli.doctor",
+    "runs.driver cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
     "cli.check cli.export cli.evaluate cli.render cli.transfer",
     "sweeps.sweep sweeps.plotting cli.train",
-    "cli.sweep",
+    "cli.sweep sweeps.report",
+    "cli.plot",
+    "cli.report",
     "cli",
 ]
 EMPTY = "envs.engines.fused hopper host runs sweeps tools"  # folders: they hold a docstring
@@ -111,17 +118,37 @@ def test_public_names_are_there():
         mjx_dher.nonsense  # noqa: B018
 
 
-def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
-    source = tmp_path / "source"  # building leaves files behind
-    ignored = shutil.ignore_patterns("__pycache__")
-    for name in ("mjx_dher", "envs"):
-        shutil.copytree(ROOT / name, source / name, ignore=ignored)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path, source]
+def tracked():
+    """Every file of this checkout that is to be committed."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode != 0:
+        pytest.skip("this is no checkout of git's")
+    return {name for name in listed.stdout.splitlines() if (ROOT / name).is_file()}
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory):
+    """The sdist of this checkout, and the wheel that is built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    for name in tracked():  # elsewhere, because building leaves files behind
+        (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / "source" / name)
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "source"]
     built = subprocess.run(command, check=False, capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr
-    (wheel,) = tmp_path.glob("*.whl")
+    return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
+
+
+def test_the_sdist_holds_what_the_checkout_holds(distributions):
+    with tarfile.open(distributions[0]) as archive:
+        files = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
+    made = {name for name in files if name.startswith("mjx_dher.egg-info/")} | {"PKG-INFO", "setup.cfg"}
+    assert files == tracked() | made
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(distributions):
+    _, wheel = distributions
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"mjx_dher", f"mjx_dher-{mjx_dher.__version__}.dist-info"}
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
@@ -129,3 +156,33 @@ def test_the_wheel_holds_the_package_and_nothing_else(tmp_path):
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
     expected |= {"mjx_dher/py.typed", "mjx_dher/hopper/kernels.cu"}
     assert {name for name in names if name.startswith("mjx_dher/")} == expected
+
+
+def test_the_wheel_works_away_from_any_checkout(distributions, tmp_path):
+    """Its dependencies are those of this environment; .ci/dist has a fresh one."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", tmp_path / "site", distributions[1]]
+    subprocess.run(command, check=True, capture_output=True)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+
+    def run(*arguments):
+        return subprocess.run(arguments, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+
+    script = str(tmp_path / "site" / "bin" / "mjx-dher")
+    assert run(sys.executable, script, "--version") == f"mjx-dher {mjx_dher.__version__}\n"
+    assert "  weighted " in run(sys.executable, script, "list")
+    assert run(sys.executable, script, "eval", "--help").startswith("usage: mjx-dher eval ")
+    where = run(
+        sys.executable, "-P", "-c", "import mjx_dher.envs.push as push; print(push.__file__); push.Push(engine='native')"
+    )
+    assert where.startswith(str(tmp_path / "site"))
+
+
+def test_the_version_is_the_same_everywhere():
+    citation, changes = (ROOT / "CITATION.cff").read_text(), (ROOT / "CHANGELOG.md").read_text()
+    assert f"\nversion: {mjx_dher.__version__}\n" in citation
+    date = re.search(r"\ndate-released: (.*)\n", citation)[1]
+    top = re.search(r"\n## (.*)\n", changes)[1]
+    assert top in ("Unreleased", f"{mjx_dher.__version__} ({date})")
+    assert f"\n## {mjx_dher.__version__} ({date})\n" in changes
+    metadata = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert metadata["authors"] == [{"name": re.search(r"\n  - name: (.*)\n", citation)[1]}]

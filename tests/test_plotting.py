@@ -50,7 +50,7 @@ def texts(figure):
 @pytest.fixture(autouse=True)
 def close():
     yield
-    plotting._pyplot().close("all")
+    plotting.close()
 
 
 @pytest.mark.parametrize(("count", "env"), [(1, "push"), (8, ENV)])

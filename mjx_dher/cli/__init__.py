@@ -10,22 +10,9 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import __version__, names
 from mjx_dher.cli import output
-
-# Each command, and the function (argv, console) -> exit status.
-COMMANDS = {
-    "train": "mjx_dher.cli.train:train_command",
-    "resume": "mjx_dher.cli.train:resume_command",
-    "eval": "mjx_dher.cli.evaluate:eval_command",
-    "render": "mjx_dher.cli.render:render_command",
-    "transfer": "mjx_dher.cli.transfer:transfer_command",
-    "export": "mjx_dher.cli.export:export_command",
-    "sweep": "mjx_dher.cli.sweep:sweep_command",
-    "plot": "mjx_dher.cli.sweep:plot_command",
-    "check": "mjx_dher.cli.check:check_command",
-    "doctor": "mjx_dher.cli.doctor:doctor_command",
-}
+from mjx_dher.cli.commands import COMMANDS
 
 MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that decide it
 TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk, not on the screen
@@ -34,6 +21,9 @@ TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (2: the arguments were refused)."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    if argv == ["--version"]:
+        print(f"mjx-dher {__version__}")
+        return 0
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
         sys.path.append("")

@@ -7,7 +7,8 @@ import dataclasses
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, presets, spec
+from mjx_dher import envs, names, presets, spec
+from mjx_dher.cli.common import make_env
 from mjx_dher.host.caches import prepare
 from mjx_dher.spec import Engine
 
@@ -23,6 +24,8 @@ class CheckArgs:
     """Environment to try, or to try the other parts in: a name, or module:attribute."""
     engine: Engine = "auto"
     """Physics: native, warp, jax or auto."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments of the environment, NAME=VALUE each."""
     sampler: str = "future"
     """Sampler of hindsight goals."""
     weight_kernel: str = "linear"
@@ -39,14 +42,14 @@ class CheckArgs:
 
 def check_command(argv: list[str], console: Console) -> int:
     """Tries out parts of the user's own."""
-    args = tyro.cli(CheckArgs, prog="train.py check", args=argv)
-    run = presets.preset("cpu", args.env, **{name: getattr(args, name) for name in ("engine", *spec.PARTS)})
+    args = tyro.cli(CheckArgs, prog=f"{names.program()} check", args=argv)
+    run = presets.preset("cpu", args.env, **{name: getattr(args, name) for name in ("engine", "env_kwargs", *spec.PARTS)})
     spec.validate(run, envs.list_envs())
     if not spec.own_parts(run):
         raise ValueError("check takes one or more parts as module:attribute; all of these are built in")
     prepare()
     from mjx_dher.testing import check_parts
 
-    for line in check_parts(envs.make(run.env, engine=run.engine), run):
+    for line in check_parts(make_env(run), run):
         console.print(line, soft_wrap=True)
     return 0

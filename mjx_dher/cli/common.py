@@ -9,32 +9,55 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from mjx_dher import envs
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
-from mjx_dher.spec import ENGINES, RunSpec, own_parts
+from mjx_dher.spec import ENGINES, RunSpec, own_parts, to_arguments, to_texts
 
+CURVE_WIDTH = 24  # characters of the live curve
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
 
 # Flags that other libraries have, and earlier ones of this one, with the names here.
 FOREIGN_FLAGS = {
     "--learning-rate": "--actor-lr and --critic-lr",
     "--lr": "--actor-lr and --critic-lr",
+    "--policy-lr": "--actor-lr",
+    "--q-lr": "--critic-lr",
     "--buffer-size": "--replay-size",
     "--replay-buffer-size": "--replay-size",
-    "--tau": "--polyak, which is 1 - tau",
+    "--max-replay-size": "--replay-size",
+    "--tau": "--polyak, which is 1 - tau: tau 0.05 is --polyak 0.95",
+    "--soft-target-tau": "--polyak, which is 1 - tau: tau 0.05 is --polyak 0.95",
     "--discount": "--gamma",
+    "--discounting": "--gamma",
     "--n-envs": "--num-envs",
-    "--total-timesteps": "--total-steps",
+    "--total-timesteps": "--total-steps, of all environments together",
+    "--num-timesteps": "--total-steps, of all environments together",
+    "--n-timesteps": "--total-steps, of all environments together",
+    "--total-env-steps": "--total-steps, of all environments together",
+    "--timesteps": "--total-steps, of all environments together",
     "--n-sampled-goal": "--her-k",
+    "--goal-selection-strategy": "--sampler",
+    "--gradient-steps": "--updates-per-cycle, for the num_envs episodes of a cycle together",
+    "--target-update-interval": "--target-period",
+    "--exploration-noise": "--noise-std",
+    "--net-arch": "--hidden-sizes",
+    "--env-id": "--env",
+    "--algo": "--learner",
+    "--track": "--log wandb",
+    "--tensorboard-log": "--log tensorboard",
+    "--n-eval-episodes": "--eval-episodes",
     "--eventful-share": "--priority-fraction",
     "--share": "--shard",
 }
+LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
 
 
 def refuse_foreign_flags(argv: Sequence[str]) -> None:
@@ -42,13 +65,33 @@ def refuse_foreign_flags(argv: Sequence[str]) -> None:
     for argument in argv:
         flag = argument.partition("=")[0].replace("_", "-")
         if flag in FOREIGN_FLAGS:
-            raise ValueError(f"{flag} is called {FOREIGN_FLAGS[flag]} here")
+            name, comma, rest = FOREIGN_FLAGS[flag].partition(",")
+            raise ValueError(f"{flag} is called {name} here{comma}{rest}")
+
+
+def warn_of_tau(polyak: float, console: Console) -> None:
+    """Prints what a small polyak means, which is more likely meant as the tau of other libraries."""
+    if polyak < LEAST_LIKELY_POLYAK:
+        console.print(
+            f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries",
+            soft_wrap=True,
+        )
 
 
 def check_engine(engine: str | None) -> None:
     """Raises ValueError for a name that is no engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
+
+
+def make_env(run: RunSpec, engine: str | None = None) -> Any:
+    """Makes the environment of a run, with another engine than the run's if one is given."""
+    return envs.make(run.env, engine=engine or run.engine, **run.env_arguments)
+
+
+def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
+    """Returns a run whose environment has the arguments in `env_kwargs` in place of its own of these names."""
+    return dataclasses.replace(run, env_kwargs=to_texts({**run.env_arguments, **to_arguments(env_kwargs)}))
 
 
 def settle_compiler(engine: str) -> None:
@@ -118,9 +161,15 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
 
 
 class Screen:
-    """Progress over one run or many: a live bar on a terminal; elsewhere lines, of a sweep one now and then."""
+    """Progress over one run or many: a live bar and curve on a terminal; elsewhere lines, of a sweep one now and then.
 
-    def __init__(self, console: Console, specs: Sequence[RunSpec]):
+    Args:
+      console: to print to.
+      specs: runs that will be trained.
+      success: success rates of the epochs that had ended, of a run that is resumed.
+    """
+
+    def __init__(self, console: Console, specs: Sequence[RunSpec], success: Sequence[float] = ()):
         self._console, self._single = console, len(specs) == 1
         self._total = sum(spec.config.total_steps for spec in specs)
         self._done = 0.0  # environment steps, of all runs
@@ -129,17 +178,21 @@ class Screen:
         self._trained = 0.0  # since this start of the program, in `_seconds`
         self._seconds = 0.0
         self._printed = time.monotonic()
+        self._success = list(success)  # of those that train now, an epoch each
         self._bar: Bar | None = None
         if console.is_terminal:
-            self._bar = Bar(BarColumn(bar_width=20), TextColumn("{task.description}"), console=console)
-            self._task = self._bar.add_task("...", total=self._total)
+            columns = (BarColumn(bar_width=20), TextColumn("{task.fields[curve]}"), TextColumn("{task.description}"))
+            self._bar = Bar(*columns, console=console)
+            self._task = self._bar.add_task("...", total=self._total, curve="")
             self._bar.start()
 
     def show(self, specs: Sequence[RunSpec], progress: Any) -> None:
         """Shows an epoch of those side by side; `progress` is a `loop.Progress`."""
         total = specs[0].config.total_steps
         if list(specs) != list(self._present):
+            self._success = [] if self._present else self._success
             self._present, self._done_before = specs, self._done
+        self._success.append(float(np.mean(progress.metrics["success_rate"])))
         per_epoch = len(specs) * total / progress.num_epochs
         self._done = self._done_before + per_epoch * progress.epoch
         self._trained += per_epoch
@@ -148,7 +201,8 @@ class Screen:
         last = progress.epoch == progress.num_epochs
         line = self._line_of_one(progress, eta) if self._single else self._line_of_many(specs, progress, eta)
         if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, description=line)
+            curve = sparkline(self._success, ascii_only=self._console.options.ascii_only)
+            self._bar.update(self._task, completed=self._done, description=line, curve=curve)
         elif self._single or last or time.monotonic() - self._printed > SECONDS_PER_LINE:
             self._console.print(line, soft_wrap=True, highlight=False)
             self._printed = time.monotonic()
@@ -177,6 +231,13 @@ class Screen:
         """Ends the live bar."""
         if self._bar is not None:
             self._bar.stop()
+
+
+def sparkline(rates: Sequence[float], width: int = CURVE_WIDTH, ascii_only: bool = False) -> str:
+    """Returns a curve of rates in [0, 1] as a line of at most `width` characters, each the mean of its share of them."""
+    levels = " .:-=+*#" if ascii_only else "▁▂▃▄▅▆▇█"
+    parts = np.array_split(np.clip(np.nan_to_num(rates), 0, 1), min(width, len(rates))) if len(rates) else ()
+    return "".join(levels[min(int(part.mean() * len(levels)), len(levels) - 1)] for part in parts)
 
 
 def clock(seconds: float) -> str:

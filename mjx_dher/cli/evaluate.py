@@ -3,46 +3,75 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs
-from mjx_dher.cli.common import check_engine, print_summary, read_run, settle_compiler
+from mjx_dher import names
+from mjx_dher.cli.common import changed_arguments, check_engine, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.config import check_count
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
+from mjx_dher.spec import RunSpec, to_arguments
 
 
 @dataclasses.dataclass(frozen=True)
 class EvalArgs:
-    """Evaluate the policy of a run folder again."""
+    """Evaluate the policy of one run folder again, or of several, one after the other."""
 
-    run: tyro.conf.Positional[Path]
-    """Run folder."""
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
     episodes: int = 500
     """Episodes to play."""
     seed: int = 1
     """Seed of the starts and goals."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
+    json: bool = False
+    """Print one JSON object a run, a line each, instead; remarks then go to standard error."""
 
 
 def eval_command(argv: list[str], console: Console) -> int:
-    """Evaluates the policy of a run folder."""
-    args = tyro.cli(EvalArgs, prog="train.py eval", args=argv)
+    """Evaluates the policies of run folders."""
+    args = tyro.cli(EvalArgs, prog=f"{names.program()} eval", args=argv)
+    if not args.runs:
+        raise ValueError("eval takes one or more run folders; got none")
     check_count("episodes", args.episodes)
     check_engine(args.engine)
-    run = read_run(args.run, console)
-    settle_compiler(args.engine or run.engine)
-    from mjx_dher.runs.load import check_fits, load_policy
+    to_arguments(args.env_kwargs)
+    remarks = Console(stderr=True, highlight=False, markup=False, emoji=False) if args.json else console
+    runs = [changed_arguments(read_run(path, remarks), args.env_kwargs) for path in args.runs]
+    for run in runs:
+        settle_compiler(args.engine or run.engine)
+    from mjx_dher.runs.load import load_policy
+
+    policies = [load_policy(path) for path in args.runs]  # all of them, before any is played
+    keep_compiled_programs()
+    for path, run, policy in zip(args.runs, runs, policies):
+        _evaluate(args, path, run, policy, console)
+    return 0
+
+
+def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Console) -> None:
+    """Plays the policy of one run, and prints how it went."""
+    from mjx_dher.runs.load import check_fits
     from mjx_dher.runs.play import play, summarize
 
-    policy = load_policy(args.run)
-    keep_compiled_programs()
-    env = envs.make(run.env, engine=args.engine or run.engine)
+    env = make_env(run, args.engine)
     check_fits(policy, env)
-    console.print(f"{run.env}: {args.episodes} episodes, seed {args.seed}, physics {run_folder.engine_name(env)} ...")
+    physics = run_folder.engine_name(env)
+    if args.json:
+        head = {"run": str(path), "env": run.env, "env_kwargs": run.env_arguments, "physics": physics, "seed": args.seed}
+        summary = summarize(*play(env, policy, args.episodes, args.seed))
+        plain = {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in summary.items()}
+        print(json.dumps({**head, **plain}), flush=True)
+        return
+    where = f"{path}: " if len(args.runs) > 1 else ""
+    console.print(f"{where}{run.env}: {args.episodes} episodes, seed {args.seed}, physics {physics} ...", soft_wrap=True)
     print_summary(summarize(*play(env, policy, args.episodes, args.seed)), console)
-    return 0

@@ -34,7 +34,7 @@ def export_command(argv: list[str], console: Console) -> int:
     from mjx_dher.runs.load import check_plain, load_policy
     from mjx_dher.tools import export
 
-    args = tyro.cli(ExportArgs, prog="train.py export", args=argv)
+    args = tyro.cli(ExportArgs, prog=f"{names.program()} export", args=argv)
     names.check_name("format", args.format, export.FORMATS)
     run = run_folder.read_spec(args.run)
     out = args.out or args.run / f"policy.{args.format}"

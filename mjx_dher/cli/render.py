@@ -9,13 +9,13 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs
-from mjx_dher.cli.common import check_engine, read_run
+from mjx_dher import envs, names
+from mjx_dher.cli.common import changed_arguments, check_engine, make_env, read_run
 from mjx_dher.config import check_count
 from mjx_dher.host.caches import check_platform
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import RunSpec, to_arguments
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +35,8 @@ class RenderArgs:
     """Episodes to play, one after the other."""
     seed: int = 1
     """Seed of the starts, the goals and the random actions."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
     width: int = 640
@@ -47,13 +49,14 @@ class RenderArgs:
 
 def render_command(argv: list[str], console: Console) -> int:
     """Draws episodes of a run's policy, or of random actions."""
-    from mjx_dher.runs.load import check_fits, load_policy
+    from mjx_dher.runs.load import load_policy
     from mjx_dher.tools import render
 
-    args = tyro.cli(RenderArgs, prog="train.py render", args=argv)
+    args = tyro.cli(RenderArgs, prog=f"{names.program()} render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     check_count("episodes", args.episodes)
     check_engine(args.engine)
+    to_arguments(args.env_kwargs)
     if args.run is not None and args.env is None:
         played, policy = read_run(args.run, console), load_policy(args.run)
     elif args.env is not None and args.run is None:
@@ -61,10 +64,31 @@ def render_command(argv: list[str], console: Console) -> int:
         played, policy = RunSpec(env=args.env), None
     else:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
+    _draw(changed_arguments(played, args.env_kwargs), policy, args, console)
+    return 0
+
+
+def draw_run(folder: Path, out: Path, episodes: int, console: Console) -> None:
+    """Draws episodes of a run's policy into a file, which it replaces.
+
+    Raises:
+      FolderError: no run folder, or it has no policy.
+      ValueError: the environment cannot be drawn, or not on this machine.
+    """
+    from mjx_dher.runs.load import load_policy
+
+    _draw(read_run(folder, console), load_policy(folder), RenderArgs(out=out, run=folder, episodes=episodes), console)
+
+
+def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> None:
+    """Plays episodes and writes their pictures; random ones where there is no policy."""
+    from mjx_dher.runs.load import check_fits
+    from mjx_dher.tools import render
+
     render.ffmpeg()
     gl = render.choose_gl()
     check_platform()
-    env: Any = envs.make(played.env, engine=args.engine or played.engine)  # Any: a GoalEnv need not have a model
+    env: Any = make_env(played, args.engine)  # Any: a GoalEnv need not have a model
     if policy is not None:
         check_fits(policy, env)
     import jax
@@ -77,10 +101,10 @@ def render_command(argv: list[str], console: Console) -> int:
 
     console.print(
         f"{played.env}: {args.episodes} episodes{'' if policy else ' of random actions'}, seed {args.seed},"
-        f" physics {run_folder.engine_name(env)}, drawn with {gl} ..."
+        f" physics {run_folder.engine_name(env)}, drawn with {gl} ...",
+        soft_wrap=True,
     )
     qpos, goals, success = render.play(env, act, args.seed, args.episodes)
     pictures = (env.model, qpos, goals, args.width, args.height)
     render.write(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
     console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)
-    return 0

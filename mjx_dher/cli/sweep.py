@@ -1,4 +1,4 @@
-"""The commands `sweep` and `plot`."""
+"""The command `sweep`, and the comparison that it prints."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, print_table, refuse_foreign_flags, settle_compiler, try_parts
+from mjx_dher import envs, names, presets, spec
+from mjx_dher.cli import settings
+from mjx_dher.cli.common import Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.config import Config, HParams, check_count, check_number
 from mjx_dher.host import files
-from mjx_dher.host.caches import prepare
+from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
@@ -71,6 +72,8 @@ class SweepArgs:
     """Environments, by name or as module:attribute."""
     engine: Engine = "auto"
     """Physics: native, warp, jax or auto."""
+    env_kwargs: tuple[str, ...] = ()
+    """Arguments of the environments, NAME=VALUE each."""
     sampler: tuple[str, ...] = ("future", "closest", "epsilon_closest", "weighted")
     """Samplers of hindsight goals, by name or as module:attribute."""
     weight_kernel: tuple[str, ...] = ("linear",)
@@ -97,22 +100,8 @@ class SweepArgs:
     """Success rate for the time that it takes to get there."""
     baseline: str = "future"
     """Setting that the others are compared with: a sampler, or a setting as the table names it."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PlotArgs:
-    """Draw a sweep's learning curves, epochs to a threshold and comparison, and write comparison.csv anew."""
-
-    folder: tyro.conf.Positional[Path]
-    """Folder of the sweep."""
-    out: Path | None = None
-    """Folder for the pictures; the sweep's own unless given."""
-    threshold: float = 0.9
-    """Success rate for the time that it takes to get there."""
-    baseline: str = "future"
-    """Setting that the others are compared with: a sampler, or a setting as the table names it."""
-    formats: tuple[str, ...] = ("png", "svg")
-    """Formats of the pictures: png, svg, pdf."""
+    dry_run: bool = False
+    """Say what would be trained, and write nothing."""
 
 
 def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
@@ -122,8 +111,12 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
       ValueError: one or more of them cannot be used.
     """
     refuse_foreign_flags(argv)
+    for flag in argv:
+        if (name := flag.partition("=")[0].lstrip("-").replace("-", "_")) in HParams._fields and flag.startswith("--"):
+            dashed = name.replace("_", "-")
+            raise ValueError(f"--{dashed} is called --sweep.{dashed} here, and takes one or more values to try")
     default = SweepArgs(tyro.MISSING, changes=_Changes(), sweep=_Axes())
-    args = tyro.cli(SweepArgs, prog="train.py sweep", args=argv, default=default)
+    args = tyro.cli(SweepArgs, prog=f"{names.program()} sweep", args=argv, default=default)
     _check(args)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
     if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
@@ -144,6 +137,7 @@ def _check(args: SweepArgs) -> None:
     if args.lanes is not None:
         check_count("lanes", args.lanes)
     args.options.check()
+    args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
     _parse_shard(args.shard)
     if args.out.exists() and not args.out.is_dir():
@@ -163,7 +157,7 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
     parts = [list(dict.fromkeys(getattr(args, field) or (None,))) for field in GRID]
     for env, *choice in itertools.product(*parts):
-        base = presets.preset(preset, env, engine=args.engine, **dict(zip(GRID[1:], choice)))
+        base = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs, **dict(zip(GRID[1:], choice)))
         base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))
         for point in itertools.product(*axes.values()):
             run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))
@@ -182,6 +176,8 @@ def _parse_shard(text: str) -> tuple[int, int]:
 def sweep_command(argv: list[str], console: Console) -> int:
     """Trains a grid of runs."""
     args, trials = parse_sweep_args(argv)
+    if args.dry_run:
+        return _dry_run(args, trials, console)
     files.make_folder(args.out / grid.CELLS)
     for text in grid.changed_files(args.out, trials):
         console.print(text, soft_wrap=True)
@@ -206,6 +202,30 @@ def sweep_command(argv: list[str], console: Console) -> int:
     return 0
 
 
+def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
+    """Says what would be trained. The environments are made, and nothing is compiled or written."""
+    settings.check_writable(args.out)
+    todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
+    console.print(f"{len(trials)} runs, {len(trials) - len(todo)} of them done already")
+    settle_compiler(args.engine)
+    check_platform()
+    turns = [program for program, _ in itertools.groupby(todo, key=lambda run: run.program)]
+    programs = list(dict.fromkeys(turns))
+    for program in programs:
+        group = [run for run in todo if run.program == program]
+        env = make_env(program)
+        for run in group:
+            spec.validate(run, envs.list_envs(), env.episode_length)
+        samplers = ", ".join(dict.fromkeys(run.sampler for run in group))
+        console.print(f"{program.env}, learner {program.learner}: {len(group)} runs; samplers {samplers}", soft_wrap=True)
+        for line in (settings.amount(program.config, env.episode_length, len(group)), *settings.memory_lines(env, group)):
+            console.print(f"  {line}", soft_wrap=True)
+    lanes = args.lanes or "one on a CPU, on a GPU as many as memory holds"
+    amount = f"{len(programs)} programs, in {len(turns)} turns"
+    console.print(f"{amount}; runs side by side: {lanes}; nothing was written", soft_wrap=True)
+    return 0
+
+
 def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None:
     """Trains what is left; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
@@ -215,14 +235,14 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
     for _, group in itertools.groupby(todo, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.own_parts, own)):
-            try_parts(envs.make(own[0].env, engine=own[0].engine), own, console)
+            try_parts(make_env(own[0]), own, console)
     stop, screen = Stop(console, args.out), Screen(console, todo)
     try:
         with stop:
             sweep.run(
                 args.out,
                 todo,
-                lambda run: envs.make(run.env, engine=run.engine),
+                make_env,
                 options=args.options,
                 lanes=args.lanes,
                 should_stop=lambda: stop.asked is not None,
@@ -240,29 +260,11 @@ def _write_tables(args: SweepArgs, console: Console) -> None:
     with files.lock(args.out / grid.CELLS, wait=True):  # another shard's program may be writing them
         trials = tables.read(args.out)
         tables.write(args.out, trials)
-        _compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)
+        compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)
     console.print(f"wrote {tables.RESULTS}, {tables.FINALS} and {comparison.COMPARISON} in {args.out}", soft_wrap=True)
 
 
-def plot_command(argv: list[str], console: Console) -> int:
-    """Draws a sweep."""
-    from mjx_dher.sweeps import comparison, plotting, tables
-
-    args = tyro.cli(PlotArgs, prog="train.py plot", args=argv)
-    check_number("threshold", args.threshold, "(0, 1]", float)
-    plotting.check(args.formats)
-    by_env = comparison.groups(tables.read(args.folder))
-    out = args.out or args.folder
-    files.make_folder(out)
-    rows = _compare(out, by_env, args.baseline, args.threshold, console)
-    for env, groups in by_env.items():
-        own = [row for row in rows if row.env == env]
-        for path in plotting.write(out, groups, own, args.threshold, args.formats):
-            console.print(f"wrote {path}", soft_wrap=True)
-    return 0
-
-
-def _compare(
+def compare(
     folder: Path, by_env: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
 ) -> Sequence[comparison.Row]:
     """Prints the comparison of all settings, and writes it into the folder."""

@@ -4,41 +4,60 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import inspect
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, presets, spec
-from mjx_dher.cli.common import Screen, check_engine, print_summary, refuse_foreign_flags, settle_compiler, try_parts
+from mjx_dher import envs, names, presets, spec
+from mjx_dher.cli import settings
+from mjx_dher.cli.common import (
+    Screen,
+    check_engine,
+    make_env,
+    print_summary,
+    refuse_foreign_flags,
+    settle_compiler,
+    try_parts,
+    warn_of_tau,
+)
 from mjx_dher.host import files
-from mjx_dher.host.caches import prepare
+from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
 from mjx_dher.names import check_name
 from mjx_dher.presets import PRESETS
-from mjx_dher.runs import identity, results, run_folder
+from mjx_dher.runs import curves, identity, results, run_folder, sinks
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import RunSpec
+from mjx_dher.tools import figures
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
-    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates one again, `render RUN` draws it,
-    `transfer RUN` plays it in the original Fetch task, `export RUN` writes its policy for other programs, `sweep` trains and
-    compares many runs, `plot DIR` draws a sweep, `check` tries out parts of your own, `doctor` says what works on this machine
-    (see `eval --help` and so on).
+    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `render RUN` draws
+    episodes, `transfer RUN` plays one in the original Fetch task, `export RUN` writes its policy for other programs, `sweep`
+    trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a page about a run or a sweep, `list` names all
+    tasks and parts, `check` tries out parts of your own, `doctor` says what works on this machine, `completion SHELL` is for
+    your shell (see `eval --help` and so on); `--version`.
     """
 
     spec: RunSpec
     preset: Literal["auto", "cpu", "gpu", "paper"] = "auto"
     """Settings that other options override: cpu or gpu (tuned for time to success there), auto (the one for this machine) or
     paper (the paper's settings)."""
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    """Run folder, or a config.json, whose settings and options are taken in place of a preset's; others given override them."""
     out: Path | None = None
     """Run folder to write; a fresh one under runs/ unless given. Never overwrites."""
+    dry_run: bool = False
+    """Say what would be trained, and what it takes, and write nothing."""
+    curve: bool = True
+    """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
     options: Options = dataclasses.field(default_factory=Options)
 
 
@@ -46,7 +65,8 @@ class TrainArgs:
 class ResumeArgs:
     """Go on with a run that was stopped, or killed, from its newest checkpoint that is whole.
 
-    With the engine that it had, on a CPU, it ends as if it had never stopped, to the bit.
+    With the engine that it had, on a CPU, it ends as if it had never stopped, to the bit. A run that has ended goes on, with a
+    larger --total-steps, if it was trained with --keep-end.
     """
 
     run: tyro.conf.Positional[Path]
@@ -61,21 +81,47 @@ class ResumeArgs:
     """Epochs between checkpoints, or 0; as the run was started with unless given."""
     keep: int | None = None
     """Checkpoints to keep; as the run was started with unless given."""
+    keep_end: bool | None = None
+    """Checkpoint of the end, kept; as the run was started with unless given."""
     log: tuple[str, ...] | None = None
     """Logs beside metrics.csv: jsonl, tensorboard, wandb; as the run was started with unless given."""
     stop_at: float | None = None
     """Success rate that ends the run; as the run was started with unless given."""
+    curve: bool = True
+    """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
 
 
 def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
     args = parse_train_args(argv)
+    if args.config_file is not None:
+        before, _, told = settings.read(args.config_file)
+        for line in (*told, settings.changes(before, args.spec)):
+            console.print(line, soft_wrap=True)
+    if args.dry_run:
+        return _dry_run(args, console)
     with run_folder.claim_new(args.out, args.spec) as folder:
         settle_compiler(args.spec.engine)
         prepare()
-        env = envs.make(args.spec.env, engine=args.spec.engine)
+        env = make_env(args.spec)
         try_parts(env, [args.spec], console)
-        return _train(env, args.spec, folder, args.options, console)
+        return _train(env, args.spec, folder, args.options, args.curve, console)
+
+
+def _dry_run(args: TrainArgs, console: Console) -> int:
+    """Says what would be trained. The environment is made, and nothing is compiled or written."""
+    settings.check_out(args.out)
+    settle_compiler(args.spec.engine)
+    check_platform()
+    env = make_env(args.spec)
+    spec.validate(args.spec, envs.list_envs(), env.episode_length)
+    memory = settings.memory_lines(env, [args.spec])
+    for title, told in settings.groups(args.spec):
+        console.print(f"{title}: {told}", soft_wrap=True)
+    amount = settings.amount(args.spec.config, env.episode_length)
+    for line in (amount, *memory, "one program to train, one for the last evaluation; nothing was written"):
+        console.print(line, soft_wrap=True)
+    return 0
 
 
 def resume_command(argv: list[str], console: Console) -> int:
@@ -89,7 +135,7 @@ def resume_command(argv: list[str], console: Console) -> int:
         settle_compiler(args.engine or content["physics"])
         prepare()
         ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
-        return _train(envs.make(run.env, engine=args.engine or ran), run, args.run, options, console)
+        return _train(make_env(run, args.engine or ran), run, args.run, options, args.curve, console)
 
 
 def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
@@ -109,16 +155,42 @@ def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> t
     if args.total_steps is not None:
         run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
     spec.validate(run, envs.list_envs())
-    names = [field.name for field in dataclasses.fields(Options)]
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    options = Options(**{**{name: content[name] for name in names if name in content}, **given})
+    fields = [field.name for field in dataclasses.fields(Options)]
+    given = {name: getattr(args, name) for name in fields if getattr(args, name) is not None}
+    options = Options(**{**{name: content[name] for name in fields if name in content}, **given})
     options.check()
-    if results.exists(args.run) and results.read(args.run)["status"] != run_folder.FAILED:
-        raise FolderError(f"{args.run} has ended; there is nothing to go on with")
+    if results.exists(args.run) and (result := results.read(args.run))["status"] != run_folder.FAILED:
+        _check_ended(args, run, options, result)
+        options = dataclasses.replace(options, stop_at=args.stop_at)  # what has ended it does not end it again
     run_folder.checkpoints_to_resume(args.run)
-    told = "; ".join(f"{name} {getattr(options, name)}" for name in names if name != "log")
+    if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
+        console.print(
+            f"step sizes fall to {run.hparams.lr_end:g} of their start over the whole run, whose length has changed: they go on"
+            " from what they would be at this point of a run of the new length",
+            soft_wrap=True,
+        )
+    told = "; ".join(f"{name} {getattr(options, name)}" for name in fields if name != "log")
     console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}", soft_wrap=True)
     return run, dataclasses.replace(options, log=tuple(options.log))
+
+
+def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[str, Any]) -> None:
+    """Raises FolderError where a run that has ended cannot go on."""
+    if not run_folder.checkpoints(args.run):
+        raise FolderError(
+            f"{args.run} has ended; there is nothing to go on with: --keep-end would have kept a checkpoint of its end."
+            f" `{names.program()} --config {args.run} --total-steps N` trains a longer one from the start"
+        )
+    if not results.can_go_on(args.run, run.config.total_steps):
+        raise FolderError(
+            f"{args.run} has ended after {result['env_steps']:,} environment steps; total_steps must be more than that for it"
+            f" to go on; got {run.config.total_steps}"
+        )
+    if args.total_steps is None and args.stop_at is None:
+        raise FolderError(
+            f"{args.run} has ended after {result['env_steps']:,} environment steps, at its stop_at {options.stop_at}:"
+            " give --total-steps, or another --stop-at, to go on"
+        )
 
 
 def parse_train_args(argv: list[str]) -> TrainArgs:
@@ -132,18 +204,32 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
     early.add_argument("--learner")
+    early.add_argument("--config", type=Path)
     chosen, _ = early.parse_known_args(argv)
     check_name("preset", chosen.preset, ("auto", *PRESETS))
+    if chosen.config is not None:
+        if chosen.preset != "auto":
+            raise ValueError("config and preset are both whole settings: give one of them")
+        base, options, _ = settings.read(chosen.config)
+        return _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
     if chosen.preset != "auto":
-        return _parse(argv, chosen.preset, chosen)
-    args = _parse(argv, "cpu", chosen)
+        return _parse_preset(argv, chosen.preset, chosen)
+    asks = {"-h", "--help"} & set(argv)  # only then is what the machine has asked for before all arguments are checked
+    args = _parse_preset(argv, presets.machine_preset() if asks else "cpu", chosen)
     preset = presets.machine_preset()
-    return args if preset == "cpu" else _parse(argv, preset, chosen)
+    return args if preset == "cpu" else _parse_preset(argv, preset, chosen)
 
 
-def _parse(argv: list[str], preset: Any, chosen: argparse.Namespace) -> TrainArgs:
+def _parse_preset(argv: list[str], preset: Any, chosen: argparse.Namespace) -> TrainArgs:
     default = TrainArgs(presets.preset(preset, chosen.env, chosen.learner))
-    args = tyro.cli(TrainArgs, prog="train.py", args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,))
+    return dataclasses.replace(_parse(argv, default, f"those of preset {preset} for {chosen.env}"), preset=preset)
+
+
+def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
+    head = f"{inspect.getdoc(TrainArgs)}\n\nDefaults below are {origin}."
+    args = tyro.cli(
+        TrainArgs, prog=names.program(), description=head, args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,)
+    )
     problems = []
     for check in (lambda: spec.validate(args.spec, envs.list_envs()), args.options.check):
         try:
@@ -152,16 +238,24 @@ def _parse(argv: list[str], preset: Any, chosen: argparse.Namespace) -> TrainArg
             problems.append(str(error))
     if problems:
         raise ValueError("\n".join(problems))
-    return dataclasses.replace(args, preset=preset)
+    return args
 
 
-def _train(env: Any, run: RunSpec, folder: Path, options: Options, console: Console) -> int:
+def _train(env: Any, run: RunSpec, folder: Path, options: Options, curve: bool, console: Console) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
     from mjx_dher.runs import driver
     from mjx_dher.runs.claims import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
-    stop, screen = Stop(console, folder), Screen(console, [run])
+    before = [row["success_rate"] for row in sinks.read_rows(folder / run_folder.METRICS_FILE)]
+    stop, screen = Stop(console, folder), Screen(console, [run], before)
+
+    def on_epoch(specs: Any, progress: Any) -> None:
+        screen.show(specs, progress)
+        if curve:
+            figures.preload()
+
+    warn_of_tau(run.hparams.polyak, console)
     try:
         with stop:
             (result,) = driver.train_runs(
@@ -171,19 +265,33 @@ def _train(env: Any, run: RunSpec, folder: Path, options: Options, console: Cons
                 options=options,
                 should_stop=lambda: stop.asked is not None,
                 report=lambda text: console.print(text, soft_wrap=True),
-                on_epoch=screen.show,
+                on_epoch=on_epoch,
             )
     finally:
         screen.close()
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
-            f" `train.py resume {folder}` goes on",
+            f" `{names.program()} resume {folder}` goes on",
             soft_wrap=True,
         )
         return 128 + (stop.asked or 0)
     if result.status == run_folder.FAILED:
+        _draw(folder, curve, console)
         raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")
     print_summary(result.content, console)
     console.print(f"run folder: {folder}", soft_wrap=True)
+    _draw(folder, curve, console)
     return 0
+
+
+def _draw(folder: Path, curve: bool, console: Console) -> None:
+    """Draws the curve of a run that has ended. A picture that cannot be drawn costs a line, and nothing else."""
+    if not (curve and figures.is_there() and sinks.whole_epochs(folder)):
+        return
+    picture = folder / f"{curves.CURVE}.png"
+    try:
+        figures.write(curves.draw(curves.read(folder)), picture)
+        console.print(f"learning curve: {picture}", soft_wrap=True)
+    except Exception as error:  # the run itself has ended as it should
+        console.print(f"the learning curve could not be drawn ({type(error).__name__}: {error})", soft_wrap=True)

@@ -8,8 +8,8 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs
-from mjx_dher.cli.common import check_engine, print_summary, read_run, settle_compiler
+from mjx_dher import names
+from mjx_dher.cli.common import check_engine, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.config import check_count
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
@@ -38,7 +38,7 @@ class TransferArgs:
 
 def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
-    args = tyro.cli(TransferArgs, prog="train.py transfer", args=argv)
+    args = tyro.cli(TransferArgs, prog=f"{names.program()} transfer", args=argv)
     check_engine(args.engine)
     check_count("episodes", args.episodes)
     run = read_run(args.run, console)
@@ -58,7 +58,9 @@ def transfer_command(argv: list[str], console: Console) -> int:
     python = args.python or originals.interpreter(environment)
     name = originals.check(run.env, python)
     keep_compiled_programs()
-    env = envs.make(run.env, engine=args.engine or run.engine)
+    if run.env_kwargs:
+        console.print(f"trained with {' '.join(run.env_kwargs)}; played without them, there and here", soft_wrap=True)
+    env = make_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
     theirs = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from mjx_dher import names
 from mjx_dher.host import files
 from mjx_dher.host.files import BusyError, FolderError
 from mjx_dher.runs import results, run_folder
@@ -22,7 +23,7 @@ class Claims:
     sweep: bool  # leave out runs that have ended or that another program has, rather than raise
     report: Callable[[str], None]
 
-    def is_free(self, folder: Path) -> bool:
+    def is_free(self, spec: RunSpec, folder: Path) -> bool:
         """Returns whether a run is to be trained, as far as can be told before its turn comes: now, not when all is compiled.
 
         Raises:
@@ -32,7 +33,7 @@ class Claims:
             return True
         try:
             with named(folder), files.lock(folder):
-                return self._is_due(folder)
+                return self._is_due(spec, folder)
         except BusyError:
             if not self.sweep:
                 raise
@@ -61,7 +62,7 @@ class Claims:
                 with named(folder), contextlib.ExitStack() as attempt:
                     files.make_folder(folder)
                     attempt.enter_context(files.lock(folder))
-                    if self._is_due(folder):
+                    if self._is_due(spec, folder):
                         claimed.append((spec, folder))
                         stack.enter_context(attempt.pop_all())
             except BusyError:
@@ -70,7 +71,7 @@ class Claims:
                 busy.append((spec, folder))
         return claimed, busy
 
-    def _is_due(self, folder: Path) -> bool:
+    def _is_due(self, spec: RunSpec, folder: Path) -> bool:
         """Returns whether a run, which is locked, is to be trained.
 
         Raises:
@@ -83,7 +84,7 @@ class Claims:
             self.report(f"{problem}; it is trained again")
         if self.sweep:
             return problem is not None
-        if problem is None and results.read(folder)["status"] == run_folder.FAILED and run_folder.checkpoints(folder):
+        if problem is None and results.can_go_on(folder, spec.config.total_steps):
             return True
         raise FolderError(problem or f"{folder} has ended; there is nothing to go on with")
 
@@ -101,4 +102,4 @@ def named(folder: Path) -> Iterator[None]:
 def last_checkpoint(folder: Path) -> str:
     """Returns what an error tells of the checkpoint that a run has left."""
     paths = run_folder.checkpoints(folder)
-    return f"`train.py resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"
+    return f"`{names.program()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"

@@ -101,20 +101,21 @@ def train_runs(
       A Result each; fewer than `specs` where training was stopped before their turn, or runs were left out.
 
     Raises:
-      ValueError: a run that cannot be trained, memory that does not suffice for one alone, or `stop_at` for several runs.
+      ValueError: a run that cannot be trained, memory that does not suffice for one alone, or `stop_at` or `keep_end` for
+        several runs.
       FolderError: a run that has ended, that another program is at work on, or whose folder cannot be written to.
     """
     options = options or Options()
     options.check()
     _check_runs(env, specs, folders)
-    if options.stop_at is not None and (sweep or len(specs) > 1):
-        raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
+    if sweep or len(specs) > 1:
+        options.check_many()
     if lanes is None and jax.default_backend() == "cpu":
         lanes = 1
     shared = folders[0].parent / "unfinished" if shared is None else shared
     session = _Session(env, options, should_stop, report, on_epoch, make_sinks, shared, sweep)
     claims = Claims(sweep, report)
-    waiting = [run for run in zip(specs, folders) if claims.is_free(run[1])]
+    waiting = [run for run in zip(specs, folders) if claims.is_free(*run)]
     if not waiting:
         return []
     program = program_lib.compile_runs(env, [spec for spec, _ in waiting], lanes, options.final_episodes, report)
@@ -178,9 +179,11 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
                 checkpoints.try_save(progress)
     if progress.epoch < progress.num_epochs and options.is_reached(success):
         session.report(f"stop_at {options.stop_at:g} is reached after epoch {progress.epoch} of {progress.num_epochs}")
+    if options.keep_end and not watch.failed:
+        checkpoints.try_save(progress)
     results = _finish(session, program, progress, specs, folders, runs, watch.failed)
     if len(watch.failed) < len(specs):
-        checkpoints.clear()
+        checkpoints.clear(options.keep_end)
     session.on_epoch(specs, progress)
     return results
 

@@ -60,6 +60,7 @@ def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dic
     defaults = settings(RunSpec())
     kept = {name: x for name, x in settings(spec).items() if name in _FIRST_SETTINGS or x != defaults[name]}
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
+    kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
     return {**content, "sources": dict(own_sources)}
 

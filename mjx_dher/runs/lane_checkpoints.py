@@ -113,9 +113,15 @@ class LaneCheckpoints:
         except (OSError, checkpoint.CheckpointError) as error:
             self.report(str(error))
 
-    def clear(self) -> None:
-        """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay."""
-        for path in {self.folder, self.folders[0] / run_folder.CHECKPOINTS} - {self.folders[0]}:
+    def clear(self, keep_end: bool = False) -> None:
+        """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay.
+
+        With `keep_end` the newest stays that is in the run's own folder.
+        """
+        own = self.folders[0] / run_folder.CHECKPOINTS
+        for path in run_folder.checkpoints(self.folders[0])[1:] if keep_end else ():
+            shutil.rmtree(path, ignore_errors=True)
+        for path in {self.folder, *(() if keep_end else (own,))} - {self.folders[0]}:
             shutil.rmtree(path, ignore_errors=True)
         for path in self.shared.glob(f"*/{NAMES_FILE}"):
             names = _names(path)

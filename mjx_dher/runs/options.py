@@ -19,6 +19,8 @@ class Options:
     """Epochs between checkpoints, from which a run goes on; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
     keep: int = 2
     """Checkpoints to keep, the newest (of runs side by side: one); they are deleted when the run has ended."""
+    keep_end: bool = False
+    """Checkpoint of the end, kept, from which `resume --total-steps` makes a single run longer; as large as the replay ring."""
     log: tuple[str, ...] = ()
     """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
     stop_at: float | None = None
@@ -29,9 +31,18 @@ class Options:
         check_count("final_episodes", self.final_episodes)
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
+        if not isinstance(self.keep_end, bool):
+            raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
         sinks.check(self.log)
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
+
+    def check_many(self) -> None:
+        """Raises ValueError for an option that several runs cannot have."""
+        if self.stop_at is not None:
+            raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
+        if self.keep_end:
+            raise ValueError("keep_end is for one run alone: a sweep with another total_steps has runs of its own")
 
     def is_reached(self, success_rates: Sequence[float]) -> bool:
         """Returns whether a run with these success rates, an epoch each, has reached `stop_at`."""

@@ -35,6 +35,17 @@ def read(folder: Path) -> dict[str, Any]:
         raise FolderError(f"{path} is damaged ({type(error).__name__}: {error})") from error
 
 
+def can_go_on(folder: Path, total_steps: int) -> bool:
+    """Returns whether a run that has ended can go on from a checkpoint: it failed, or `total_steps` is more than it made.
+
+    Raises:
+      FolderError: its result is damaged.
+    """
+    result = read(folder)
+    due = result["status"] == FAILED or result.get("env_steps", total_steps) < total_steps
+    return due and bool(run_folder.checkpoints(folder))
+
+
 def problem(folder: Path) -> str | None:
     """Returns why a run with a result is not whole: its curve is cut, or its files are not of one run. None where it is."""
     try:

@@ -149,14 +149,25 @@ def read_content(path: Path) -> dict[str, Any]:
     if not path.is_dir():
         raise FolderError(f"{path} is not a run folder: no such folder")
     try:
-        content = read_versioned(path / CONFIG_FILE, 1, SCHEMA)
+        return read_file(path / CONFIG_FILE)
+    except FileNotFoundError:
+        raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
+
+
+def read_file(file: Path) -> dict[str, Any]:
+    """Returns the content of a run's config.json, wherever it lies and whatever its name is, in today's schema.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      FolderError: it does not describe a run, or is of another schema.
+    """
+    try:
+        content = read_versioned(file, 1, SCHEMA)
         content = _upgraded(content) if content["schema"] == 1 else content
         _check_kinds(content)
         return content
-    except FileNotFoundError:
-        raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
     except (KeyError, AttributeError, TypeError) as error:
-        raise FolderError(f"{path / CONFIG_FILE} does not describe a run ({error})") from error
+        raise FolderError(f"{file} does not describe a run ({error})") from error
 
 
 def _check_kinds(content: dict[str, Any]) -> None:
@@ -168,6 +179,7 @@ def _check_kinds(content: dict[str, Any]) -> None:
         "hparams, an object": isinstance(content["hparams"], dict),
         "hidden_sizes, a list": isinstance(content["config"], dict) and isinstance(content["config"]["hidden_sizes"], list),
         "physics, a name": isinstance(content["physics"], str),
+        "env_kwargs, a list": isinstance(content.get("env_kwargs", []), list),
         "sources, an object": isinstance(sources, dict),
         **{f"sources.{name}, a text": isinstance(text, str) for name, text in texts.items()},
     }
@@ -248,11 +260,12 @@ def written_identity(path: Path) -> dict[str, Any] | None:
 
 
 def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
-    """Returns the description that `read_content` gave of the run in `path`.
+    """Returns the description that `read_content` gave of the run in `path`, or `read_file` of the file there.
 
     Raises:
       FolderError: something is missing in it, or of another kind.
     """
+    file = path / CONFIG_FILE if path.is_dir() else path
     try:
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
@@ -261,9 +274,10 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
         spec = RunSpec(
             config=Config(**config),
             hparams=HParams(**content["hparams"]),
-            **{name: content[name] for name in fields if name in content},
+            **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
+            env_kwargs=tuple(content.get("env_kwargs", ())),
         )
         spec_lib.validate_values(spec)
         return spec
     except (KeyError, TypeError, ValueError) as error:
-        raise FolderError(f"{path / CONFIG_FILE} does not describe a run ({error})") from error
+        raise FolderError(f"{file} does not describe a run ({error})") from error

@@ -69,6 +69,8 @@ def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any]
 def _format(name: str, value: Any) -> str:
     if isinstance(value, str):
         return value or f"{name} unknown"
+    if name == "env_kwargs":
+        return " ".join(value) or "env_kwargs none"
     return f"{name} {value:g}" if isinstance(value, (int, float)) else f"{name} {value}"
 
 

@@ -10,29 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import names, stats
+from mjx_dher import stats
 from mjx_dher.runs import run_folder
 from mjx_dher.sweeps.comparison import Group, Row
-
-# Okabe and Ito's palette, which colour-blind readers can tell apart, from dark to light; each with its own line and marker.
-_STYLES = (
-    ("#000000", "-", "o"),
-    ("#0072B2", "--", "s"),
-    ("#D55E00", "-.", "^"),
-    ("#009E73", ":", "D"),
-    ("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v"),
-    ("#E69F00", (0, (8, 2)), "P"),
-    ("#56B4E9", (0, (1, 1)), "X"),
-)
-FORMATS = ("png", "svg", "pdf")
-
-
-def check(formats: Sequence[str]) -> None:
-    """Raises ValueError if Matplotlib is not installed or a format is not one of FORMATS."""
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
-    names.require_extra("plot", "matplotlib", "plot")
+from mjx_dher.tools import figures
 
 
 def curves(groups: Sequence[Group], threshold: float) -> Any:
@@ -42,7 +23,7 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
     columns = max(1, min(4, 140 // (6 + max(map(len, labels)))))
     height = 3.6 + 0.2 * math.ceil(len(groups) / columns)
     figure, axes = plt.subplots(1, 3, figsize=(12, height), sharey=True, layout="constrained")
-    for group, (color, line, marker) in zip(groups, _styles(len(groups))):
+    for group, (color, line, marker) in zip(groups, figures.styles(len(groups))):
         middle, low, high = stats.curve_interval(group.success)
         every = max(1, len(group.epoch) // 8)
         for axis, x in zip(axes, (group.epoch, group.env_steps / 1e6, group.seconds)):
@@ -60,7 +41,7 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
     axes[0].set_ylim(-0.02, 1.02)
     axes[0].set_ylabel("success rate")
     title = f"{groups[0].env}: interquartile mean of {_seeds(len(group.seeds) for group in groups)}, 95 % interval"
-    figure.suptitle(_folded(title, 12), fontsize=11)
+    figure.suptitle(figures.folded(title, 12), fontsize=11)
     handles, _ = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return figure
@@ -78,7 +59,7 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
     figure, axis = plt.subplots(figsize=(width, 3.8 + 0.13 * lines), layout="constrained")
     last = max(float(group.epoch[-1]) for group in groups)
     never = 1.1 * last
-    for place, (group, row, (color, _, marker)) in enumerate(zip(groups, rows, _styles(len(groups)))):
+    for place, (group, row, (color, _, marker)) in enumerate(zip(groups, rows, figures.styles(len(groups)))):
         reach = np.minimum(stats.first_reach(group.epoch, group.success, threshold), never)
         spread = np.linspace(-0.18, 0.18, len(reach)) if len(reach) > 1 else np.zeros(1)
         axis.plot(place + spread, reach, linestyle="none", marker=marker, color=color, markersize=4, alpha=0.55)
@@ -90,7 +71,7 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
     axis.set_xlim(-0.5, len(groups) - 0.3)
     axis.set_ylim(0, 1.16 * last)
     axis.set_ylabel(f"epochs to {threshold:g}")
-    figure.suptitle(_folded(f"{groups[0].env}: each seed, and the median with its 95 % interval", width), fontsize=10)
+    figure.suptitle(figures.folded(f"{groups[0].env}: each seed, and the median with its 95 % interval", width), fontsize=10)
     axis.grid(axis="y", alpha=0.2)
     return figure
 
@@ -107,7 +88,7 @@ def comparison(rows: Sequence[Row]) -> Any:
         ("P(better than the baseline)", [(r.better, r.better_low, r.better_high) for r in rows]),
     )
     for axis, (label, values) in zip(axes, panels):
-        for place, ((middle, low, high), (color, _, marker)) in enumerate(zip(values, _styles(len(rows)))):
+        for place, ((middle, low, high), (color, _, marker)) in enumerate(zip(values, figures.styles(len(rows)))):
             if np.isfinite(middle) and rows[place].failed < rows[place].seeds:
                 around = [[max(0.0, middle - low)], [max(0.0, high - middle)]]
                 axis.errorbar(middle, place, xerr=around, color=color, marker=marker, markersize=5, capsize=3)
@@ -119,28 +100,34 @@ def comparison(rows: Sequence[Row]) -> Any:
     axes[2].set_xlim(-0.03, 1.03)
     axes[0].set_yticks(range(len(rows)), names, fontsize=9)
     axes[0].invert_yaxis()
-    figure.suptitle(_folded(f"{rows[0].env}: {_seeds(row.seeds for row in rows)}, 95 % intervals", 11), fontsize=11)
+    figure.suptitle(figures.folded(f"{rows[0].env}: {_seeds(row.seeds for row in rows)}, 95 % intervals", 11), fontsize=11)
     return figure
 
 
-def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
-    """Writes the three figures of an environment into `folder` and returns their paths."""
-    plt = _pyplot()
-    written = []
-    figures = {
+def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict[str, Any]:
+    """Draws the three figures of an environment; returns them by name."""
+    return {
         "curves": curves(groups, threshold),
         "thresholds": thresholds(groups, rows, threshold),
         "comparison": comparison(rows),
     }
-    for name, figure in figures.items():
+
+
+def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
+    """Writes the three figures of an environment into `folder` and returns their paths."""
+    written = []
+    for name, figure in draw(groups, rows, threshold).items():
         for ending in formats:
             path = folder / f"{run_folder.in_a_path(groups[0].env)}_{name}.{ending}"
-            # No date and fixed ids, so that the same sweep gives the same file.
-            with plt.rc_context({"svg.hashsalt": "mjx-dher"}):
-                figure.savefig(path, dpi=130, metadata={"Date": None} if ending == "svg" else None)
+            figures.write(figure, path)
             written.append(path)
-        plt.close(figure)
+    close()
     return written
+
+
+def close() -> None:
+    """Frees all figures that were drawn."""
+    _pyplot().close("all")
 
 
 def _name(group: Group) -> str:
@@ -154,15 +141,6 @@ def _failures(failed: int, seeds: int) -> str:
 def _seeds(counts: Iterable[int]) -> str:
     low, *_, high = (*(ordered := sorted(counts)), ordered[-1])
     return f"{low} seeds" if low == high else f"{low} to {high} seeds"
-
-
-def _folded(title: str, width: float) -> str:
-    """Returns a title in as many lines as a figure `width` inches wide takes."""
-    return textwrap.fill(title, int(11.5 * width))
-
-
-def _styles(number: int) -> list[tuple[Any, Any, str]]:
-    return [_STYLES[i % len(_STYLES)] for i in range(number)]
 
 
 def _pyplot() -> Any:

@@ -72,7 +72,8 @@ def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
     finals: list[dict[str, Any]] = []
     for trial in trials:
         sizes = "x".join(map(str, trial["settings"]["hidden_sizes"]))
-        head = {**trial["settings"], "hidden_sizes": sizes, "seed": trial["seed"], "lanes": trial["lanes"]}
+        own = {"hidden_sizes": sizes, "env_kwargs": " ".join(trial["settings"]["env_kwargs"])}
+        head = {**trial["settings"], **own, "seed": trial["seed"], "lanes": trial["lanes"]}
         curve = trial["curve"]
         epochs = range(len(curve.get("epoch", ())))
         results += [{**head, **{name: values[i] for name, values in curve.items()}} for i in epochs]

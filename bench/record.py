@@ -1,0 +1,198 @@
+"""History of speed: measures this machine, and appends one line to bench/history.jsonl; or draws what is there.
+
+    python bench/record.py [--repeats 5] [--out bench/history.jsonl] [--anyway]
+    python bench/record.py --draw
+
+A line has the commit, the date, the machine, the versions, and the figures: environment steps a second of a rollout of Push,
+updates a second of DDPG as the machine's preset makes them, and the seconds of `python train.py` from Enter to its first epoch,
+where nothing has been compiled and after that. It takes some minutes. A machine that is busy, and a working tree with changes,
+are refused, because the line would be of something else than it says; with `--anyway` it says so.
+
+--draw writes history.md and history.svg beside the file (extra `plot`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import math
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+HISTORY = Path(__file__).parent / "history.jsonl"
+BUSY = 0.15  # of the cores, by the load of the last minute: more than that makes a figure one of what else runs
+# Figures by name: what it is, and its digits.
+FIGURES = {
+    "env_steps_per_second": ("environment steps a second", 0),
+    "updates_per_second": ("updates a second", 0),
+    "cold_start_seconds": ("seconds to the first epoch, nothing compiled", 1),
+    "warm_start_seconds": ("seconds to the first epoch", 1),
+}
+FIELDS = ("date", "commit", "remarks", "machine", "versions", "setup", "figures")
+
+
+def git(*arguments: str) -> str:
+    """What git says of this checkout."""
+    return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def remarks_of(load: float, cores: int, changes: str) -> list[str]:
+    """What keeps a line from being of this commit, on this machine alone."""
+    busy = [f"machine busy: load {load:.2f} on {cores} cores"] if load > BUSY * cores else []
+    return busy + (["working tree with changes"] if changes else [])
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """All lines of a history, oldest first; exits where one is none."""
+    entries = []
+    for number, line in enumerate(path.read_text().splitlines() if path.exists() else [], start=1):
+        try:
+            entry = json.loads(line)
+            missing = [name for name in FIELDS if name not in entry]
+            wrong = [name for name in FIGURES if not 0 < float(entry["figures"][name]) < math.inf]
+            if missing or wrong:
+                raise ValueError(f"without {', '.join(missing + wrong)}")
+        except (ValueError, KeyError, TypeError) as error:
+            raise SystemExit(f"{path}, line {number}: not an entry ({type(error).__name__}: {error})") from error
+        entries.append(entry)
+    return sorted(entries, key=lambda entry: str(entry["date"]))
+
+
+def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
+    """The figures, and with which settings they were taken. Start-up comes first: it needs the GPU's memory."""
+    import startup
+
+    from mjx_dher import config, presets
+
+    preset = startup.machine_preset()
+    run = presets.preset(preset, "push", learner="ddpg").config
+    steps = str(2 * config.steps_per_epoch(run, 50))
+    command = ["--env", "push", "--preset", preset, "--total-steps", steps, "--no-curve"]
+    with tempfile.TemporaryDirectory() as home:
+        starts = [startup.measure(command, home)["to the first epoch"] for _ in range(1 + repeats)]
+
+    import jax
+    import learner as learner_bench
+    import throughput
+
+    from mjx_dher import learners, samplers
+    from mjx_dher.envs.engines import resolve_engine
+    from mjx_dher.types import Sizes
+
+    engine = resolve_engine("auto")
+    rates = [throughput.measure("push", engine, run.num_envs)[0] for _ in range(repeats)]
+    made = learners.make("ddpg", run, Sizes(25, 3, 4))
+    timed = learner_bench.Timed(made, run.batch_size, 1, samplers.make("future"), 200)
+    updates = [1 / timed.seconds()[0] for _ in range(repeats)]
+    medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]))
+    setup = {"preset": preset, "engine": engine, "num_envs": run.num_envs, "batch_size": run.batch_size, "repeats": repeats}
+    spread = {name: [float(f"{x:.4g}") for x in (min(many), max(many))] for name, many in zip(FIGURES, (rates, updates))}
+    return dict(zip(FIGURES, medians)), {**setup, "lowest_and_highest": spread, "device": jax.devices()[0].device_kind}
+
+
+def record(path: Path, repeats: int, anyway: bool) -> dict[str, Any]:
+    """Measures, and appends a line to the file."""
+    from timing import cpu
+
+    import mjx_dher
+    from mjx_dher.envs.engines.native import usable_cores
+
+    read(path)  # a file that is none is not appended to
+    remarks = remarks_of(os.getloadavg()[0], usable_cores(), git("status", "--porcelain"))
+    if remarks and not anyway:
+        raise SystemExit(f"not recorded: {'; '.join(remarks)} (--anyway records it with that remark)")
+    figures, setup = measure(repeats)
+    versions = {name: metadata.version(name) for name in ("jax", "mujoco", "numpy")}
+    entry = {
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "commit": git("rev-parse", "--short=12", "HEAD"),
+        "remarks": remarks,
+        "machine": f"{setup.pop('device')}; {cpu()}, {usable_cores()} cores",
+        "versions": {"mjx_dher": mjx_dher.__version__, "python": platform.python_version(), **versions},
+        "setup": setup,
+        "figures": {name: float(f"{value:.4g}") for name, value in figures.items()},
+    }
+    with path.open("a") as file:
+        file.write(json.dumps(entry) + "\n")
+    return entry
+
+
+def page(entries: list[dict[str, Any]]) -> str:
+    """history.md: a table of all entries, the newest first."""
+    lines = [
+        "# History of speed",
+        "",
+        "Written by `python bench/record.py --draw`; `bench/record.py` says what the figures are.",
+        "",
+    ]
+    if not entries:
+        return "\n".join([*lines, "There is no entry yet."]) + "\n"
+    head = ["date", "commit", *(label for label, _ in FIGURES.values()), "machine", "versions", "remarks"]
+    lines += ["![Each figure over time](history.svg)", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for entry in reversed(entries):
+        figures = [f"{entry['figures'][name]:,.{digits}f}" for name, (_, digits) in FIGURES.items()]
+        versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
+        cells = [entry["date"][:10], f"`{entry['commit']}`", *figures, entry["machine"], versions, "; ".join(entry["remarks"])]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(entries: list[dict[str, Any]]) -> Any:
+    """Each figure over time, a line a machine; entries with remarks are hollow."""
+    from mjx_dher.tools import figures
+
+    figure, axes = figures.subplots(2, 2, 11, 6)
+    machines = list(dict.fromkeys(entry["machine"] for entry in entries))
+    for axis, (name, (label, _)) in zip(axes, FIGURES.items()):
+        for machine, (color, line, marker) in zip(machines, figures.styles(len(machines))):
+            own = [entry for entry in entries if entry["machine"] == machine]
+            dates = [datetime.datetime.fromisoformat(entry["date"]) for entry in own]
+            axis.plot(dates, [entry["figures"][name] for entry in own], color=color, linestyle=line, label=machine)
+            for date, entry in zip(dates, own):
+                fill = "none" if entry["remarks"] else color
+                axis.plot(date, entry["figures"][name], color=color, marker=marker, markerfacecolor=fill)
+        axis.set_title(label, fontsize=10)
+        axis.set_ylim(bottom=0)
+        axis.tick_params(axis="x", labelrotation=20, labelsize=8)
+        axis.grid(alpha=0.2)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", frameon=False, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=HISTORY, help="file to append to, or to draw")
+    parser.add_argument("--repeats", type=int, default=5, help="of each figure, whose median is taken")
+    parser.add_argument("--anyway", action="store_true", help="record a busy machine or changes, and say so")
+    parser.add_argument("--draw", action="store_true", help="write history.md and history.svg beside the file")
+    args = parser.parse_args()
+    if not 1 <= args.repeats <= 100:
+        parser.error(f"--repeats must lie in [1, 100]; got {args.repeats}")
+    if not args.out.parent.is_dir():
+        parser.error(f"--out: there is no folder {args.out.parent}")
+    if not args.draw:
+        print(json.dumps(record(args.out, args.repeats, args.anyway), indent=2))
+        return
+    from mjx_dher.tools import figures
+
+    figures.check(("svg",), "--draw")
+    entries = read(args.out)
+    args.out.with_suffix(".md").write_text(page(entries))
+    if entries:
+        figures.write(draw(entries), args.out.with_suffix(".svg"))
+    print(f"wrote {args.out.with_suffix('.md')} ({len(entries)} entries)")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+    main()

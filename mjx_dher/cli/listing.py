@@ -1,0 +1,103 @@
+"""The command `list`: all tasks, parts, engines and presets by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import names
+
+# By kind, each name and what it is, in a line. A test holds the names to the tables in spec.py, presets.py and envs.
+KINDS: dict[str, dict[str, str]] = {
+    "tasks": {
+        "push": "push a block on the table to a goal (FetchPush-v4)",
+        "pick_and_place": "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)",
+        "slide": "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)",
+        "reach": "move the gripper to a goal (FetchReach-v4)",
+    },
+    "engines": {
+        "auto": "native on a CPU, warp on an NVIDIA GPU, else jax",
+        "native": "MuJoCo C on all cores of the host",
+        "jax": "MJX, wherever JAX runs",
+        "warp": "a kernel of this library for NVIDIA GPUs (extra cuda)",
+    },
+    "presets": {
+        "auto": "cpu or gpu, the one for this machine",
+        "cpu": "tuned for time to success on two cores, with native",
+        "gpu": "tuned for time to success on one NVIDIA GPU, with warp",
+        "paper": "the settings of the paper",
+    },
+    "samplers": {
+        "random": "any goal of any episode",
+        "episode": "any goal of the episode",
+        "future": "any goal after the step (Andrychowicz et al. 2017)",
+        "final": "the last goal of the episode",
+        "closest": "the future goal nearest to the desired one (the paper's method 1); reads metric",
+        "epsilon_closest": "any future goal with probability epsilon, else the closest (method 2); reads metric, epsilon",
+        "weighted": "nearer future goals likelier (method 3); reads metric, weight_kernel, temperature",
+    },
+    "kernels": {
+        "linear": "weights that fall linearly with the relative distance",
+        "inverse": "weights that fall as a power of the relative distance",
+        "softmax": "weights that fall exponentially with the relative distance",
+    },
+    "metrics": {"position": "Euclidean distance between goals"},
+    "priorities": {"eventful": "episodes whose last achieved goal was not yet reached at their start"},
+    "learners": {
+        "ddpg": "DDPG (Lillicrap et al. 2016): deterministic actor, one critic",
+        "td3": "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
+        "sac": "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
+        "redq": "REDQ (Chen et al. 2021): SAC with many critics, some of them drawn for each target",
+        "tqc": "TQC (Kuznetsov et al. 2020): SAC with quantile critics, the largest quantiles dropped",
+        "dtqc": "tqc with a deterministic actor",
+    },
+    "networks": {
+        "mlp": "hidden layers with ReLU",
+        "layer_norm": "mlp with layer normalization in the critics",
+    },
+}
+# The option that takes a name of each kind; those with "module:attribute" take a part of the user's own, too.
+OPTIONS = {
+    "tasks": "--env",
+    "engines": "--engine",
+    "presets": "--preset",
+    "samplers": "--sampler",
+    "kernels": "--weight-kernel",
+    "metrics": "--metric",
+    "priorities": "--priority",
+    "learners": "--learner",
+    "networks": "--networks",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ListArgs:
+    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, learners and networks, in a line each.
+
+    All but engines and presets can be your own, too, as module:attribute (docs/tutorial.md).
+    """
+
+    kinds: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Kinds to name, such as tasks; all unless given."""
+    json: bool = False
+    """Print one JSON object instead: name and line by kind."""
+
+
+def list_command(argv: list[str], console: Console) -> int:
+    """Names all tasks and parts."""
+    args = tyro.cli(ListArgs, prog=f"{names.program()} list", args=argv)
+    for kind in args.kinds:
+        names.check_name("kind", kind, KINDS)
+    chosen = {kind: KINDS[kind] for kind in args.kinds or KINDS}
+    if args.json:
+        print(json.dumps(chosen, indent=2))
+        return 0
+    width = max(len(name) for lines in chosen.values() for name in lines)
+    for kind, lines in chosen.items():
+        console.print(f"{kind} ({OPTIONS[kind]})")
+        for name, line in lines.items():
+            console.print(f"  {name:{width}}  {line}", soft_wrap=True)
+    return 0

@@ -1,0 +1,97 @@
+"""The command `plot`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import names
+from mjx_dher.cli.common import print_table
+from mjx_dher.cli.sweep import compare
+from mjx_dher.config import check_number
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import curves, run_folder
+from mjx_dher.sweeps import grid
+from mjx_dher.tools import figures
+
+TOGETHER = "curves"  # the picture of several runs, without its ending
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotArgs:
+    """Draw how a run went, several runs together, or a sweep.
+
+    Of a run: success, returns, values and losses, in its folder. Of several: their success together, in the current folder.
+    Of a sweep: learning curves, epochs to a threshold and comparison, in its folder; comparison.csv is written anew.
+    """
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders, or the folder of one sweep."""
+    out: Path | None = None
+    """Folder for the pictures; the run's or the sweep's own unless given, and the current one for several runs."""
+    threshold: float = 0.9
+    """Success rate for the time that it takes to get there (of a sweep)."""
+    baseline: str = "future"
+    """Setting that the others are compared with: a sampler, or a setting as the table names it (of a sweep)."""
+    formats: tuple[str, ...] = ("png", "svg")
+    """Formats of the pictures: png, svg, pdf."""
+
+
+def plot_command(argv: list[str], console: Console) -> int:
+    """Draws runs, or a sweep."""
+    args = tyro.cli(PlotArgs, prog=f"{names.program()} plot", args=argv)
+    check_number("threshold", args.threshold, "(0, 1]", float)
+    figures.check(args.formats)
+    if is_sweep(args.folders):
+        return _plot_sweep(args, console)
+    runs = [curves.read(folder) for folder in args.folders]
+    together = len(runs) > 1
+    out = args.out or (Path() if together else args.folders[0])
+    files.make_folder(out)
+    if together:
+        print_table(*curves.table(runs), console)
+    name = TOGETHER if together else curves.CURVE
+    for ending in args.formats:  # drawn anew: a figure that was written before has another layout
+        path = out / f"{name}.{ending}"
+        figures.write(curves.draw_together(runs) if together else curves.draw(runs[0]), path)
+        console.print(f"wrote {path}", soft_wrap=True)
+    return 0
+
+
+def is_sweep(folders: tuple[Path, ...]) -> bool:
+    """Returns whether this is one sweep, and not one or more run folders.
+
+    Raises:
+      FolderError: it is neither.
+    """
+    if not folders:
+        raise FolderError("name one or more run folders, or the folder of a sweep; got none")
+    for folder in folders:
+        if not folder.is_dir():
+            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: no such folder")
+        sweep, run = (folder / grid.CELLS).is_dir(), (folder / run_folder.CONFIG_FILE).exists()
+        if not sweep and not run:
+            told = f"it has neither {run_folder.CONFIG_FILE} nor {grid.CELLS}/"
+            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: {told}")
+        if sweep and len(folders) > 1:
+            raise FolderError(f"{folder} is a sweep: it is taken alone, not with other folders")
+    return (folders[0] / grid.CELLS).is_dir()
+
+
+def _plot_sweep(args: PlotArgs, console: Console) -> int:
+    from mjx_dher.sweeps import comparison, plotting, tables
+
+    (folder,) = args.folders
+    by_env = comparison.groups(tables.read(folder))
+    out = args.out or folder
+    files.make_folder(out)
+    rows = compare(out, by_env, args.baseline, args.threshold, console)
+    for env, groups in by_env.items():
+        own = [row for row in rows if row.env == env]
+        for path in plotting.write(out, groups, own, args.threshold, args.formats):
+            console.print(f"wrote {path}", soft_wrap=True)
+    return 0

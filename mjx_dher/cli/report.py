@@ -1,0 +1,83 @@
+"""The command `report`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from mjx_dher import names
+from mjx_dher.cli import render as cli_render
+from mjx_dher.cli.plot import is_sweep
+from mjx_dher.config import check_number
+from mjx_dher.host import files
+from mjx_dher.runs import run_folder
+from mjx_dher.tools import figures
+
+EPISODES = 3  # of a video
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportArgs:
+    """Write a page about a run or a sweep: curves, tables, settings and videos in one file that opens without a server.
+
+    Videos (.mp4, .gif, .webm) that lie in the folder are taken in. Needs the extra: `pip install -e ".[plot]"`.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """Run folder, however far the run came, or the folder of a sweep."""
+    out: Path | None = None
+    """File to write, which ends in .html; report.html in the folder, which it replaces, unless given."""
+    overwrite: bool = False
+    """Replacement of an existing `out`."""
+    video: bool = False
+    """Draw a video of the run's policy first, or of the best run of each task of a sweep, into the folder (extra video)."""
+    threshold: float = 0.9
+    """Success rate for the time that it takes to get there (of a sweep)."""
+    baseline: str = "future"
+    """Setting that the others are compared with: a sampler, or a setting as the table names it (of a sweep)."""
+
+
+def report_command(argv: list[str], console: Console) -> int:
+    """Writes a page about a run or a sweep."""
+    args = tyro.cli(ReportArgs, prog=f"{names.program()} report", args=argv)
+    check_number("threshold", args.threshold, "(0, 1]", float)
+    figures.check(("svg",), "report")
+    sweep = is_sweep((args.folder,))
+    if args.out is not None:
+        files.check_file(args.out, (".html",), args.overwrite)
+    from mjx_dher.sweeps import report
+
+    def tell(text: str) -> None:
+        console.print(text, soft_wrap=True)
+
+    if args.video:
+        for run, out in _to_film(args.folder, sweep):
+            cli_render.draw_run(run, out, EPISODES, console)
+    page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
+    out = args.out or args.folder / report.REPORT
+    with files.atomic_write(out) as partial:
+        partial.write_text(page, encoding="utf-8")
+    tell(f"wrote {out}")
+    return 0
+
+
+def _to_film(folder: Path, sweep: bool) -> list[tuple[Path, Path]]:
+    """Returns the run folders of which a video is to be drawn, and its file: of a sweep, the best run of each task."""
+    if not sweep:
+        return [(folder, folder / "video.mp4")]
+    from mjx_dher.sweeps import tables
+
+    best: dict[str, dict[str, Any]] = {}
+    for trial in tables.read(folder):
+        rate = trial["final"].get("success_rate", -1.0)
+        env = trial["settings"]["env"]
+        if rate >= 0 and (env not in best or rate > best[env]["final"]["success_rate"]):
+            best[env] = trial
+    return [
+        (trial["folder"], folder / f"{run_folder.in_a_path(env)}_{run_folder.in_a_path(trial['settings']['sampler'])}.mp4")
+        for env, trial in best.items()
+    ]

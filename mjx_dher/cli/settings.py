@@ -1,0 +1,137 @@
+"""Settings of a run from a file, and what they come to before anything is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjx_dher import config as config_lib
+from mjx_dher.config import Config, HParams
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import identity, run_folder
+from mjx_dher.runs.options import Options
+from mjx_dher.spec import RunSpec, reads
+
+
+def read(path: Path) -> tuple[RunSpec, Options, list[str]]:
+    """Returns the settings and options in the config.json of a run, and what a reader is told of them.
+
+    Args:
+      path: a run folder, or a config.json, wherever it lies; it may have been edited.
+
+    Raises:
+      FolderError: it describes no run, or one of another schema.
+    """
+    file = path / run_folder.CONFIG_FILE if path.is_dir() else path
+    try:
+        content = run_folder.read_file(file)
+    except FileNotFoundError:
+        raise FolderError(f"config: there is no file {file}") from None
+    run = run_folder.to_spec(file, content)
+    names = [field.name for field in dataclasses.fields(Options)]
+    options = Options(**{name: content[name] for name in names if name in content})
+    options.check()
+    options = dataclasses.replace(options, log=tuple(options.log))
+    return run, options, [_origin(file, content, run), *run_folder.changed_code(content, run)]
+
+
+def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
+    """Returns where settings come from: the run, the version that wrote them, and whether they were edited since."""
+    versions = content.get("versions", {})
+    version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
+    now = identity.digest(run_folder.identity_of(content, run))
+    edited = "; edited since" if content.get("digest", now) != now else ""
+    return (
+        f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
+        f" {content['physics']}{edited}"
+    )
+
+
+def changes(before: RunSpec, now: RunSpec) -> str:
+    """Returns which settings were given beside those of a file: "gamma 0.9 (0.98 in the file)"."""
+    old, new = ({**identity.settings(spec), "seed": spec.seed} for spec in (before, now))
+    told = [f"{name} {text(new[name])} ({text(old[name])} in the file)" for name in new if new[name] != old[name]]
+    return "given beside it: " + (", ".join(told) or "nothing")
+
+
+def text(value: Any) -> str:
+    """Returns a setting's value as a command line has it."""
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def check_out(out: Path | None) -> None:
+    """Checks without a trace that a run folder can be made at `out`.
+
+    Raises:
+      FolderError: something is there already, or the folder above cannot be written to.
+    """
+    if out is None:
+        return
+    if (out.is_symlink() or out.exists()) and (not out.is_dir() or files.is_used(out)):
+        raise FolderError(f"out: {out} is there already and is never overwritten; name a new or empty folder")
+    check_writable(out)
+
+
+def check_writable(out: Path) -> None:
+    """Checks without a trace that a folder is writable, or can be made.
+
+    Raises:
+      FolderError: it cannot.
+    """
+    parent = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not (parent.is_dir() and os.access(parent, os.W_OK)):
+        raise FolderError(f"out: {parent} cannot be written to")
+
+
+def groups(run: RunSpec) -> Iterator[tuple[str, str]]:
+    """Yields the settings that a run reads, in three groups with a heading each."""
+    values = {**identity.settings(run), "seed": run.seed}
+    sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
+    parts = [name for name in values if name not in (*sizes, *numbers)]
+    for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
+        read_here = [name for name in names if reads(run.sampler, run.learner, name)]
+        yield title, "; ".join(f"{name} {text(values[name])}" for name in read_here)
+
+
+def amount(config: Config, episode_length: int, runs: int = 1) -> str:
+    """Returns how much `runs` runs play and learn, in a sentence."""
+    epochs = config_lib.num_epochs(config, episode_length)
+    steps = epochs * config_lib.steps_per_epoch(config, episode_length)
+    updates = config_lib.num_updates(config, episode_length)
+    each = " each" if runs > 1 else ""
+    whole = f"; {steps * runs:,} steps and {updates * runs:,} updates in all" if runs > 1 else ""
+    return (
+        f"{epochs} epochs of {config.cycles_per_epoch} cycles{each}: {steps:,} environment steps,"
+        f" {updates:,} updates of {config.batch_size:,} transitions{whole}"
+    )
+
+
+def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
+    """Returns what runs of one program hold in memory, without compiling it.
+
+    Raises:
+      ValueError: the parts do not fit together, or one run alone is more than memory holds.
+    """
+    import jax
+
+    from mjx_dher.host import memory
+    from mjx_dher.runs import loop, program
+
+    train = program.make_loop(env, specs[0], list(dict.fromkeys(spec.sampler_choice for spec in specs)))
+    loop.check_memory(train, specs[0].config)
+    leaves = jax.tree.leaves(jax.eval_shape(train.learner.init, jax.random.key(0)))
+    learner = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
+    available = memory.available_bytes()
+    free = "unknown" if available is None else memory.format_bytes(available)
+    each = " a run" if len(specs) > 1 else ""
+    return [
+        f"memory{each}: replay ring {memory.format_bytes(train.replay_bytes)}, learner {memory.format_bytes(learner)};"
+        f" what the compiled program takes beside them is known when it is compiled; {free} is free",
+        f"physics {run_folder.engine_name(env)}, learner on {jax.devices()[0].device_kind}",
+    ]

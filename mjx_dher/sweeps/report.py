@@ -1,0 +1,155 @@
+"""A page about a run or a sweep, in one file that opens without a server: curves, tables, settings, videos."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjx_dher import __version__
+from mjx_dher.config import Config, HParams
+from mjx_dher.runs import curves, identity, run_folder
+from mjx_dher.runs.curves import Curve
+from mjx_dher.runs.run_folder import FAILED
+from mjx_dher.spec import RunSpec, reads
+from mjx_dher.sweeps import comparison, plotting, tables
+from mjx_dher.tools import figures, page
+
+REPORT = "report.html"
+
+
+def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> str:
+    """Returns the page about the run in `folder`, however far it came.
+
+    Args:
+      folder: of the run.
+      report: called with a line about each video that is left out.
+
+    Raises:
+      FolderError: no run folder, or one that cannot be believed.
+    """
+    curve = curves.read(folder, allow_empty=True)
+    spec = curve.spec
+    body = [page.paragraph(curves.title(curve), "failed" if curve.status == FAILED else ""), page.facts(_facts(curve))]
+    body += _videos(folder, report)
+    if curve.rows:
+        body += [page.heading("Curves"), page.figure(figures.to_svg(curves.draw(curve), 0))]
+        columns = [name for name in curve.rows[0] if name != "digest"]
+        rows = [[_number(row.get(name)) for name in columns] for row in curve.rows]
+        body.append(page.details(f"every epoch ({len(rows)})", page.table(columns, rows)))
+    else:
+        body.append(page.paragraph("No epoch of the run has ended."))
+    body += [page.heading("Settings"), *_settings(spec, curve.content)]
+    body += [page.code(f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"), _footer(curve.content.get("versions"))]
+    return page.page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
+
+
+def _facts(curve: Curve) -> Iterator[tuple[str, str]]:
+    result, last = curve.result, curve.rows[-1] if curve.rows else {}
+    yield "status", curve.status
+    if "success_rate" in result:
+        interval = f"{result['success_low']:.3f} to {result['success_high']:.3f}"
+        yield f"success of {result['episodes']} episodes (95 % interval {interval})", f"{result['success_rate']:.3f}"
+        yield "already at the reset", f"{result['reset_success_rate']:.3f}"
+    elif last:
+        yield f"success of the last evaluation ({curve.spec.config.eval_episodes} episodes)", f"{last['success_rate']:.3f}"
+    if last:
+        yield "environment steps", f"{last['env_steps']:,}"
+        yield "updates", f"{last['updates']:,}"
+        yield "seconds of training", f"{last['wall_seconds']:,.1f}"
+
+
+def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
+    """Yields the settings that a run reads, beside the defaults of the library where they differ."""
+    values, defaults = {**identity.settings(spec), "seed": spec.seed}, identity.settings(RunSpec())
+    sizes, numbers = [field.name for field in dataclasses.fields(Config)], HParams._fields
+    parts = [name for name in values if name not in (*sizes, *numbers)]
+    for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
+        own = [name for name in names if reads(spec.sampler, spec.learner, name)]
+        rows = [[n, _value(values[n]), _value(defaults[n]) if n in defaults and defaults[n] != values[n] else ""] for n in own]
+        if title == "run":
+            rows.append(["physics", content["physics"], ""])
+        yield page.details(title, page.table((title, "value", "default, where it differs"), rows))
+
+
+def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in page.VIDEOS or not path.is_file():
+            continue
+        if path.stat().st_size > page.LARGEST:
+            report(f"{path} is larger than {page.LARGEST / 1e6:.0f} MB, and left out")
+            continue
+        yield page.video(path)
+
+
+def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
+    """Returns the page about the sweep in `folder`: of all runs that have ended.
+
+    Args:
+      folder: of the sweep.
+      baseline: setting that the others are compared with, as for `comparison.compare`.
+      threshold: success rate for the time that it takes to get there.
+      report: called with a line about each video that is left out.
+
+    Raises:
+      FolderError: no sweep, none of its runs has ended, or one that cannot be believed.
+    """
+    trials = tables.read(folder)
+    failed = [trial for trial in trials if trial["status"] == FAILED]
+    body = [page.paragraph(f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")]
+    body += _videos(folder, report)
+    for number, (env, groups) in enumerate(comparison.groups(trials).items()):
+        rows = comparison.compare(groups, baseline, threshold)
+        body += [page.heading(env), page.table(*comparison.table(rows))]
+        body.append(page.paragraph(f"epochs to a success rate of {threshold:g}; P(better) and p: against {baseline}"))
+        for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
+            body.append(page.figure(figures.to_svg(figure, 10 * number + place), name))
+    plotting.close()
+    body += [page.heading("Runs"), page.details(f"all {len(trials)} runs", _runs(trials))]
+    body += [page.heading("Settings"), *_shared_settings(trials)]
+    body.append(_footer(None))
+    return page.page(f"Sweep {folder.absolute().name}", body)
+
+
+def _runs(trials: Sequence[dict[str, Any]]) -> str:
+    varying = _varying(trials)
+    head = ["run", *varying, "seed", "status", "success", "at the reset", "seconds", "reason"]
+    rows = []
+    for trial in trials:
+        final, (*_, seconds) = trial["final"], (None, *trial["curve"].get("wall_seconds", ()))
+        values = [_value(trial["settings"][name]) for name in varying]
+        numbers = map(_number, (final.get("success_rate"), final.get("reset_success_rate"), seconds))
+        rows.append([trial["folder"].name, *values, trial["seed"], trial["status"], *numbers, trial["reason"]])
+    return page.table(head, rows)
+
+
+def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
+    settings = [trial["settings"] for trial in trials]
+    return [name for name in settings[0] if len({str(each.get(name)) for each in settings}) > 1]
+
+
+def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
+    varying, first = _varying(trials), trials[0]["settings"]
+    if varying:
+        yield page.paragraph(f"What differs between runs: {', '.join(varying)}.")
+    rows = [(name, _value(value)) for name, value in first.items() if name not in varying]
+    yield page.details("the same in all runs", page.table(("setting", "value"), rows))
+
+
+def _footer(versions: Any) -> str:
+    told = ", ".join(f"{name} {version}" for name, version in versions.items()) if isinstance(versions, dict) else ""
+    return page.paragraph(f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _number(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,94 @@
+"""What all pictures share: line styles, and figures that need no screen. Matplotlib is loaded when the first is made."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import io
+import re
+import textwrap
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mjx_dher import names
+from mjx_dher.host import files
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart, from dark to light; each with its own line and marker.
+_STYLES = (
+    ("#000000", "-", "o"),
+    ("#0072B2", "--", "s"),
+    ("#D55E00", "-.", "^"),
+    ("#009E73", ":", "D"),
+    ("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v"),
+    ("#E69F00", (0, (8, 2)), "P"),
+    ("#56B4E9", (0, (1, 1)), "X"),
+)
+FORMATS = ("png", "svg", "pdf")
+DPI = 130
+
+
+def check(formats: Sequence[str], feature: str = "plot") -> None:
+    """Raises ValueError if Matplotlib is not installed or a format is not one of FORMATS."""
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
+        raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
+    names.require_extra(feature, "matplotlib", "plot")
+
+
+def is_there() -> bool:
+    """Returns whether Matplotlib is installed."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+@functools.cache
+def preload() -> None:
+    """Loads Matplotlib, if it is there, in a thread, for a program that waits for the device and draws later."""
+    if is_there():
+        threading.Thread(target=importlib.import_module, args=("matplotlib.backends.backend_agg",), daemon=True).start()
+
+
+def styles(number: int) -> list[tuple[Any, Any, str]]:
+    """Returns colour, line and marker for each of `number` curves."""
+    return [_STYLES[i % len(_STYLES)] for i in range(number)]
+
+
+def subplots(rows: int, columns: int, width: float, height: float) -> tuple[Any, list[Any]]:
+    """Makes a figure, in inches, and returns it with its axes, row by row."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def write(figure: Any, path: Path) -> None:
+    """Writes a figure in the format that the path ends in, atomically.
+
+    There is no date in it, and ids are fixed, so that the same figure gives the same file.
+    """
+    import matplotlib
+
+    ending = path.suffix[1:]
+    with files.atomic_write(path) as partial, matplotlib.rc_context({"svg.hashsalt": "mjx-dher"}):
+        figure.savefig(partial, format=ending, dpi=DPI, metadata={"Date": None} if ending == "svg" else None)
+
+
+def to_svg(figure: Any, number: int) -> str:
+    """Returns a figure as an SVG element for a page, which refers to nothing outside; `number` keeps its ids apart."""
+    import matplotlib
+
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": "mjx-dher"}):
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    element = text.getvalue()[text.getvalue().index("<svg") :]
+    element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.S)
+    return re.sub(r'(\bid="|href="#|url\(#)', rf"\1f{number}-", element)
+
+
+def folded(title: str, width: float) -> str:
+    """Returns a title in as many lines as a figure `width` inches wide takes."""
+    return textwrap.fill(title, int(11.5 * width))

@@ -1,0 +1,83 @@
+"""Parts of a page of HTML that holds all that it shows: no file, script, font or address outside of it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
+LARGEST = 50_000_000  # bytes of a video that a page takes in
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff }
+body { max-width: 1100px; margin: 2em auto; padding: 0 1em }
+h1 { font-size: 1.5em } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #ddd }
+.wide { overflow-x: auto } svg { max-width: 100%; height: auto }
+table { border-collapse: collapse; font-size: 13px } th, td { text-align: left; padding: 2px 12px 2px 0; vertical-align: top }
+tr { border-bottom: 1px solid #eee } td { font-variant-numeric: tabular-nums } summary { cursor: pointer; margin: 1em 0 }
+.facts { display: flex; flex-wrap: wrap; gap: 2em } .facts b { display: block; font-size: 1.5em }
+.failed { color: #a00 } figure { margin: 1em 0 } figcaption { color: #555; font-size: 13px } video, img { max-width: 100% }
+code { background: #f4f4f4; padding: 0 3px }
+"""
+
+
+def page(title: str, body: Iterable[str]) -> str:
+    """Returns a whole page with a heading."""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{text(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{text(title)}</h1>\n" + "\n".join(body) + "\n</body>\n</html>\n"
+    )
+
+
+def text(value: object) -> str:
+    """Returns what a reader is to see, with what HTML would take for markup escaped."""
+    return html.escape(str(value))
+
+
+def heading(title: str) -> str:
+    """Returns the heading of a section."""
+    return f"<h2>{text(title)}</h2>"
+
+
+def paragraph(words: str, kind: str = "") -> str:
+    """Returns a paragraph, of a class of its own if one is given."""
+    return f'<p class="{kind}">{text(words)}</p>' if kind else f"<p>{text(words)}</p>"
+
+
+def code(command: str) -> str:
+    """Returns a command as a paragraph."""
+    return f"<p><code>{text(command)}</code></p>"
+
+
+def facts(values: Iterable[tuple[str, str]]) -> str:
+    """Returns figures beside one another, each with its name."""
+    return '<div class="facts">' + "".join(f"<div><b>{text(v)}</b>{text(name)}</div>" for name, v in values) + "</div>"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Returns a table."""
+    first = "".join(f"<th>{text(name)}</th>" for name in head)
+    rest = "\n".join("<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="wide"><table>\n<tr>{first}</tr>\n{rest}\n</table></div>'
+
+
+def details(summary: str, inside: str) -> str:
+    """Returns something that a click opens."""
+    return f"<details><summary>{text(summary)}</summary>\n{inside}\n</details>"
+
+
+def figure(content: str, caption: str = "") -> str:
+    """Returns a picture, an element of HTML, with a caption."""
+    return f"<figure>{content}" + (f"<figcaption>{text(caption)}</figcaption>" if caption else "") + "</figure>"
+
+
+def video(path: Path) -> str:
+    """Returns a film, a file of one of VIDEOS, as an element that holds it."""
+    kind = VIDEOS[path.suffix.lower()]
+    source = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    if kind.startswith("image"):
+        return figure(f'<img src="{source}" alt="{text(path.name)}">', path.name)
+    return figure(f'<video controls loop muted autoplay playsinline src="{source}"></video>', path.name)

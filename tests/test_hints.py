@@ -1,0 +1,46 @@
+"""Words of other libraries, the live curve, and what messages call this program."""
+
+import io
+import os
+import sys
+
+import pytest
+from rich.console import Console
+
+from mjx_dher import cli, names
+from mjx_dher.cli import common
+
+
+def test_a_polyak_that_is_likely_a_tau_is_explained():
+    for polyak, told in ((0.05, True), (0.95, False)):
+        console = Console(file=io.StringIO(), width=200)
+        common.warn_of_tau(polyak, console)
+        assert ("it is 1 - tau of other libraries" in console.file.getvalue()) == told
+
+
+@pytest.mark.parametrize("flag", common.FOREIGN_FLAGS)
+def test_every_foreign_flag_names_one_that_is_there(flag, capsys):
+    assert cli.main([flag, "3"]) == 2
+    named = capsys.readouterr().err.split(" is called ")[1]
+    assert cli.main(["sweep" if "--shard" in named else "train", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(word.strip(",:") in text for word in named.split(" here")[0].split() if word.startswith("--"))
+
+
+def test_a_number_in_a_sweep_is_named_as_it_is_there(capsys):
+    assert cli.main(["sweep", "--out", "x", "--her-k", "2", "4"]) == 2
+    assert "error: --her-k is called --sweep.her-k here, and takes one or more values to try" in capsys.readouterr().err
+
+
+def test_a_curve_of_characters():
+    assert common.sparkline([0.0, 0.5, 1.0]) == "▁▅█"
+    assert common.sparkline([0.0, 0.5, 1.0], ascii_only=True) == " =#"
+    assert common.sparkline([0.0] * 50 + [1.0] * 50, width=4) == "▁▁██"
+    assert common.sparkline([]) == ""
+    assert common.sparkline([float("nan"), 2.0, -1.0]) == "▁█▁"
+
+
+def test_messages_name_the_program_that_was_started(monkeypatch):
+    assert names.program() == "train.py"
+    monkeypatch.setattr(sys, "argv", [os.path.join("bin", "mjx-dher")])
+    assert names.program() == "mjx-dher"
