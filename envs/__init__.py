@@ -1,4 +1,7 @@
-"""Goal-conditioned environments, made by name or as "module:attribute": `make` and `list_envs`."""
+"""Goal-conditioned environments, made by name or as "module:attribute": `make` and `list_envs`.
+
+`Simulator` steps any MuJoCo model, whether it is a task or not.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ from mjx_dher.names import check_name, load_import_path
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State
+    from mjx_dher.envs.engines.simulator import Simulator
 
-__all__ = ["GoalEnv", "State", "list_envs", "make"]
+__all__ = ["GoalEnv", "Simulator", "State", "list_envs", "make"]
 
 # name -> constructor, or its "module:attribute", so that this module stays cheap to import
 _REGISTRY: dict[str, Callable[..., Any] | str] = {
@@ -98,4 +102,6 @@ def _takes_engine(constructor: Callable[..., Any]) -> bool:
 def __getattr__(name: str) -> Any:
     if name in ("GoalEnv", "State"):
         return getattr(importlib.import_module("mjx_dher.envs.base"), name)
+    if name == "Simulator":
+        return importlib.import_module("mjx_dher.envs.engines.simulator").Simulator
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

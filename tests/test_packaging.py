@@ -20,7 +20,7 @@ LAYERS = [
     "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
     "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
-    "presets networks priorities samplers runs.identity runs.health testing.env",
+    "presets networks priorities samplers runs.identity runs.health testing.env envs.engines.simulator",
     "envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
     "envs.engines.fused.memory envs.engines.fused.kinematics envs.engines.fused.contacts envs.engines.fused.linear",
     "envs.engines.fused.solver",

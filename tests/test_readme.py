@@ -1,9 +1,15 @@
 import re
 import runpy
 
+import numpy as np
 from conftest import ROOT
+from test_packaging import MODULES
+
+from mjx_dher import stats
 
 README = (ROOT / "README.md").read_text()
+# What commands and engines are made of; some of it has a place among the API pages, too.
+INNER = "cli host hopper envs.engines.fused envs.engines.warp learners.stored runs sweeps testing tools names"
 
 
 def test_the_components_example_runs(capsys):
@@ -14,8 +20,10 @@ def test_the_components_example_runs(capsys):
 
 
 def test_files_that_the_documents_name_are_there():
-    for document in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "bench" / "README.md"]:
-        for link in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "bench" / "README.md"]:
+        for link in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text()):
+            if link.startswith("https://"):
+                continue
             assert (document.parent / link).exists(), f"{document.name} links to {link}"
 
 
@@ -30,3 +38,30 @@ def test_the_two_commands_are_what_ci_installs_and_runs():
 def test_the_picture_of_the_design_is_what_its_script_draws():
     figure = runpy.run_path(str(ROOT / "docs" / "make_design_figure.py"))["make"]()
     assert figure == (ROOT / "docs" / "images" / "design.svg").read_text()
+
+
+def test_the_picture_of_samplers_has_the_numbers_of_the_tables():
+    """Its curves, averaged over epochs, are the mean successes of docs/results.md."""
+    figure = runpy.run_path(str(ROOT / "docs" / "make_sampler_figure.py"))
+    table = (ROOT / "docs" / "results.md").read_text()
+    for _, task, _, samplers in figure["PANELS"]:
+        for sampler in samplers:
+            curves = figure["curves"](task, sampler)
+            assert len(curves) == 10
+            area = stats.area_under_curve(np.arange(curves.shape[1]), curves)
+            assert f"| {stats.interquartile_mean(area):.3f} (" in table, (task, sampler)
+
+
+def test_the_site_has_every_module_that_is_for_users():
+    pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
+    listed = re.findall(r"^- \[`mjx_dher\.([\w.]+)`\]\(../../([\w./]+)\)", pages, re.M)
+    assert len(set(listed)) == len(listed)
+    assert {name: MODULES[name] for name, _ in listed} == {name: ROOT / path for name, path in listed}
+    users = {name for name in MODULES if name and not any(f"{name}.".startswith(f"{part}.") for part in INNER.split())}
+    assert users <= {name for name, _ in listed}
+
+
+def test_the_index_lists_every_page():
+    index = (ROOT / "docs" / "index.md").read_text()
+    for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "api").glob("*.md")]:
+        assert page.name == "index.md" or f"]({page.relative_to(ROOT / 'docs')})" in index, page

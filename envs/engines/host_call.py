@@ -85,7 +85,10 @@ _handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))
 
 
 def register(name: str, function: _Function) -> None:
-    """Makes `function` the one that programs call by `name`; it takes the place of an earlier one."""
+    """Makes `function` the one that programs call by `name`; it takes the place of an earlier one.
+
+    It must use NumPy alone: calls of JAX in a callback could deadlock.
+    """
     _functions[name] = function
     if name not in _handlers:
         _handlers[name] = _handler(lambda frame: _handle(name, frame.contents))
@@ -95,9 +98,11 @@ def register(name: str, function: _Function) -> None:
 def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
     """Calls the function that is registered by `name` with `inputs` [m]; returns its outputs, float32 of `shape`.
 
-    Under `vmap` it is called once, with [..., m].
+    Under `vmap` it is called once, with [..., m]. A program for another device than a CPU holds the function's address.
     """
     result = jax.ShapeDtypeStruct(shape, np.float32)
+    if jax.default_backend() != "cpu":
+        return jax.pure_callback(_functions[name], result, inputs, vmap_method="broadcast_all")
     return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(inputs)
 
 

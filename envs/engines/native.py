@@ -9,7 +9,6 @@ import os
 import threading
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -36,40 +35,30 @@ def _drop_warnings() -> None:
         mujoco.set_mju_user_warning(ignore)
 
 
-def _digest(model: mujoco.MjModel, *settings: int) -> str:
+def digest(model: mujoco.MjModel, *settings: Any) -> str:
     """Returns digits that stand for a model and numbers: engines that have them alike can stand in for one another."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.sha256(buffer.tobytes() + repr(settings).encode()).hexdigest()[:16]
 
 
-class NativeEngine:
-    """MuJoCo C behind one call of the host a step, for any number of (nested) batch axes.
+class BatchedModel:
+    """A model of MuJoCo C, whose states are stepped in batches by all cores: what the host does for a compiled program.
 
-    The results are those of a plain loop over `mj_step` at any number of threads: float64 inside, float32 between steps.
+    A copy, or a pickle, has batches of its own.
     """
 
-    name = "native"
-
-    def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int | None = None):
+    def __init__(self, model: mujoco.MjModel, num_threads: int | None):
         if num_threads is not None:
             check_number("num_threads", num_threads, "[1, 4096]")
         self._model = copy.copy(model)
-        # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
-        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
-        # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0, and the environment cannot notice.
+        # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0, and nobody can notice.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._substeps = substeps
-        # Ends of qpos, qvel, warmstart and target in a packed row; ctrl is the rest.
-        self._ends = np.cumsum([model.nq, model.nv, model.nv, 7])
         self._num_threads = num_threads or usable_cores()
-        self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads)}"
-        self._begin()
 
     def _begin(self) -> None:
         self._batches: dict[int, Batch] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
-        host_call.register(self._name, self._advance)
         _drop_warnings()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -80,15 +69,38 @@ class NativeEngine:
         vars(self).update(state)
         self._begin()
 
+    def _batch(self, nsim: int) -> Batch:
+        if nsim not in self._batches:
+            self._batches[nsim] = Batch(self._model, nsim, self._num_threads)
+        return self._batches[nsim]
+
+
+class NativeEngine(BatchedModel):
+    """MuJoCo C behind one call of the host a step, for any number of (nested) batch axes.
+
+    The results are those of a plain loop over `mj_step` at any number of threads: float64 inside, float32 between steps.
+    """
+
+    name = "native"
+
+    def __init__(self, model: mujoco.MjModel, substeps: int, num_threads: int | None = None):
+        super().__init__(model, num_threads)
+        # One gripper and one object: splitting the constraints into islands costs more (10 %) than it saves.
+        self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        self._substeps = substeps
+        # Ends of qpos, qvel, warmstart and target in a packed row; ctrl is the rest.
+        self._ends = np.cumsum([model.nq, model.nv, model.nv, 7])
+        self._name = f"mjx_dher_native_{digest(self._model, substeps, self._num_threads)}"
+        self._begin()
+
+    def _begin(self) -> None:
+        super()._begin()
+        host_call.register(self._name, self._advance)
+
     def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
         # One array in and one out, because each costs the callback some 20 microseconds.
         state = jnp.concatenate([physics.qpos, physics.qvel, physics.warmstart])
-        inputs = jnp.concatenate([state, target, ctrl])
-        if jax.default_backend() == "cpu":
-            state = host_call.call(self._name, state.shape, inputs)
-        else:
-            result = jax.ShapeDtypeStruct(state.shape, jnp.float32)
-            state = jax.pure_callback(self._advance, result, inputs, vmap_method="broadcast_all")
+        state = host_call.call(self._name, state.shape, jnp.concatenate([state, target, ctrl]))
         qpos, qvel, warmstart = jnp.split(state, self._ends[:2].tolist())
         return Physics(qpos=qpos, qvel=qvel, warmstart=warmstart)
 
@@ -96,7 +108,7 @@ class NativeEngine:
         pass  # nothing goes wrong unnoticed
 
     def _advance(self, inputs: Any) -> np.ndarray:
-        """Advances `inputs` [..., row] on the host. NumPy only: calls of JAX in a callback could deadlock."""
+        """Advances `inputs` [..., row] on the host."""
         rows = np.asarray(inputs).reshape(-1, inputs.shape[-1])
         qpos, qvel, warmstart, target, ctrl = np.split(rows, self._ends, axis=1)
         with self._lock:
@@ -111,8 +123,3 @@ class NativeEngine:
             batch.step(nstep=self._substeps)
             state = np.concatenate([batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart")], axis=1, dtype=np.float32)
         return state.reshape(*inputs.shape[:-1], -1)
-
-    def _batch(self, nsim: int) -> Batch:
-        if nsim not in self._batches:
-            self._batches[nsim] = Batch(self._model, nsim, self._num_threads)
-        return self._batches[nsim]

@@ -41,7 +41,7 @@ EXTRAS = {  # extra: packages that only it installs
     "export": ("onnx", "safetensors"),
     "tensorboard": ("tensorboardX", "tensorboard"),
     "wandb": ("wandb",),
-    "docs": ("pdoc",),
+    "docs": ("sphinx", "furo", "myst-nb"),
 }
 EXTRA_OF = {package: extra for extra, packages in EXTRAS.items() for package in packages}
 

@@ -1,0 +1,64 @@
+"""Writes docs/images/samplers.png, the README's first picture: `python docs/make_sampler_figure.py` (extra `plot`)."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher import stats
+
+DOCS = Path(__file__).parent
+# Okabe and Ito's colours, and a line's style.
+STYLES = {
+    "future": ("#0072B2", "-"),
+    "weighted": ("#D55E00", "--"),
+    "epsilon_closest": ("#009E73", "-."),
+    "closest": ("#000000", ":"),
+}
+# Task, its file, environment steps an epoch, and samplers.
+PANELS = (
+    ("Push", "push", 40_000, tuple(STYLES)),
+    ("PickAndPlace", "pick_and_place", 80_000, ("future", "weighted")),
+    ("Slide", "slide", 40_000, ("future", "weighted")),
+)
+
+
+def curves(task: str, sampler: str) -> np.ndarray:
+    """Returns the success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper_TASK_curves.csv."""
+    with (DOCS / f"paper_{task}_curves.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["sweep"] == "samplers" and row["setting"] == sampler]
+    seeds, epochs = ({int(row[column]) for row in rows} for column in ("seed", "epoch"))
+    table = np.full((len(seeds), len(epochs)), np.nan)
+    for row in rows:
+        table[int(row["seed"]) - min(seeds), int(row["epoch"]) - 1] = float(row["success_rate"])
+    return table
+
+
+def make() -> Any:
+    """Returns the figure."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.9), sharey=True, layout="constrained")
+    for axis, (title, task, steps, samplers) in zip(axes, PANELS, strict=True):
+        for sampler in samplers:
+            color, line = STYLES[sampler]
+            middle, low, high = stats.curve_interval(curves(task, sampler))
+            x = np.arange(1, len(middle) + 1) * steps / 1e6
+            axis.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0)
+            axis.plot(x, middle, color=color, linestyle=line, linewidth=1.8, label=sampler)
+        axis.set(title=title, xlabel="million environment steps", xlim=(0, None), ylim=(0, 1.02))
+        axis.grid(alpha=0.2)
+    axes[0].set_ylabel("success rate")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
+    return figure
+
+
+if __name__ == "__main__":
+    make().savefig(DOCS / "images" / "samplers.png", dpi=110)

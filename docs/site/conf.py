@@ -1,0 +1,162 @@
+"""Settings of Sphinx for the site: `.ci/run --docs` builds it. Its source is the repository, so that links are those of GitHub.
+
+Pages are Markdown that reads as well without Sphinx. Three things are made of it here: the table of contents, which is that of
+docs/index.md; the API pages, on which the line of a module becomes its docstrings; and docstrings, which are Markdown, too.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from sphinx.pycode import ModuleAnalyzer
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+project = "mjx-dher"
+author = "The mjx-dher authors"
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+root_doc = "docs/index"
+include_patterns = ["*.md", ".github/*.md", "docs/*.md", "docs/*.ipynb", "docs/api/*.md", "bench/README.md"]
+html_theme = "furo"
+html_title = "mjx-dher"
+html_extra_path = ["index.html"]  # the front page's address: it leads to docs/index.html
+html_copy_source = False
+myst_heading_anchors = 4
+nb_execution_mode = "off"  # a test runs the notebook
+default_role = "py:obj"  # what is in backticks in a docstring
+autodoc_default_options = {
+    "members": True,
+    "undoc-members": True,
+    "member-order": "bysource",
+    "ignore-module-all": True,
+    "exclude-members": "replace",
+}
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+napoleon_google_docstring, napoleon_numpy_docstring = True, False
+suppress_warnings = ["ref.python"]  # a name in backticks that several modules have
+
+SECTION = re.compile(r"(Args|Returns|Raises|Yields|Attributes|Note|Example|Examples):$")
+MODULE = re.compile(r"^- \[`(mjx_dher[\w.]*)`\]\([^)]*\)(.*)$", re.M)
+AUTOMODULE = "## `{0}`\n\n```{{eval-rst}}\n.. automodule:: {0}\n```\n"
+
+
+def expand(app: Any, docname: str, source: list[str]) -> None:
+    """Makes the table of contents of the index's links, and docstrings of the API pages' lists."""
+    del app
+    if docname == root_doc:
+        source[0] += contents(source[0])
+    elif docname.startswith("docs/api/"):
+        for line in MODULE.finditer(source[0]):
+            add_comments(line[1])
+        source[0] = MODULE.sub(lambda line: AUTOMODULE.format(line[1]), source[0])
+
+
+def contents(text: str) -> str:
+    """Returns the index's sections as hidden tables of contents, each of the pages that its section links to."""
+    parts = []
+    for section in text.split("\n## ")[1:]:
+        title, _, body = section.partition("\n")
+        pages = re.findall(r"\]\(([^)#:]+\.(?:md|ipynb))\)", body)
+        entries = "\n".join(dict.fromkeys(path.rpartition(".")[0] for path in pages))
+        parts.append(f"\n```{{toctree}}\n:hidden:\n:caption: {title}\n\n{entries}\n```\n")
+    return "".join(parts)
+
+
+def to_rst(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Rewrites a docstring, before napoleon reads it: an indented block after a paragraph is shown as it is."""
+    del app, what, name, obj, options
+    if lines and lines[0].startswith("Alias for field number"):  # Python's own text for a field of a NamedTuple
+        lines.clear()
+    written: list[str] = []
+    in_section = in_block = False
+    for line in lines:
+        if line and not line.startswith(" "):
+            in_section, in_block = bool(SECTION.match(line)), False
+        if line.startswith("    ") and not in_section and not in_block and written and not written[-1]:
+            written += ["::", ""]
+            in_block = True
+        written.append(line if in_block else escaped(line))
+    lines[:] = written
+
+
+def escaped(line: str) -> str:
+    """Returns a line in which marks of reStructuredText that are none in Markdown mean themselves."""
+    if re.match(r"\s*\*\*\w+:", line):  # an argument's name
+        return line
+    parts = line.split("`")
+    for i in range(0, len(parts), 2):  # not within backticks
+        text = re.sub(r"(?<!\w)\*(?=\w[^*]*\w\*)|(?<=\w)\*(?!\w)", "\0", parts[i])  # emphasis stays
+        text = re.sub(r"(?<=\w)_(?!\w)", r"\\_", re.sub(r"([*|])", r"\\\1", text)).replace("\0", "*")
+        parts[i] = f"\\ {text}" if i and text[:1].isalnum() else text  # `Array`s
+    return "`".join(parts)
+
+
+def field_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Gives a field its text as it is written: napoleon takes what comes before a colon for its type."""
+    del app, obj, options
+    owner, _, field = name.rpartition(".")
+    if what == "attribute" and (text := texts_of(*owner.rpartition(".")[::2]).get(field)):
+        lines[:] = [escaped(line) for line in text.split("\n")]
+
+
+def add_comments(module: str) -> None:
+    """Has autodoc take the comment beside a field, which has its shape, for the docstring of one that has none."""
+    importlib.import_module(module)
+    documented = ModuleAnalyzer.for_module(module).find_attr_docs()
+    for owner in classes(module):
+        for field, text in texts_of(module, owner).items():
+            documented.setdefault((owner, field), [text, ""])
+
+
+def classes(module: str) -> dict[str, ast.ClassDef]:
+    """Returns the classes of a module that is imported, by name."""
+    origin = getattr(sys.modules.get(module), "__file__", None)
+    tree = ast.parse(Path(origin).read_text()) if origin else ast.Module([], [])
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+
+
+@functools.cache
+def texts_of(module: str, owner: str) -> dict[str, str]:
+    """Returns the docstrings of a class's fields, or else the comments beside and above them, by name; nothing for no class."""
+    if (node := classes(module).get(owner)) is None:
+        return {}
+    rows, texts = Path(sys.modules[module].__file__ or "").read_text().splitlines(), {}
+    for field, following in zip(node.body, [*node.body[1:], None], strict=True):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and field.end_lineno:
+            text = docstring(following) or comment(rows, field.lineno - 1, field.end_lineno - 1)
+            texts.update({field.target.id: text} if text else {})
+    return texts
+
+
+def docstring(node: ast.stmt | None) -> str:
+    """Returns the text of a statement that is only that, as what stands below a field; "" of any other."""
+    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+        return inspect.cleandoc(node.value.value)
+    return ""
+
+
+def comment(rows: list[str], first: int, last: int) -> str:
+    """Returns the comment above row `first`, and the one at the end of row `last`."""
+    above: list[str] = []
+    while rows[first - 1].strip().startswith("# "):
+        first -= 1
+        above.insert(0, rows[first].strip()[2:])
+    beside = rows[last].partition("  # ")[2].partition("  # noqa")[0]
+    return " ".join([*above, beside]).strip()
+
+
+def setup(app: Any) -> None:
+    """Registers what is done to pages and docstrings."""
+    app.connect("source-read", expand)
+    app.connect("autodoc-process-docstring", to_rst, priority=400)  # before napoleon's
+    app.connect("autodoc-process-docstring", field_text, priority=600)

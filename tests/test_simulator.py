@@ -1,0 +1,171 @@
+"""Any model by MuJoCo C from inside compiled programs, beside plain loops over `mj_step`."""
+
+import copy
+import pickle
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from any_model import FIGURE
+
+from mjx_dher.envs import Simulator, make
+from mjx_dher.envs.engines import simulator
+
+# Whatever a state can have: an actuator with activation, a mocap body with a weld, a tendon, a delayed sensor, a keyframe.
+RICH = """
+<mujoco>
+  <size nuserdata="2"/>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1"/>
+    <body name="hand" mocap="true" pos="0 0 1"/>
+    <body name="box" pos="0 0 1"><freejoint/><geom name="box" type="box" size="0.1 0.1 0.1"/></body>
+    <body name="arm" pos="1 0 0.5">
+      <joint name="swing" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.04"/>
+      <body pos="0.4 0 0"><joint name="bend" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03"/></body>
+    </body>
+  </worldbody>
+  <equality><weld body1="hand" body2="box"/></equality>
+  <tendon><fixed name="pull"><joint joint="swing" coef="1"/><joint joint="bend" coef="-0.5"/></fixed></tendon>
+  <actuator>
+    <general joint="swing" dyntype="filter" dynprm="0.1" gainprm="5"/>
+    <motor tendon="pull" gear="2"/>
+  </actuator>
+  <sensor><jointpos joint="swing" nsample="4" delay="0.006"/><framepos objtype="body" objname="box"/></sensor>
+  <keyframe><key name="up" qpos="0 0 2 1 0 0 0 0.5 -0.5" ctrl="0.1 0.2"/></keyframe>
+</mujoco>
+"""
+STATE = simulator._STATE
+
+
+def load(model, data, values):
+    """Puts a state, as it was between steps, into an MjData."""
+    for name in STATE:
+        value = np.asarray(getattr(values, name))
+        if name == "time":
+            data.time = float(value)
+        else:
+            getattr(data, name)[...] = value.reshape(getattr(data, name).shape)
+
+
+def loop(model, first, controls, substeps):
+    """States after each step of a loop over `mj_step` that keeps float32 between steps, as lists of arrays by name."""
+    model = copy.copy(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    data, states = mujoco.MjData(model), []
+    load(model, data, first)
+    for ctrl in controls:
+        data.ctrl[:] = ctrl
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+        state = {name: np.float32(getattr(data, name)) for name in (*STATE, "xpos", "sensordata")}
+        states.append(state)
+        data = mujoco.MjData(model)
+        load(model, data, simulator.Data(**{name: state[name] for name in STATE}, derived={}))
+    return states
+
+
+@pytest.mark.parametrize("xml", [FIGURE, RICH], ids=["figure", "rich"])
+def test_a_scan_of_a_batch_is_a_loop_over_mj_step(xml):
+    model = mujoco.MjModel.from_xml_string(xml)
+    sim = Simulator(model, derived=["xpos", "sensordata"], substeps=3, num_threads=2)
+    controls = jax.random.uniform(jax.random.key(0), (20, 4, model.nu), minval=-1, maxval=1)
+    first = jax.vmap(lambda x: sim.make_data().replace(qvel=x * jnp.ones(model.nv)))(jnp.linspace(-0.5, 0.5, 4))
+
+    def step(data, ctrl):
+        data = jax.vmap(sim.step)(data, ctrl)
+        return data, data
+
+    _, states = jax.jit(lambda data: jax.lax.scan(step, data, controls))(first)
+    assert np.ptp(states.qpos, axis=1).max() > 0.1  # they went different ways
+    for i in range(4):
+        expected = loop(model, jax.tree.map(lambda x, i=i: x[i], first), np.asarray(controls[:, i]), substeps=3)
+        for t, state in enumerate(expected):
+            for name in STATE:
+                np.testing.assert_array_equal(getattr(states, name)[t, i].ravel(), state[name].ravel(), err_msg=name)
+            for name in ("xpos", "sensordata"):
+                np.testing.assert_array_equal(states.derived[name][t, i], state[name], err_msg=name)
+
+
+def test_alone_nested_and_through_grad_s_stop():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), num_threads=1)
+    data = sim.make_data()
+    alone = jax.jit(sim.step)(data, jnp.ones(4))
+    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (2, 3, *x.shape)), data)
+    nested = jax.jit(jax.vmap(jax.vmap(sim.step)))(many, jnp.ones((2, 3, 4)))
+    for one, all_of_them in zip(jax.tree.leaves(alone), jax.tree.leaves(nested), strict=True):
+        np.testing.assert_array_equal(all_of_them[1, 2], one)
+    with pytest.raises(ValueError, match="cannot be differentiated"):
+        jax.grad(lambda ctrl: sim.step(data, ctrl).qvel.sum())(jnp.ones(4))
+
+
+def test_forward_makes_current_what_step_leaves_a_timestep_behind():
+    model = mujoco.MjModel.from_xml_string(RICH)
+    sim = Simulator(model, derived=["xpos"])
+    data = sim.make_data("up")
+    assert data.qpos[2] == 2
+    np.testing.assert_allclose(data.ctrl, [0.1, 0.2])
+    np.testing.assert_allclose(data.derived["xpos"][2], [0, 0, 2])
+    np.testing.assert_array_equal(data.derived["xpos"], sim.make_data(0).derived["xpos"])
+    fallen = sim.step(sim.step(data))
+    current = sim.forward(fallen)
+    assert fallen.derived["xpos"][2, 2] != fallen.qpos[2]
+    np.testing.assert_array_equal(current.derived["xpos"][2], fallen.qpos[:3])
+    np.testing.assert_array_equal(current.qpos, fallen.qpos)
+
+
+def test_what_blows_up_is_not_reset_behind_one_s_back():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE))
+    data = sim.make_data()
+    wild = jax.vmap(lambda v: sim.step(sim.step(data.replace(qvel=data.qvel.at[0].set(v)))))(jnp.array([0.0, jnp.inf]))
+    assert np.isfinite(wild.qvel[0]).all()
+    assert not np.isfinite(wild.qvel[1]).all()
+
+
+def test_copies_and_pickles_step_alike():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), derived=["xpos"])
+    expected = sim.step(sim.make_data(), jnp.ones(4))
+    for other in (copy.deepcopy(sim), pickle.loads(pickle.dumps(sim))):
+        for a, b in zip(jax.tree.leaves(other.step(other.make_data(), jnp.ones(4))), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_task_s_model_steps_as_its_engine_does():
+    env = make("push", engine="native")
+    sim = Simulator(env.model, substeps=20)
+    state = env.reset(jax.random.key(0))
+    physics = state.physics
+    data = sim.make_data().replace(qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.warmstart)
+    target = jnp.concatenate([data.mocap_pos[0], data.mocap_quat[0]])
+    theirs = env.engine.advance(physics, target, data.ctrl)
+    np.testing.assert_allclose(sim.step(data).qpos, theirs.qpos, atol=1e-5)  # its engine does without islands
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda model: Simulator("figure.xml"), "model must be a mujoco.MjModel; got a str"),
+        (lambda model: Simulator(model, derived="xpos"), "derived must be a list of names; got 'xpos'"),
+        (lambda model: Simulator(model, derived=["xposs"]), "derived must be one of .*; got 'xposs' .*'xpos'"),
+        (lambda model: Simulator(model, derived=["qpos"]), "derived must be one of"),
+        (lambda model: Simulator(model, substeps=0), r"substeps must lie in \[1, 1000000\]; got 0"),
+        (lambda model: Simulator(model, num_threads=0), r"num_threads must lie in \[1, 4096\]; got 0"),
+        (lambda model: Simulator(model).make_data("down"), "keyframe 'down' is none of the model's 0"),
+        (lambda model: Simulator(model).make_data(3), "keyframe 3 is none of the model's 0"),
+        (
+            lambda model: Simulator(model).step(Simulator(model).make_data(), jnp.ones(3)),
+            r"ctrl has shape \[3\]; the model's is \[4\]",
+        ),
+        (lambda model: Simulator(model).step(None), "data must be a Data, as make_data gives it; got a NoneType"),
+        (lambda model: Simulator(asleep(model)), "sleep and IPC require a persistent batch"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(mujoco.MjModel.from_xml_string(FIGURE))
+
+
+def asleep(model):
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    return model
