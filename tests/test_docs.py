@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import re
 import shlex
 import tomllib
@@ -64,7 +65,7 @@ def shell_lines(script):
         if len(words) == 1 and (assigned := re.fullmatch(r"(\w+)=(.*)", words[0])):
             variables[assigned[1]] = assigned[2]
         command = []
-        for word in [*words, "&&"]:
+        for word in [*itertools.takewhile(lambda word: word != ">", words), "&&"]:
             if word in ("&&", "&", ";", "|"):
                 if command:
                     yield command
@@ -114,12 +115,15 @@ def parse_only(monkeypatch):
     monkeypatch.setattr(tyro, "cli", and_stop)
 
 
-@pytest.mark.parametrize("line", [line for line in OURS if "COMMAND" not in line])
+@pytest.mark.parametrize("line", [line for line in OURS if "COMMAND" not in line and line != "--version"])
 def test_a_command_line_is_one(line, parse_only, monkeypatch, capsys):
     arguments = shlex.split(line)
     name = arguments[0] if arguments and arguments[0] in cli.COMMANDS else "train"
     if "--help" in arguments:
         arguments.remove("--help")
+    if "--config" in arguments:  # there is no such run here
+        at = arguments.index("--config")
+        del arguments[at : at + 2]
     if "module:attribute" not in line and name in ("train", "sweep"):  # values and all
         monkeypatch.undo()
         parse_train_args(arguments) if name == "train" else parse_sweep_args([*arguments[1:], *_out(arguments)])
