@@ -44,7 +44,7 @@ def script(shell: str) -> str:
     every: Any = reduce(operator.or_, (_subcommand(name) for name in COMMANDS))
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        tyro.cli(tyro.conf.OmitArgPrefixes[every], prog="mjx-dher", args=["--tyro-print-completion", shell])
+        tyro.cli(every, prog="mjx-dher", args=["--tyro-print-completion", shell], config=(tyro.conf.OmitArgPrefixes,))
     return printed.getvalue()
 
 

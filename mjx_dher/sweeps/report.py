@@ -118,7 +118,7 @@ def _runs(trials: Sequence[dict[str, Any]]) -> str:
     head = ["run", *varying, "seed", "status", "success", "at the reset", "seconds", "reason"]
     rows = []
     for trial in trials:
-        final, (*_, seconds) = trial["final"], (None, *trial["curve"].get("wall_seconds", ()))
+        final, seconds = trial["final"], [None, *trial["curve"].get("wall_seconds", ())][-1]
         values = [_value(trial["settings"][name]) for name in varying]
         numbers = map(_number, (final.get("success_rate"), final.get("reset_success_rate"), seconds))
         rows.append([trial["folder"].name, *values, trial["seed"], trial["status"], *numbers, trial["reason"]])
