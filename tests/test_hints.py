@@ -5,6 +5,7 @@ import os
 import sys
 
 import pytest
+from conftest import ROOT
 from rich.console import Console
 
 from mjx_dher import cli, names
@@ -44,3 +45,29 @@ def test_messages_name_the_program_that_was_started(monkeypatch):
     assert names.program() == "train.py"
     monkeypatch.setattr(sys, "argv", [os.path.join("bin", "mjx-dher")])
     assert names.program() == "mjx-dher"
+
+
+HUGE = str(10**20)
+BAD = [
+    (["eval", "docs", "--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
+    (["transfer", "docs", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
+    (["render", "docs", "--out", "x.png", "--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
+    (["--env-kwargs", "dense"], ["env_kwargs must be NAME=VALUE each, such as reward_type=dense; got 'dense'"]),
+    (["--config", "docs"], ["config: there is no file docs/config.json"]),
+    (["--stop-at", "nan"], ["stop_at must lie in (0, 1]; got nan"]),
+    (["sweep", "--out", "x", "--keep-end"], ["keep_end is for one run alone"]),
+    (["plot", "docs"], ["docs is neither a run folder nor that of a sweep: it has neither config.json nor cells/"]),
+    (["report", "docs/not-there"], ["docs/not-there is neither a run folder nor that of a sweep: no such folder"]),
+    (["list", "smplers"], ["kind must be one of tasks", "did you mean 'samplers' or 'metrics'?"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "messages"), BAD)
+def test_bad_arguments_are_refused_with_a_line(argv, messages, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    before = {path.name for path in ROOT.iterdir()}
+    assert cli.main(argv) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: ")
+    assert all(message in error for message in messages)
+    assert {path.name for path in ROOT.iterdir()} == before

@@ -17,6 +17,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from mjx_dher import envs
+from mjx_dher.config import check_count, check_number
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, own_parts, to_arguments, to_texts
@@ -76,6 +77,12 @@ def warn_of_tau(polyak: float, console: Console) -> None:
             f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries",
             soft_wrap=True,
         )
+
+
+def check_episodes(episodes: int, seed: int) -> None:
+    """Raises ValueError for a number of episodes, or a seed, that cannot be played."""
+    check_count("episodes", episodes)
+    check_number("seed", seed, "[0, 4294967295]")
 
 
 def check_engine(engine: str | None) -> None:

@@ -12,8 +12,15 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import names
-from mjx_dher.cli.common import changed_arguments, check_engine, make_env, print_summary, read_run, settle_compiler
-from mjx_dher.config import check_count
+from mjx_dher.cli.common import (
+    changed_arguments,
+    check_engine,
+    check_episodes,
+    make_env,
+    print_summary,
+    read_run,
+    settle_compiler,
+)
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
 from mjx_dher.spec import RunSpec, to_arguments
@@ -42,7 +49,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     args = tyro.cli(EvalArgs, prog=f"{names.program()} eval", args=argv)
     if not args.runs:
         raise ValueError("eval takes one or more run folders; got none")
-    check_count("episodes", args.episodes)
+    check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
     remarks = Console(stderr=True, highlight=False, markup=False, emoji=False) if args.json else console

@@ -10,8 +10,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, names
-from mjx_dher.cli.common import changed_arguments, check_engine, make_env, read_run
-from mjx_dher.config import check_count
+from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, make_env, read_run
 from mjx_dher.host.caches import check_platform
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
@@ -54,7 +53,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
     args = tyro.cli(RenderArgs, prog=f"{names.program()} render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
-    check_count("episodes", args.episodes)
+    check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
     if args.run is not None and args.env is None:

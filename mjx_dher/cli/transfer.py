@@ -9,8 +9,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import names
-from mjx_dher.cli.common import check_engine, make_env, print_summary, read_run, settle_compiler
-from mjx_dher.config import check_count
+from mjx_dher.cli.common import check_engine, check_episodes, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
 
@@ -40,7 +39,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
     args = tyro.cli(TransferArgs, prog=f"{names.program()} transfer", args=argv)
     check_engine(args.engine)
-    check_count("episodes", args.episodes)
+    check_episodes(args.episodes, args.seed)
     run = read_run(args.run, console)
     settle_compiler(args.engine or run.engine)
     from mjx_dher.envs.engines.native import usable_cores

@@ -103,7 +103,8 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
     for number, (env, groups) in enumerate(comparison.groups(trials).items()):
         rows = comparison.compare(groups, baseline, threshold)
         body += [page.heading(env), page.table(*comparison.table(rows))]
-        body.append(page.paragraph(f"epochs to a success rate of {threshold:g}; P(better) and p: against {baseline}"))
+        compared = f"P(better) and p: against {baseline}" if any(row.better == row.better for row in rows) else "no baseline"
+        body.append(page.paragraph(f"epochs to a success rate of {threshold:g}; {compared}"))
         for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
             body.append(page.figure(figures.to_svg(figure, 10 * number + place), name))
     plotting.close()
