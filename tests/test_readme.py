@@ -19,12 +19,18 @@ def test_the_components_example_runs(capsys):
     assert capsys.readouterr().out.startswith("(256, 25) (256, 3) -")
 
 
-def test_files_that_the_documents_name_are_there():
-    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "bench" / "README.md"]:
-        for link in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text()):
-            if link.startswith("https://"):
-                continue
-            assert (document.parent / link).exists(), f"{document.name} links to {link}"
+def anchors(text):
+    """Of a page's headings, as GitHub and the site make them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_files_and_headings_that_the_documents_name_are_there():
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")]:
+        for link, _, anchor in re.findall(r"\]\((?!https?:)([^)#]*)(#([^)]+))?\)", document.read_text()):
+            target = document.parent / link if link else document
+            assert target.exists(), f"{document.name} links to {link}"
+            assert not anchor or anchor in anchors(target.read_text()), f"{document.name} links to {link}#{anchor}"
 
 
 def test_the_two_commands_are_what_ci_installs_and_runs():
