@@ -17,7 +17,13 @@ from mjx_dher.cli.train import parse_train_args
 
 DOCUMENTS = {
     str(path.relative_to(ROOT)): path.read_text()
-    for path in [*ROOT.glob("*.md"), *ROOT.glob(".github/**/*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "bench" / "README.md"]
+    for path in [
+        *ROOT.glob("*.md"),
+        *ROOT.glob(".github/**/*.md"),
+        *ROOT.glob("docs/**/*.md"),
+        *ROOT.glob("mjx_dher/**/*.md"),
+        ROOT / "bench" / "README.md",
+    ]
     if path.name not in ("CHANGELOG.md", "history.md")  # they tell of what there was
 }
 EXTRAS = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])

@@ -34,6 +34,15 @@ def test_a_function_is_called_once_for_all_batch_axes():
     assert seen == [(3,), (2, 2, 3), (3,), (3,), (3,)]
 
 
+def test_programs_for_other_devices_call_the_function_itself(monkeypatch):
+    host_call.register("test_elsewhere", double)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    call = lambda row: host_call.call("test_elsewhere", (4,), row)  # noqa: E731
+    program = jax.jit(jax.vmap(call))
+    assert "pure_callback" in str(jax.make_jaxpr(program)(ROWS))
+    np.testing.assert_array_equal(program(ROWS), double(np.asarray(ROWS)))
+
+
 def test_the_last_function_of_a_name_is_called_also_by_what_is_compiled():
     host_call.register("test_two", double)
     call = jax.jit(lambda row: host_call.call("test_two", (4,), row))

@@ -19,12 +19,18 @@ def test_the_components_example_runs(capsys):
     assert capsys.readouterr().out.startswith("(256, 25) (256, 3) -")
 
 
-def test_files_that_the_documents_name_are_there():
-    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "bench" / "README.md"]:
-        for link in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text()):
-            if link.startswith("https://"):
-                continue
-            assert (document.parent / link).exists(), f"{document.name} links to {link}"
+def anchors(text):
+    """Of a page's headings, as GitHub and the site make them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.S), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_files_and_headings_that_the_documents_name_are_there():
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")]:
+        for link, _, anchor in re.findall(r"\]\((?!https?:)([^)#]*)(#([^)]+))?\)", document.read_text()):
+            target = document.parent / link if link else document
+            assert target.exists(), f"{document.name} links to {link}"
+            assert not anchor or anchor in anchors(target.read_text()), f"{document.name} links to {link}#{anchor}"
 
 
 def test_the_two_commands_are_what_ci_installs_and_runs():
@@ -65,3 +71,29 @@ def test_the_index_lists_every_page():
     index = (ROOT / "docs" / "index.md").read_text()
     for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "api").glob("*.md")]:
         assert page.name == "index.md" or f"]({page.relative_to(ROOT / 'docs')})" in index, page
+
+
+def section(text, title):
+    return re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", text, re.M | re.S)[1]
+
+
+def test_numbers_are_those_of_the_pages_that_have_measured_them():
+    """Of the README and of docs/field.md: a figure that changes has to change everywhere."""
+    read = lambda name: (ROOT / name).read_text()  # noqa: E731
+    results, bench, field = read("docs/results.md"), read("bench/README.md"), read("docs/field.md")
+    measured = results + read("docs/fidelity.md")
+    figures = re.findall(r"[+-]?\d\.\d{3}", section(README, "Results in four lines"))
+    assert len(figures) > 20
+    assert [figure for figure in figures if figure not in measured and f"+{figure}" not in measured] == []
+    of_gpu = re.findall(r"((?:[01]\.\d{3}, ){4}[01]\.\d{3}) \(200 to 204\)", section(README, "Tasks"))
+    assert len(of_gpu) == 3
+    assert [successes for successes in of_gpu if f"| {successes} |" not in bench] == []
+    cpu = re.search(r"^\| `push` .*?\| ([\d., ]+) \(0 to 4\)", README, re.M)[1].split(", ")
+    assert cpu == re.findall(r"^\| \d +\| .*\| ([01]\.\d{3}) \(", section(bench, r"Time to success.*?"), re.M)[:5]
+    rates = re.findall(r"\d{1,3}(?:,\d{3})+", section(field, "Speed").split("Transitions")[1])
+    assert rates
+    assert [rate for rate in rates if rate not in bench] == []
+    ours = [row for row in section(field, "Speed").splitlines() if "Push" in row and "H200" in row]
+    table = re.search(r"^\| Push \| (.*) \|$", read("docs/design.md"), re.M)[1].replace(",", "").split(" | ")
+    thousands = [str(int(re.search(r"\| ([\d,]+) \|", row)[1].replace(",", "")) // 1000) for row in ours]
+    assert thousands == [table[2]]

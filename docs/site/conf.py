@@ -19,14 +19,16 @@ from sphinx.pycode import ModuleAnalyzer
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
+import mjx_dher  # noqa: E402
 
 project = "mjx-dher"
+release = mjx_dher.__version__
 author = "The mjx-dher authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 root_doc = "docs/index"
 include_patterns = ["*.md", ".github/*.md", "docs/*.md", "docs/*.ipynb", "docs/api/*.md", "bench/*.md"]
 html_theme = "furo"
-html_title = "mjx-dher"
+html_title = f"mjx-dher {release}"
 html_extra_path = ["index.html"]  # the front page's address: it leads to docs/index.html
 html_copy_source = False
 myst_heading_anchors = 4
