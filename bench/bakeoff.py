@@ -19,11 +19,10 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from bakeoff_arms import ARMS, BASELINE, GROUPS, LEARNERS, TASKS, THRESHOLDS, Arm, estimated_minutes, spec_of
-from numpy.typing import NDArray
+from bakeoff_arms import ARMS, BASELINE, GROUPS, LEARNERS, TASKS, THRESHOLDS, estimated_minutes, spec_of
+from bakeoff_report import Row, Scores, compare, forest
 from rich.console import Console
 
 from mjx_dher import envs, stats
@@ -38,7 +37,6 @@ from mjx_dher.sweeps import comparison, grid, sweep, tables
 
 TABLE = "bakeoff.csv"
 TOY_TASK = "point_mass:PointMass"
-ALPHA, POWER = 0.05, 0.8
 
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
@@ -143,108 +141,6 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
     return all(grid.is_done(folder, run) for run in todo)
 
 
-class Scores(NamedTuple):
-    """What the runs of an arm came to, by seed; all [S]."""
-
-    seeds: tuple[int, ...]
-    area: NDArray  # mean success over the epochs
-    final: NDArray  # success of the last policy
-    steps: NDArray  # environment steps to the threshold; infinite where it is never reached
-    failed: int
-
-
-class Row(NamedTuple):
-    """An arm of a learner and task beside `future`. Differences are paired by seed; intervals are at 95 %."""
-
-    learner: str
-    task: str
-    arm: str
-    seeds: int
-    failed: int
-    mean_success: float
-    final: float
-    steps_to_threshold: float  # median; infinite if half of the seeds or more never reach it
-    difference: float  # of mean success
-    low: float
-    high: float
-    final_difference: float
-    better: float  # probability that a seed of the arm has more mean success than one of `future`
-    better_low: float
-    better_high: float
-    p_value: float
-    p_corrected: float  # by Holm's method, over all arms of a learner and task
-    smallest_effect: float  # that would have been seen four times in five, for this spread of the differences
-    claim: str
-    source: str
-
-
-def smallest_effect(spread: float, seeds: int, tests: int) -> float:
-    """Returns the mean difference that is significant at 0.05 / tests four times in five, by a paired t-test.
-
-    `spread` is the standard deviation of the differences. Holm's method holds the smallest p to that level.
-    """
-    from scipy.stats import nct, t
-
-    if seeds < 2:
-        return math.nan
-    critical = float(t.ppf(1 - ALPHA / tests / 2, seeds - 1))
-    low, high = 0.0, 100.0
-    for _ in range(60):  # noncentrality at which the power is as asked
-        middle = (low + high) / 2
-        low, high = (middle, high) if nct.sf(critical, seeds - 1, middle) < POWER else (low, middle)
-    return high * spread / math.sqrt(seeds)
-
-
-def compare(learner: str, task: str, scores: dict[str, Scores]) -> list[Row]:
-    """Returns a row an arm: each against `future` on the seeds that both have."""
-    base, arms = scores[BASELINE], {arm.name: arm for arm in ARMS}
-    others = [name for name in scores if name != BASELINE]
-    rows = [_row(learner, task, arms[name], scores[name], base, len(others)) for name in (BASELINE, *others)]
-    tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
-    for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested]) if tested else []):
-        rows[number] = rows[number]._replace(p_corrected=p)
-    return rows
-
-
-def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: int) -> Row:
-    common = [seed for seed in own.seeds if seed in base.seeds]
-    nan, paired = math.nan, {}
-    if arm.name != BASELINE and len(common) > 1:
-        mine, theirs = ([scores.seeds.index(seed) for seed in common] for scores in (own, base))
-        difference = own.area[mine] - base.area[theirs]
-        low, high = stats.bootstrap_interval(difference, np.mean)
-        better_low, better_high = stats.improvement_interval(own.area, base.area)
-        paired = {
-            "difference": float(difference.mean()),
-            "low": low,
-            "high": high,
-            "final_difference": float((own.final[mine] - base.final[theirs]).mean()),
-            "better": stats.probability_of_improvement(own.area, base.area),
-            "better_low": better_low,
-            "better_high": better_high,
-            "p_value": stats.paired_p_value(own.area[mine], base.area[theirs]),
-            "smallest_effect": smallest_effect(float(difference.std(ddof=1)), len(common), max(tests, 1)),
-        }
-    empty = dict.fromkeys(
-        ("difference", "low", "high", "final_difference", "better", "better_low", "better_high", "p_value", "smallest_effect"),
-        nan,
-    )
-    return Row(
-        learner=learner,
-        task=task,
-        arm=arm.name,
-        seeds=len(own.seeds),
-        failed=own.failed,
-        mean_success=float(own.area.mean()),
-        final=float(own.final.mean()),
-        steps_to_threshold=float(np.median(own.steps)),
-        p_corrected=nan,
-        claim=arm.claim,
-        source=arm.source,
-        **(empty | paired),
-    )
-
-
 def read(args: argparse.Namespace, learner: str, task: str) -> dict[str, Scores]:
     """Returns what the runs that have ended came to, by arm; empty where there are none."""
     folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
@@ -270,7 +166,7 @@ def _scores(task: str, name: str, trials: list[dict[str, Any]], threshold: float
     (groups,) = comparison.groups(trials).values()
     (group,) = groups
     reach = stats.first_reach(group.env_steps, group.success, threshold)
-    return Scores(group.seeds, comparison._areas(group), group.final, reach, group.failed)
+    return Scores(group.seeds, stats.area_under_curve(group.epoch, group.success), group.final, reach, group.failed)
 
 
 def report(args: argparse.Namespace, console: Console) -> int:
@@ -294,40 +190,6 @@ def report(args: argparse.Namespace, console: Console) -> int:
             forest(own, path)
             console.print(f"wrote {path}")
     return len(rows)
-
-
-def forest(rows: Sequence[Row], path: Path) -> None:
-    """Draws the paired differences to `future` of a task's arms, a panel a learner, with intervals and corrected p."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    learners = list(dict.fromkeys(row.learner for row in rows))
-    names = [arm.name for arm in ARMS if any(row.arm == arm.name for row in rows) and arm.name != BASELINE]
-    height = 1.3 + 0.3 * max(len(names), 1)
-    figure, axes = plt.subplots(1, len(learners), figsize=(5.2 * len(learners), height), sharey=True, squeeze=False)
-    for axis, learner in zip(axes[0], learners):
-        for row in rows:
-            if row.learner != learner or math.isnan(row.difference):
-                continue
-            place = names.index(row.arm)
-            shown = "black" if row.p_corrected < ALPHA else "0.5"
-            around = [[row.difference - row.low], [row.high - row.difference]]
-            axis.errorbar(row.difference, place, xerr=around, fmt="o", color=shown, capsize=3, markersize=4)
-            axis.annotate(
-                f"p {row.p_corrected:.2g}", (1.01, place), xycoords=("axes fraction", "data"), fontsize=7, va="center"
-            )
-        axis.axvline(0.0, color="0.6", linewidth=0.8)
-        axis.set_title(learner, fontsize=10)
-        axis.set_xlabel(f"mean success over epochs, difference to {BASELINE}")
-        axis.grid(axis="x", alpha=0.2)
-    axes[0][0].set_yticks(range(len(names)), names)
-    axes[0][0].invert_yaxis()
-    figure.suptitle(f"{rows[0].task}: paired by seed, 95 % intervals; black where p corrected < {ALPHA}", fontsize=10)
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
