@@ -20,7 +20,7 @@ from mjx_dher import names
 from mjx_dher.replay import ReplayState
 from mjx_dher.spec import GENERATORS
 from mjx_dher.types import Array, GoalObs, PRNGKey
-from mjx_dher.view import View
+from mjx_dher.view import View, pick
 
 # generator(key, obs with leading [N], ring, view) -> goals [N, G]
 GenerateFn = Callable[[PRNGKey, GoalObs, ReplayState, View], Array]
@@ -70,12 +70,8 @@ def one_of(choices: Sequence[Generator | GenerateFn]) -> Generator:
     if len(made) == 1:
         return made[0]
 
-    def of_lane(key: PRNGKey, obs: GoalObs, ring: ReplayState, view: View) -> Array:
-        hparams: Any = view.hparams
-        goals = goals_of(made[0], key, obs, ring, view)
-        for index, generator in enumerate(made[1:], 1):
-            goals = jnp.where(hparams.generator_choice == index, goals_of(generator, key, obs, ring, view), goals)
-        return goals
+    def of_lane(key: PRNGKey, obs: GoalObs, ring: ReplayState, view: Any) -> Array:
+        return pick([goals_of(own, key, obs, ring, view) for own in made], view.hparams.generator_choice)
 
     return Generator(of_lane, uses_values=any(generator.uses_values for generator in made))
 

@@ -22,7 +22,7 @@ from mjx_dher.config import HParams
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.spec import PRIORITIES
 from mjx_dher.types import Array, Batch, Episode, PRNGKey, RewardFn
-from mjx_dher.view import View
+from mjx_dher.view import View, pick
 
 CANDIDATES = 4  # transitions that are drawn for each that a priority of transitions chooses
 
@@ -179,24 +179,18 @@ def one_of(choices: Sequence[Priority | PriorityFn]) -> Priority:
     if len(made) == 1:
         return made[0]
 
-    def pick(results: Sequence[Array], hparams: Any) -> Array:
-        kept = jnp.asarray(results[0])
-        for index, result in enumerate(results[1:], 1):
-            kept = jnp.where(hparams.priority_choice == index, result, kept)
-        return kept
-
-    def weigh(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
+    def weigh(episode: Episode, compute_reward: RewardFn, hparams: Any) -> Array:
         zero = jnp.zeros(())
         results = [own.weigh(episode, compute_reward, hparams) if own.weigh else zero for own in made]
-        return pick([jnp.asarray(result, jnp.float32) for result in results], hparams)
+        return pick([jnp.asarray(result, jnp.float32) for result in results], hparams.priority_choice)
 
-    def renew(ring: ReplayState, view: View) -> Array:
-        return pick([renewed(own, ring, view).priority for own in made], view.hparams)
+    def renew(ring: ReplayState, view: Any) -> Array:
+        return pick([renewed(own, ring, view).priority for own in made], view.hparams.priority_choice)
 
-    def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: View) -> Array:
+    def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: Any) -> Array:
         anyhow = CANDIDATES * jnp.arange(number, dtype=jnp.int32)
         results = [_checked_choice(own.choose, key, sample, batch, number, view) if own.choose else anyhow for own in made]
-        return pick([result.astype(jnp.int32) for result in results], view.hparams)
+        return pick([result.astype(jnp.int32) for result in results], view.hparams.priority_choice)
 
     return Priority(
         weigh=weigh if any(own.weigh for own in made) else None,

@@ -83,17 +83,20 @@ def draw_batches(
     `replay.cumulative_priority(state)`. The ring must not be empty. `n_step` is what `look_ahead` takes, `scores` what
     `hindsight_goals` does. Where `priority` chooses among transitions, more are drawn and it looks at `view`, too.
     """
-    row_key, sample_key, relabel_key = jax.random.split(key, 3)
     number = math.prod(shape)
-    choosing = priority is not None and priority.choose is not None
-    drawn = priorities.CANDIDATES * number if choosing else number
-    rows = replay.draw_rows(state, row_key, drawn, hparams.priority_fraction, cumulative)
-    sample = replay.sample(state, sample_key, drawn, rows)
-    batch = relabel(state, sample, sampler, compute_reward, hparams, relabel_key, scores)
-    if choosing and priority is not None:
+
+    def draw(count: int) -> tuple[Sample, Batch]:
+        row_key, sample_key, relabel_key = jax.random.split(key, 3)
+        rows = replay.draw_rows(state, row_key, count, hparams.priority_fraction, cumulative)
+        sample = replay.sample(state, sample_key, count, rows)
+        return sample, relabel(state, sample, sampler, compute_reward, hparams, relabel_key, scores)
+
+    if priority is None or priority.choose is None:
+        sample, batch = draw(number)
+    else:
         view = View(compute_reward, hparams) if view is None else view
-        choose_key = jax.random.fold_in(key, CHOOSE)
-        sample, batch = priorities.chosen(priority, choose_key, sample, batch, number, view)
+        candidates = draw(priorities.CANDIDATES * number)
+        sample, batch = priorities.chosen(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, view)
     if n_step > 1:
         batch = look_ahead(state, sample, batch, compute_reward, hparams.gamma, n_step)
     batch = dataclasses.replace(batch, reward=batch.reward * hindsight_factor(sample, batch, hparams))

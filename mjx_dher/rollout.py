@@ -49,10 +49,7 @@ def rollout(
     """
     check_env_parts(env)
     check_size("num_envs", num_envs)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
-        if jnp.shape(leaf)[:1] != (env.episode_length,):
-            name, shape = jax.tree_util.keystr(path), list(jnp.shape(leaf))
-            raise ValueError(f"inputs{name} must lead with [T] = [{env.episode_length}], one for each step; got {shape}")
+    _check_inputs(inputs, env.episode_length)
     first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     check_first(first, (num_envs,))
     if goals is not None:
@@ -89,6 +86,14 @@ def rollout(
         valid=valid,
         bad_rewards=jnp.mean((reward < -1.0) | (reward > 0.0), axis=0, dtype=jnp.float32),
     )
+
+
+def _check_inputs(inputs: PyTree, num_steps: int) -> None:
+    """Raises ValueError unless the leaves of `inputs` lead with [T]."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
+        if jnp.shape(leaf)[:1] != (num_steps,):
+            name, shape = jax.tree_util.keystr(path), list(jnp.shape(leaf))
+            raise ValueError(f"inputs{name} must lead with [T] = [{num_steps}], one for each step; got {shape}")
 
 
 def _with_goals(env: Any, first: Any, goals: Array) -> Any:

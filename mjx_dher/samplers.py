@@ -25,7 +25,7 @@ from mjx_dher.config import HParams
 from mjx_dher.scores import LearnedMetric, ScoreFn, make_metric, score_of
 from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS
 from mjx_dher.types import Array, Episode, PRNGKey
-from mjx_dher.view import View
+from mjx_dher.view import pick
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; of a sampler with a score, (..., hparams, score [T+1])
 LogWeightsFn = Callable[..., Array]
@@ -242,7 +242,7 @@ def _to_sampler(sampler: Any) -> Sampler:
     names.check_function("sampler", sampler.log_weights, parameters if sampler.score is None else (*parameters, "score"))
     if sampler.score is not None:
         names.check_function("sampler: score", sampler.score, ("episode", "view"))
-        if sampler.cross_episode:
+        if sampler.cross_episode is True:
             raise ValueError("a sampler with a score takes goals of its own episode; this one has cross_episode, too")
     if not (isinstance(sampler.cross_episode, bool) or callable(sampler.cross_episode)):
         raise ValueError(f"cross_episode of a sampler must be True, False or a function; it is {sampler.cross_episode!r}")
@@ -279,23 +279,19 @@ def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     if len(samplers) == 1:
         return samplers[0]
 
-    def pick(values: Sequence[Any], hparams: Any) -> Array:
-        kept = jnp.asarray(values[0])
-        for index, value in enumerate(values[1:], 1):
-            kept = jnp.where(hparams.choice == index, value, kept)
-        return kept
+    def log_weights(achieved: Array, desired: Array, step: Array, hparams: Any, score: Array | None = None) -> Array:
+        return pick([weigh(sampler, achieved, desired, step, hparams, score) for sampler in samplers], hparams.choice)
 
-    def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array | None = None) -> Array:
-        return pick([weigh(sampler, achieved, desired, step, hparams, score) for sampler in samplers], hparams)
-
-    def score(episode: Episode, view: View) -> Array:
+    def score(episode: Episode, view: Any) -> Array:
         none = jnp.zeros(episode.achieved_goal.shape[0])
-        return pick([score_of(sampler.score, episode, view) if sampler.score else none for sampler in samplers], view.hparams)
+        return pick(
+            [score_of(sampler.score, episode, view) if sampler.score else none for sampler in samplers], view.hparams.choice
+        )
 
     crossing = [sampler.cross_episode for sampler in samplers]
     return Sampler(
         log_weights,
-        cross_episode=(lambda hparams: pick(crossing, hparams)) if any(crossing) else False,
+        cross_episode=(lambda hparams: pick(crossing, hparams.choice)) if any(crossing) else False,
         score=score if any(sampler.score for sampler in samplers) else None,
     )
 

@@ -75,7 +75,7 @@ class Loop:
 
     @property
     def uses_values(self) -> bool:
-        """Whether a part asks the learner for values."""
+        """Need of one of the parts for the learner's values."""
         return self.sampler.score is not None or self.priority.uses_values or self.generator.uses_values
 
     @property

@@ -6,7 +6,7 @@ Priorities that choose among transitions, priorities that are renewed, goal gene
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -44,6 +44,14 @@ class View(NamedTuple):
         bound = -1.0 / (1.0 - self.hparams.gamma)
         target = jnp.clip(batch.reward + self.hparams.gamma * following, bound, 0.0)
         return target - self.values.value(batch.observation, batch.desired_goal, batch.action)
+
+
+def pick(results: Sequence[Any], number: Array) -> Array:
+    """Returns the result with a number, traced: what lanes of one program do that differ in a part (`one_of`)."""
+    kept = jnp.asarray(results[0])
+    for index, result in enumerate(results[1:], 1):
+        kept = jnp.where(number == index, result, kept)
+    return kept
 
 
 def of_each_episode(function: Callable[[Any], Array], episodes: Any) -> Array:

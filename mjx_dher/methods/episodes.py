@@ -45,6 +45,14 @@ def diversity(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> A
     return jnp.sum(jnp.maximum(squared - 0.25 * jnp.square(squared), 0.0))
 
 
+def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Array:
+    """Returns the log densities [E, components] of `rows` [E, K] under each component, its share included."""
+    inverse = 1.0 / variances
+    constant = jnp.sum(jnp.square(means) * inverse + jnp.log(2.0 * jnp.pi * variances), axis=1)
+    squares = jnp.square(rows) @ inverse.T - 2.0 * rows @ (means * inverse).T + constant[None]
+    return jnp.log(shares)[None] - 0.5 * squares
+
+
 def fit_mixture(rows: Array, counted: Array) -> Array:
     """Returns the log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to those that are `counted` [E].
 
@@ -66,21 +74,15 @@ def fit_mixture(rows: Array, counted: Array) -> Array:
     means = mean[None] + spread * places[:, None] * axis[None]
     state = means, jnp.tile(variance + floor, (COMPONENTS, 1)), jnp.full(COMPONENTS, 1.0 / COMPONENTS, rows.dtype)
 
-    def log_parts(means: Array, variances: Array, shares: Array) -> Array:  # [E, components]
-        inverse = 1.0 / variances
-        constant = jnp.sum(jnp.square(means) * inverse + jnp.log(2.0 * jnp.pi * variances), axis=1)
-        squares = jnp.square(rows) @ inverse.T - 2.0 * rows @ (means * inverse).T + constant[None]
-        return jnp.log(shares)[None] - 0.5 * squares
-
     def step(state: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
-        share = weight * jax.nn.softmax(log_parts(*state), axis=1)
+        share = weight * jax.nn.softmax(_log_parts(rows, *state), axis=1)
         count = jnp.sum(share, axis=0) + 1e-6
         means = share.T @ rows / count[:, None]
         squares = share.T @ jnp.square(rows) / count[:, None] - jnp.square(means)
         return (means, jnp.maximum(squares, 0.0) + floor, count / jnp.sum(count)), None
 
     state, _ = jax.lax.scan(step, state, length=ROUNDS)
-    return jax.nn.logsumexp(log_parts(*state), axis=1)
+    return jax.nn.logsumexp(_log_parts(rows, *state), axis=1)
 
 
 def _by_rarity(ring: ReplayState, view: View) -> Array:

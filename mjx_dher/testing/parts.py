@@ -221,6 +221,17 @@ def check_priority(
         return jnp.asarray(of_episode(episode, env.compute_reward, _as_arrays(hparams)))
 
     weights = np.asarray(attempt("priority", jax.jit(jax.vmap(weigh)), episodes))
+    _check_weights(weights)
+    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
+    if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
+        raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
+    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
+    told = [f"weights from {weights.min():.3g} to {weights.max():.3g}{none}", *more]
+    return f"priority as it should be: {'; '.join(told)}"
+
+
+def _check_weights(weights: NDArray) -> None:
+    """Raises PartError unless weights are numbers [N], finite and not negative."""
     if weights.ndim != 1:
         raise PartError(f"priority: it must give one weight [] for an episode; it gives {list(weights.shape[1:])}")
     if weights.dtype.kind not in "fiub":
@@ -229,12 +240,6 @@ def check_priority(
         raise PartError("priority: weights must be finite; one is not")
     if weights.min() < 0:
         raise PartError(f"priority: weights must not be negative; the least is {weights.min():.3g}")
-    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
-    if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
-        raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
-    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
-    told = [f"weights from {weights.min():.3g} to {weights.max():.3g}{none}", *more]
-    return f"priority as it should be: {'; '.join(told)}"
 
 
 def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -70,8 +71,7 @@ def check_generator(
         attempt("generator", learners.check_values, learner)
     episodes, view = episodes or random_episodes(env), trial_view(env, hparams, learner)
     first = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), EPISODES))
-    full = ring_of(episodes)
-    empty = replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES)
+    full, empty = ring_of(episodes), replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES)
 
     def ask(obs: GoalObs, ring: ReplayState) -> jax.Array:
         generators.goals_of(made, jax.random.key(2), obs, ring, view)  # raises for the wrong shape
@@ -81,11 +81,17 @@ def check_generator(
     attempt("generator, with an empty ring,", jax.jit(ask), first.obs, empty)
     if not np.array_equal(goals, again, equal_nan=True):
         raise PartError("generator: the same key and the same ring must give the same goals; they differ")
+    return _told_of_goals(env, first, goals)
+
+
+def _told_of_goals(env: Any, first: Any, goals: NDArray) -> str:
+    """Sets goals [N, G] in first states; returns what to say of them."""
     finite = np.isfinite(goals).all(axis=-1)
     if not finite.any():
         raise PartError("generator: no goal is finite, so every episode would be played for the reset's own")
-    other = np.mean(finite & (goals != np.asarray(first.obs["desired_goal"])).any(axis=-1))
-    attempt("env: with_goal", jax.vmap(env.with_goal), first, jnp.asarray(np.where(finite[:, None], goals, 0.0)))  # type: ignore[attr-defined]
+    own = np.asarray(first.obs["desired_goal"])
+    attempt("env: with_goal", jax.vmap(env.with_goal), first, jnp.asarray(np.where(finite[:, None], goals, own)))
+    other = np.mean(finite & (goals != own).any(axis=-1))
     return f"generator as it should be: {other:.0%} of the goals are not those of the reset"
 
 
@@ -100,11 +106,11 @@ def check_choice(
     if priority.uses_values and learner is not None:
         attempt("priority", learners.check_values, learner)
     view, ring = trial_view(env, hparams, learner), ring_of(episodes)
-    said = []
+    told = []
     if (renew := priority.renew) is not None:
         weights = np.asarray(attempt("priority: renew", jax.jit(lambda ring: renew(ring, view)), ring))
         attempt("priority: renew", jax.jit(lambda ring: priorities.renewed(priority, ring, view)), ring)
-        said.append(f"renewed weights {_range(weights[: episodes.action.shape[0]])}")
+        told.append(f"renewed weights {_range(weights[: episodes.action.shape[0]])}")
     if (choose := priority.choose) is not None:
         keys = jax.random.split(jax.random.key(3), 3)
         sample = replay.sample(ring, keys[0], CANDIDATES * NUMBER)
@@ -114,8 +120,8 @@ def check_choice(
         indices = np.asarray(attempt("priority: choose", pick, keys[2]))
         if indices.min() < 0 or indices.max() >= CANDIDATES * NUMBER:
             raise PartError(f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {indices.max()}")
-        said.append(f"{NUMBER} of {CANDIDATES * NUMBER} transitions chosen")
-    return said
+        told.append(f"{NUMBER} of {CANDIDATES * NUMBER} transitions chosen")
+    return told
 
 
 def _range(weights: NDArray) -> str:
