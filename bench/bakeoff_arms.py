@@ -147,16 +147,21 @@ TOY = {
 }
 
 
+def parts_of(task: str, arm: Arm) -> dict[str, str]:
+    """Returns the parts of an arm by field of RunSpec; where an object comes to rest depends on the task."""
+    parts = dict(arm.parts)
+    if parts.get("metric") == "resting_point" and task != "slide":
+        parts["metric"] = "resting_point_rough"
+    return parts
+
+
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0.
 
     `paper` is DDPG under the paper's settings, `best` the preset `gpu`. Priorities are drawn by for the whole batch in
     `paper`, as their authors do, and in `best` for the preset's half of it, where they take the place of `eventful`.
     """
-    parts = dict(arm.parts)
-    if parts.get("metric") == "resting_point" and task in ("push", "pick_and_place"):
-        parts["metric"] = "resting_point_rough"
-    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts)
+    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts_of(task, arm))
     changes = TOY if toy else SIZES[learner, task].changes
     numbers = dict(arm.numbers)
     if arm.prioritized and learner == "paper":

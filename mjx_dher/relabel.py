@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -176,12 +177,7 @@ def relabel_counted(
     desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
     reward = compute_reward(achieved_goal, desired_goal)
-    if getattr(reward, "shape", None) != (batch_size,):
-        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
-        raise ValueError(
-            f"compute_reward gives rewards [B] = [{batch_size}] of goals [B, G] = {list(desired_goal.shape)}; this one gives"
-            f" {given}"
-        )
+    _check_rewards(reward, desired_goal)
     batch = Batch(
         observation=sample.observation,
         next_observation=sample.next_observation,
@@ -191,3 +187,13 @@ def relabel_counted(
     )
     missed = jnp.sum(relabelled & ~offered, dtype=jnp.float32)
     return batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0)
+
+
+def _check_rewards(reward: Any, goal: Array) -> None:
+    """Raises ValueError unless rewards of goals [B, G] are [B]."""
+    if getattr(reward, "shape", None) != goal.shape[:1]:
+        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
+        raise ValueError(
+            f"compute_reward gives rewards [B] = {list(goal.shape[:1])} of goals [B, G] = {list(goal.shape)}; this one gives"
+            f" {given}"
+        )

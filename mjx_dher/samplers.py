@@ -289,9 +289,13 @@ def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
         )
 
     crossing = [sampler.cross_episode for sampler in samplers]
+
+    def crosses(hparams: Any) -> Array:
+        return pick(crossing, hparams.choice)
+
     return Sampler(
         log_weights,
-        cross_episode=(lambda hparams: pick(crossing, hparams.choice)) if any(crossing) else False,
+        cross_episode=crosses if any(crossing) else False,
         score=score if any(sampler.score for sampler in samplers) else None,
     )
 

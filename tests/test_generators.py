@@ -140,28 +140,33 @@ def test_a_score_of_the_wrong_kind_is_refused():
 
 
 def test_trials_name_what_is_wrong():
+    episodes = testing.trial.random_episodes(ENV)
     for wrong, message in (
         (lambda key, obs, ring, view: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
         (lambda key, obs, ring, view: jnp.full((16, 2), jnp.nan), "no goal is finite"),
         (lambda key, obs, ring, view: 1 / 0, "ZeroDivisionError"),
     ):
         with pytest.raises(PartError, match=message):
-            testing.check_generator(wrong, ENV)
+            testing.check_generator(wrong, ENV, None, episodes)
     with pytest.raises(PartError, match="with_goal"):
         testing.check_generator(corner, WithoutGoals())
-    assert "100% of the goals" in testing.check_generator(corner, ENV)
+    assert "100% of the goals" in testing.check_generator(corner, ENV, None, episodes)
     with pytest.raises(PartError, match="negative"):
-        testing.check_priority(Priority(renew=lambda ring, view: -ring.priority - 1.0), ENV)
+        testing.check_priority(Priority(renew=lambda ring, view: -ring.priority - 1.0), ENV, None, episodes)
     with pytest.raises(PartError, match="indices"):
-        testing.check_priority(Priority(choose=lambda key, sample, batch, number, view: 99 + jnp.arange(number)), ENV)
+        testing.check_priority(
+            Priority(choose=lambda key, sample, batch, number, view: 99 + jnp.arange(number)), ENV, None, episodes
+        )
     with pytest.raises(PartError, match="negative"):
-        testing.check_metric(LearnedMetric(lambda episode, view: -jnp.ones(11)), ENV)
+        testing.check_metric(LearnedMetric(lambda episode, view: -jnp.ones(11)), ENV, episodes)
 
 
 def test_built_in_parts_pass_their_trials():
-    assert "chosen" in testing.check_priority("td_error", ENV)
-    assert "distances from" in testing.check_metric("time_to_goal", ENV)
-    assert "goals of the past never" in testing.check_sampler(samplers.make("weighted", metric="time_to_goal"), ENV)
+    episodes = testing.trial.random_episodes(ENV)
+    assert "chosen" in testing.check_priority("td_error", ENV, None, episodes)
+    assert "goals of the past never" in testing.check_sampler(
+        samplers.make("weighted", metric="time_to_goal"), ENV, None, episodes
+    )
 
 
 def test_a_task_that_changes_more_than_the_goal_is_named():

@@ -45,7 +45,15 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
     if own_parts(spec) in ([], ["env"]):
         return
     episodes = random_episodes(env)
-    learner = learners.make(spec.learner, spec.config, env_sizes(env), spec.networks)
+    learner = attempt("learner", learners.make, spec.learner, spec.config, env_sizes(env), spec.networks)
+    yield from _check_replayed(env, spec, episodes, learner)
+    if is_import_path(spec.learner) or is_import_path(spec.networks):
+        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
+        yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
+
+
+def _check_replayed(env: Env, spec: RunSpec, episodes: Episode, learner: Learner) -> Iterator[str]:
+    """Tries out what a run names of its own that decides what is learned from."""
     if is_import_path(spec.metric):
         yield check_metric(spec.metric, env, episodes, learner)
     if is_import_path(spec.weight_kernel):
@@ -57,9 +65,6 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
         yield check_priority(spec.priority, env, spec.hparams, episodes, learner)
     if is_import_path(spec.generator):
         yield check_generator(spec.generator, env, spec.hparams, episodes, learner)
-    if is_import_path(spec.learner) or is_import_path(spec.networks):
-        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
-        yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
 
 
 def check_sampler(
