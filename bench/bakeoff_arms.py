@@ -48,7 +48,7 @@ ARMS = (
         "energy",
         "plain",
         {"priority": "energy"},
-        claim="sooner and higher than HER and PER on Fetch and Hand tasks",
+        claim="more success and fewer samples on all of four tasks",
         source="Zhao & Tresp 2018, arXiv 1810.01363",
     ),
     Arm(
@@ -69,7 +69,7 @@ ARMS = (
         "dpp",
         "transitions",
         {"priority": "dpp"},
-        claim="sooner and higher than HER, EBP and CHER; PickAndPlace about 0.94 for 0.90 (the author)",
+        claim="sooner and higher on all of five tasks; PickAndPlace about 0.94 for 0.90 (the author)",
         source="Dai et al. 2021, arXiv 2108.07887",
     ),
     Arm(
@@ -83,7 +83,7 @@ ARMS = (
         "curriculum",
         "transitions",
         {"priority": "curriculum"},
-        claim="sooner than HER on Reach and the Hand tasks",
+        claim="better than the state of the art, on Reach and the Hand tasks",
         source="Fang et al. 2019",
     ),
     Arm(
