@@ -26,7 +26,7 @@ from bakeoff_report import Row, Scores, compare, forest
 from rich.console import Console
 
 from mjx_dher import envs, stats
-from mjx_dher.cli.common import Screen
+from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.runs import identity
@@ -129,7 +129,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
         sweep.run(
             folder,
             todo,
-            lambda run: envs.make(run.env, engine=run.engine),
+            make_env,
             options=Options(final_episodes=100 if args.toy else 500, checkpoint_every=1 if args.toy else 5),
             lanes=args.lanes,
             should_stop=lambda: stop.asked is not None or time.monotonic() > until,
