@@ -118,6 +118,11 @@ class FetchEnv(GoalEnv):
             failed=jnp.zeros((), bool),
         )
 
+    def with_goal(self, state: State, goal: Array) -> State:
+        """Returns the state of an episode that is played for another goal, [3] m."""
+        obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
+        return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
+
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
 

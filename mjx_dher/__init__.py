@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mjx_dher import (
         config,
         envs,
+        generators,
         learners,
         normalizer,
         presets,
@@ -55,6 +56,7 @@ __all__ = [
     "config",
     "ddpg",
     "envs",
+    "generators",
     "learners",
     "load_policy",
     "make_train",

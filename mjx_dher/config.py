@@ -128,6 +128,8 @@ class HParams(NamedTuple):
     """Weight of the policy's entropy in its values, before the learner has changed it."""
     entropy_target: Annotated[float, Number("(-inf, inf)"), ReadBy("sac", "redq", "tqc")] = -1.0
     """Entropy that this weight is changed for, for each number of an action."""
+    hindsight_reward: Share = 1.0
+    """Factor of the reward of a transition whose goal was replaced: below 1, hindsight counts as a better outcome (ARCHER)."""
     obs_clip: Positive = 200.0
     """Bound of observations and goals: they are clipped to +- this before they are normalized."""
     norm_clip: Positive = 5.0

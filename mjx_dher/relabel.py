@@ -5,32 +5,48 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import replay, samplers
+from mjx_dher import priorities, replay, samplers
 from mjx_dher.config import HParams
+from mjx_dher.priorities import Priority
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
+from mjx_dher.view import View
+
+CHOOSE = 0x43686F69  # folded into a draw's key, for what chooses among transitions; no index of `jax.random.split`
 
 
 def hindsight_goals(
-    state: ReplayState, sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey
+    state: ReplayState,
+    sample: Sample,
+    sampler: Sampler | LogWeightsFn,
+    hparams: HParams,
+    key: PRNGKey,
+    scores: Array | None = None,
 ) -> Array:
     """Chooses one achieved goal for each transition of `sample` by `sampler`; returns them as [B, G].
 
     A transition for which the sampler offers no goal (no weight is positive, or one is NaN or infinite) keeps its own.
+    `scores` are those of the ring's episodes [E, T+1], for a sampler that wants them (`scores.of_episodes`).
 
     Raises:
       ValueError: its log weights are not one floating-point number for each goal of an episode.
     """
-    return _choose(state, sample, sampler, hparams, key)[0]
+    return _choose(state, sample, sampler, hparams, key, scores)[0]
 
 
 def _choose(
-    state: ReplayState, sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey
+    state: ReplayState,
+    sample: Sample,
+    sampler: Sampler | LogWeightsFn,
+    hparams: HParams,
+    key: PRNGKey,
+    scores: Array | None,
 ) -> tuple[Array, Array]:
     """Returns the goals [B, G] of `hindsight_goals`, and whether the sampler offered one [B]."""
     sampler = samplers.make(sampler)
@@ -41,7 +57,9 @@ def _choose(
         other = replay.sample_episode_goals(state, pool_key, batch_size)
         pool = jnp.where(sampler.cross_episode(hparams), other, pool) if callable(sampler.cross_episode) else other
     weigh = functools.partial(samplers.weigh, sampler)
-    log_weights = jax.vmap(weigh, in_axes=(0, 0, 0, None))(pool, sample.desired_goal, sample.step, hparams)
+    score = None if scores is None else scores[sample.row]
+    axes = (0, 0, 0, None, None if score is None else 0)
+    log_weights = jax.vmap(weigh, in_axes=axes)(pool, sample.desired_goal, sample.step, hparams, score)
     index = samplers.draw(draw_key, log_weights)
     offered = index < pool.shape[1]
     return jnp.where(offered[:, None], pool[jnp.arange(batch_size), index], sample.desired_goal), offered
@@ -56,20 +74,44 @@ def draw_batches(
     hparams: HParams,
     cumulative: Array,
     n_step: int = 1,
+    scores: Array | None = None,
+    priority: Priority | None = None,
+    view: View | None = None,
 ) -> Batch:
     """Draws and relabels transitions as the learner takes them, all at once; leaves lead with `shape`.
 
     A fraction `hparams.priority_fraction` of them is from episodes drawn by priority; `cumulative` is
-    `replay.cumulative_priority(state)`. The ring must not be empty. `n_step` is what `look_ahead` takes.
+    `replay.cumulative_priority(state)`. The ring must not be empty. `n_step` is what `look_ahead` takes, `scores` what
+    `hindsight_goals` does. Where `priority` chooses among transitions, more are drawn and it looks at `view`, too.
     """
-    row_key, sample_key, relabel_key = jax.random.split(key, 3)
     number = math.prod(shape)
-    rows = replay.draw_rows(state, row_key, number, hparams.priority_fraction, cumulative)
-    sample = replay.sample(state, sample_key, number, rows)
-    batch = relabel(state, sample, sampler, compute_reward, hparams, relabel_key)
+
+    def draw(count: int) -> tuple[Sample, Batch]:
+        row_key, sample_key, relabel_key = jax.random.split(key, 3)
+        rows = replay.draw_rows(state, row_key, count, hparams.priority_fraction, cumulative)
+        sample = replay.sample(state, sample_key, count, rows)
+        return sample, relabel(state, sample, sampler, compute_reward, hparams, relabel_key, scores)
+
+    if priority is None or priority.choose is None:
+        sample, batch = draw(number)
+    else:
+        view = View(compute_reward, hparams) if view is None else view
+        candidates = draw(priorities.CANDIDATES * number)
+        sample, batch = priorities.chosen(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, view)
     if n_step > 1:
         batch = look_ahead(state, sample, batch, compute_reward, hparams.gamma, n_step)
+    batch = dataclasses.replace(batch, reward=batch.reward * hindsight_factor(sample, batch, hparams))
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
+
+
+def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
+    """Returns by what each reward [B] is multiplied: `hindsight_reward` where the goal was replaced by another, else 1.
+
+    Lanka & Wu 2018 (ARCHER): hindsight rewards are numerically greater than real ones. Rewards here are 0 or negative, so a
+    factor below 1 makes them so; all returns stay in [-1/(1-gamma), 0].
+    """
+    replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
+    return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, batch.reward.dtype), jnp.ones_like(batch.reward))
 
 
 def look_ahead(
@@ -104,16 +146,18 @@ def relabel(
     compute_reward: RewardFn,
     hparams: HParams,
     key: PRNGKey,
+    scores: Array | None = None,
 ) -> Batch:
     """Returns `sample` as a batch in which each transition was relabelled with probability k/(k+1), k = `hparams.her_k`.
 
     The reward is that of the goal achieved at the transition's end: `compute_reward(achieved at step+1, goal)`. Of `hparams`
-    it reads her_k, and whatever the sampler reads; `draw_batches` reads priority_fraction, too.
+    it reads her_k, and whatever the sampler reads; `draw_batches` reads priority_fraction and hindsight_reward, too. `scores`
+    is what `hindsight_goals` takes.
 
     Raises:
       ValueError: the sampler's log weights are not [T+1], or the rewards not [B].
     """
-    return relabel_counted(state, sample, sampler, compute_reward, hparams, key)[0]
+    return relabel_counted(state, sample, sampler, compute_reward, hparams, key, scores)[0]
 
 
 def relabel_counted(
@@ -123,21 +167,17 @@ def relabel_counted(
     compute_reward: RewardFn,
     hparams: HParams,
     key: PRNGKey,
+    scores: Array | None = None,
 ) -> tuple[Batch, Array]:
     """Returns the batch that `relabel` returns, and the share [] of transitions to be relabelled that were offered no goal."""
     coin_key, goal_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
     relabelled = jax.random.uniform(coin_key, (batch_size,)) < hparams.her_k / (hparams.her_k + 1.0)
-    goals, offered = _choose(state, sample, sampler, hparams, goal_key)
+    goals, offered = _choose(state, sample, sampler, hparams, goal_key, scores)
     desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
     reward = compute_reward(achieved_goal, desired_goal)
-    if getattr(reward, "shape", None) != (batch_size,):
-        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
-        raise ValueError(
-            f"compute_reward gives rewards [B] = [{batch_size}] of goals [B, G] = {list(desired_goal.shape)}; this one gives"
-            f" {given}"
-        )
+    _check_rewards(reward, desired_goal)
     batch = Batch(
         observation=sample.observation,
         next_observation=sample.next_observation,
@@ -147,3 +187,13 @@ def relabel_counted(
     )
     missed = jnp.sum(relabelled & ~offered, dtype=jnp.float32)
     return batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0)
+
+
+def _check_rewards(reward: Any, goal: Array) -> None:
+    """Raises ValueError unless rewards of goals [B, G] are [B]."""
+    if getattr(reward, "shape", None) != goal.shape[:1]:
+        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
+        raise ValueError(
+            f"compute_reward gives rewards [B] = {list(goal.shape[:1])} of goals [B, G] = {list(goal.shape)}; this one gives"
+            f" {given}"
+        )

@@ -165,6 +165,11 @@ def can_sample(state: ReplayState) -> Array:
     return state.size > 0
 
 
+def mean_priority(state: ReplayState) -> Array:
+    """Returns the mean [] of the priorities of the rows that hold an episode; 0 where none does."""
+    return jnp.sum(state.priority) / jnp.maximum(state.size, 1).astype(jnp.float32)
+
+
 def cumulative_priority(state: ReplayState) -> Array:
     """Returns the sums [E] of the priorities up to and with each row, int32, in units that make the last about 2^29.
 

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree, check_env_parts, check_size
+from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree, Sizes, check_env_parts, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
+# goals to play for, of the observations of N resets -> [N, G]
+GoalsFn = Callable[[GoalObs], Array]
 
 
 class Outcome(NamedTuple):
@@ -25,7 +27,9 @@ class Outcome(NamedTuple):
     bad_rewards: Array  # share of the episode's rewards outside [-1, 0]
 
 
-def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None) -> tuple[Episode, Outcome]:
+def rollout(
+    env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None, goals: GoalsFn | None = None
+) -> tuple[Episode, Outcome]:
     """Plays `num_envs` episodes side by side.
 
     Args:
@@ -34,6 +38,7 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
       key: of the first states.
       num_envs: episodes, N.
       inputs: further arguments of the policy, such as noise, or keys for one that draws; leaves lead with [T]. None for none.
+      goals: gives the goals to play for, which `env.with_goal` sets; those of the reset where None.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
@@ -44,12 +49,11 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
     """
     check_env_parts(env)
     check_size("num_envs", num_envs)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
-        if jnp.shape(leaf)[:1] != (env.episode_length,):
-            name, shape = jax.tree_util.keystr(path), list(jnp.shape(leaf))
-            raise ValueError(f"inputs{name} must lead with [T] = [{env.episode_length}], one for each step; got {shape}")
+    _check_inputs(inputs, env.episode_length)
     first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     check_first(first, (num_envs,))
+    if goals is not None:
+        first = _with_goals(env, first, goals(first.obs))
 
     def step(state, step_inputs):
         action = policy(step_inputs, state.obs)
@@ -84,6 +88,21 @@ def rollout(env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyT
     )
 
 
+def _check_inputs(inputs: PyTree, num_steps: int) -> None:
+    """Raises ValueError unless the leaves of `inputs` lead with [T]."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
+        if jnp.shape(leaf)[:1] != (num_steps,):
+            name, shape = jax.tree_util.keystr(path), list(jnp.shape(leaf))
+            raise ValueError(f"inputs{name} must lead with [T] = [{num_steps}], one for each step; got {shape}")
+
+
+def _with_goals(env: Any, first: Any, goals: Array) -> Any:
+    """Returns the first states of N episodes with other goals [N, G]; raises ValueError where the environment changes more."""
+    changed = jax.vmap(env.with_goal)(first, goals)
+    _check_same_shapes(first, changed, "with_goal")
+    return changed
+
+
 def check_first(state: Any, leading: tuple[int, ...]) -> None:
     """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
     for name in ("obs", "reward", "success"):
@@ -109,18 +128,20 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
         )
 
 
-def _check_same_shapes(before: Any, after: Any) -> None:
-    """Raises ValueError unless `step` keeps the state's structure, shapes and types, as `lax.scan` needs."""
+def _check_same_shapes(before: Any, after: Any, method: str = "step") -> None:
+    """Raises ValueError unless a method keeps the state's structure, shapes and types, as `lax.scan` needs."""
     old, new = (dict(jax.tree_util.tree_leaves_with_path(state)) for state in (before, after))
     structure: Any = jax.tree.structure(before)
     if structure != jax.tree.structure(after):
         differing = [jax.tree_util.keystr(path) for path in {**old, **new} if (path in old) != (path in new)]
-        raise ValueError(f"reset and step must give states of one structure; only one has {', '.join(differing) or 'its type'}")
+        raise ValueError(
+            f"reset and {method} must give states of one structure; only one has {', '.join(differing) or 'its type'}"
+        )
     for path, leaf in old.items():
         kept, changed = ((jnp.shape(x)[1:], jnp.result_type(x)) for x in (leaf, new[path]))
         if kept != changed:
             raise ValueError(
-                f"step must keep shapes and types; the state's {jax.tree_util.keystr(path)} is {kept[1]}{list(kept[0])} and"
+                f"{method} must keep shapes and types; the state's {jax.tree_util.keystr(path)} is {kept[1]}{list(kept[0])} and"
                 f" becomes {changed[1]}{list(changed[0])}"
             )
 
@@ -129,3 +150,39 @@ def check_steps(env: Env) -> None:
     """Calls `env.check()`, where the environment has one: it raises if steps so far were silently wrong."""
     if (check := getattr(env, "check", None)) is not None:
         check()
+
+
+def env_sizes(env: Env) -> Sizes:
+    """Returns the sizes of an environment's observation, goal and action, without running it.
+
+    Raises:
+      ValueError: the observation is not a single vector.
+    """
+    template = episode_template(env)
+    return Sizes(template.observation.shape[-1], template.desired_goal.shape[-1], env.action_size)
+
+
+def episode_template(env: Env) -> Episode:
+    """Returns the shapes and types of one episode of `env`, without running it.
+
+    Raises:
+      ValueError: the observation is not a single vector, or `env` is no environment.
+    """
+    check_env_parts(env)
+    first = jax.eval_shape(env.reset, jax.random.key(0))
+    check_first(first, ())
+    obs = first.obs
+    observation = obs["observation"]
+    if not (hasattr(observation, "shape") and len(observation.shape) == 1):
+        raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")
+
+    def repeat(x: Any, times: int) -> Any:
+        return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
+
+    num_steps = env.episode_length
+    return Episode(
+        observation=repeat(observation, num_steps + 1),
+        achieved_goal=repeat(obs["achieved_goal"], num_steps + 1),
+        desired_goal=obs["desired_goal"],
+        action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
+    )

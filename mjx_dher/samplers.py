@@ -22,11 +22,13 @@ from flax import struct
 
 from mjx_dher import names
 from mjx_dher.config import HParams
-from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS
-from mjx_dher.types import Array, PRNGKey
+from mjx_dher.scores import LearnedMetric, ScoreFn, make_metric, score_of
+from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS
+from mjx_dher.types import Array, Episode, PRNGKey
+from mjx_dher.view import pick
 
-# log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
-LogWeightsFn = Callable[[Array, Array, Array, HParams], Array]
+# log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; of a sampler with a score, (..., hparams, score [T+1])
+LogWeightsFn = Callable[..., Array]
 # metric(achieved [T+1, G], desired [G]) -> [T+1], finite and not negative
 MetricFn = Callable[[Array, Array], Array]
 # kernel(relative distance [T+1], temperature []) -> log weight [T+1]
@@ -40,6 +42,8 @@ class Sampler:
     log_weights: LogWeightsFn = struct.field(pytree_node=False)
     # Goals of any episode, not of its own. A function where the answer is traced: see `one_of`.
     cross_episode: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
+    # Numbers that the learner gives the goals of each stored episode, once a cycle; handed to `log_weights` as its last.
+    score: ScoreFn | None = struct.field(pytree_node=False, default=None)
 
 
 def position(achieved: Array, desired: Array) -> Array:
@@ -207,35 +211,56 @@ def make(name: str | Sampler | LogWeightsFn, kernel: str | KernelFn = "linear", 
         return _to_sampler(name)
     names.check_name("sampler", name, SAMPLERS, own=True)
     kernel = names.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
-    metric = names.resolve("metric", metric, METRICS, ("achieved", "desired"))
+    distance = make_metric(metric)
     by_distance: dict[str, LogWeightsFn] = {
-        "closest": functools.partial(closest, metric=metric),
-        "epsilon_closest": functools.partial(epsilon_closest, metric=metric),
-        "weighted": functools.partial(weighted, kernel=kernel, metric=metric),
+        "closest": closest,
+        "epsilon_closest": epsilon_closest,
+        "weighted": functools.partial(weighted, kernel=kernel),
     }
     if name in by_distance:
-        return Sampler(by_distance[name])
+        return _by_metric(by_distance[name], distance)
     if name in _PLAIN:
         return _PLAIN[name]
-    return _to_sampler(names.load_import_path("sampler", name))
+    return _to_sampler(names.load_import_path("sampler", SAMPLERS_ELSEWHERE.get(name, name)))
+
+
+def _by_metric(log_weights: LogWeightsFn, metric: MetricFn | LearnedMetric) -> Sampler:
+    """Returns the sampler that goes by `metric`."""
+    if not isinstance(metric, LearnedMetric):
+        return Sampler(functools.partial(log_weights, metric=metric))
+
+    def of_score(achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array) -> Array:
+        return log_weights(achieved, desired, step, hparams, metric=lambda achieved, desired: score)
+
+    return Sampler(of_score, score=metric.score)
 
 
 def _to_sampler(sampler: Any) -> Sampler:
     if not isinstance(sampler, Sampler):
         sampler = Sampler(sampler)
-    names.check_function("sampler", sampler.log_weights, ("achieved", "desired", "step", "hparams"))
+    parameters = ("achieved", "desired", "step", "hparams")
+    names.check_function("sampler", sampler.log_weights, parameters if sampler.score is None else (*parameters, "score"))
+    if sampler.score is not None:
+        names.check_function("sampler: score", sampler.score, ("episode", "view"))
+        if sampler.cross_episode is True:
+            raise ValueError("a sampler with a score takes goals of its own episode; this one has cross_episode, too")
     if not (isinstance(sampler.cross_episode, bool) or callable(sampler.cross_episode)):
         raise ValueError(f"cross_episode of a sampler must be True, False or a function; it is {sampler.cross_episode!r}")
     return sampler
 
 
-def weigh(sampler: Sampler, achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """Returns a sampler's log weights [T+1] of the goals [T+1, G] of one episode.
+def weigh(
+    sampler: Sampler, achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array | None = None
+) -> Array:
+    """Returns a sampler's log weights [T+1] of the goals [T+1, G] of one episode, of which it may want a score [T+1].
 
     Raises:
-      ValueError: they are no floating-point numbers [T+1].
+      ValueError: they are no floating-point numbers [T+1], or there is no score for a sampler that wants one.
     """
-    value = sampler.log_weights(achieved, desired, step, hparams)
+    if sampler.score is not None and score is None:
+        raise ValueError("this sampler goes by what the learner says of an episode; hand in `scores` (scores.of_episodes)")
+    more = () if sampler.score is None else (score,)
+    value = sampler.log_weights(achieved, desired, step, hparams, *more)
     return _checked("a sampler gives log weights", sampler.log_weights, value, achieved.shape[0])
 
 
@@ -254,19 +279,25 @@ def one_of(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     if len(samplers) == 1:
         return samplers[0]
 
-    def pick(values: Sequence[Any], hparams: Any) -> Array:
-        kept = jnp.asarray(values[0])
-        for index, value in enumerate(values[1:], 1):
-            kept = jnp.where(hparams.choice == index, value, kept)
-        return kept
+    def log_weights(achieved: Array, desired: Array, step: Array, hparams: Any, score: Array | None = None) -> Array:
+        return pick([weigh(sampler, achieved, desired, step, hparams, score) for sampler in samplers], hparams.choice)
 
-    def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-        return pick([weigh(sampler, achieved, desired, step, hparams) for sampler in samplers], hparams)
+    def score(episode: Episode, view: Any) -> Array:
+        none = jnp.zeros(episode.achieved_goal.shape[0])
+        return pick(
+            [score_of(sampler.score, episode, view) if sampler.score else none for sampler in samplers], view.hparams.choice
+        )
 
     crossing = [sampler.cross_episode for sampler in samplers]
-    if not any(crossing):
-        return Sampler(log_weights)
-    return Sampler(log_weights, cross_episode=lambda hparams: pick(crossing, hparams))
+
+    def crosses(hparams: Any) -> Array:
+        return pick(crossing, hparams.choice)
+
+    return Sampler(
+        log_weights,
+        cross_episode=crosses if any(crossing) else False,
+        score=score if any(sampler.score for sampler in samplers) else None,
+    )
 
 
 def probabilities(log_weights: Array) -> Array:

@@ -14,11 +14,27 @@ from mjx_dher.names import check_name, is_import_path
 
 Engine = Literal["auto", "native", "jax", "warp"]
 ENGINES = get_args(Engine)
-SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted")
+SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted", "next_future")
+SAMPLERS_ELSEWHERE = {"next_future": "mjx_dher.methods.goals:next_future"}  # the others are in mjx_dher.samplers
 # Parts by name, and where they are; an own one is named by its place alone.
 WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
-METRICS = {"position": "mjx_dher.samplers:position"}
-PRIORITIES = {"eventful": "mjx_dher.priorities:eventful"}
+METRICS = {
+    "position": "mjx_dher.samplers:position",
+    **{
+        name: f"mjx_dher.methods.metrics:{name}"
+        for name in ("velocity", "resting_point", "resting_point_rough", "time_to_goal")
+    },
+}
+# Those that weigh whole episodes, and those that choose among transitions; lanes of a program can differ within either.
+EPISODE_PRIORITIES = {
+    "eventful": "mjx_dher.priorities:eventful",
+    **{name: f"mjx_dher.methods.episodes:{name}" for name in ("energy", "max_entropy", "diversity")},
+}
+TRANSITION_PRIORITIES = {
+    name: f"mjx_dher.methods.transitions:{name}" for name in ("dpp", "td_error", "curriculum", "not_misleading")
+}
+PRIORITIES = {**EPISODE_PRIORITIES, **TRANSITION_PRIORITIES}
+GENERATORS = {"reset": "mjx_dher.generators:reset", "hgg": "mjx_dher.methods.goals:hgg"}
 LEARNERS = {
     **{name: f"mjx_dher.learners.{name}:make" for name in ("ddpg", "td3", "sac", "redq", "tqc")},
     "dtqc": "mjx_dher.learners.tqc:make_deterministic",
@@ -38,15 +54,19 @@ class RunSpec:
     env_kwargs: tuple[str, ...] = ()
     """Arguments of the environment, NAME=VALUE each: reward_type=dense distance_threshold=0.03 episode_length=80."""
     sampler: str = "future"
-    """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest or weighted, or
+    """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest, weighted or next_future, or
     module:attribute."""
     weight_kernel: Annotated[str, ReadBy("weighted")] = "linear"
     """Fall of the weights with distance, for the sampler weighted: linear, inverse or softmax, or module:attribute."""
     metric: Annotated[str, ReadBy("closest", "epsilon_closest", "weighted")] = "position"
-    """Distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by: position, or
-    module:attribute."""
+    """Distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by: position, velocity,
+    resting_point, resting_point_rough or time_to_goal, or module:attribute."""
     priority: str = "eventful"
-    """Priority of an episode in replay, for priority_fraction of each batch: eventful, or module:attribute."""
+    """Priority in replay, for priority_fraction of each batch: of episodes eventful, energy, max_entropy or diversity, of
+    transitions dpp, td_error, curriculum or not_misleading, or module:attribute."""
+    generator: str = "reset"
+    """Generator of the goals that training episodes are played for: reset (the environment's own), hgg, or
+    module:attribute."""
     learner: str = "ddpg"
     """Learner: ddpg, td3, sac, redq, tqc, dtqc (tqc with a deterministic actor), or module:attribute."""
     networks: str = "mlp"
@@ -75,14 +95,18 @@ class RunSpec:
     @property
     def program(self) -> RunSpec:
         """Description of the compiled program that the run can share: all that its lanes must agree in."""
-        return dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0, hparams=HParams())
+        alike = next((own[0] for own in map(list, _PRIORITIES_OF_LANES) if self.priority in own), self.priority)
+        shared = dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0)
+        return dataclasses.replace(shared, priority=alike, generator="reset", hparams=HParams())
 
 
+_PRIORITIES_OF_LANES = (EPISODE_PRIORITIES, TRANSITION_PRIORITIES)
 PARTS = {  # by field, the names that are built in; each field takes module:attribute, too
     "sampler": SAMPLERS,
     "weight_kernel": WEIGHT_KERNELS,
     "metric": METRICS,
     "priority": PRIORITIES,
+    "generator": GENERATORS,
     "learner": LEARNERS,
     "networks": NETWORKS,
 }

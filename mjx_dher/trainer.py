@@ -17,18 +17,22 @@ import jax.numpy as jnp
 from flax import struct
 
 from mjx_dher import config as config_lib
-from mjx_dher import evaluate, learners, priorities, replay, samplers
+from mjx_dher import evaluate, generators, learners, priorities, replay, samplers, scores
 from mjx_dher.config import Config, HParams
+from mjx_dher.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
-from mjx_dher.priorities import PriorityFn
+from mjx_dher.priorities import Priority, PriorityFn
 from mjx_dher.relabel import draw_batches, relabel_counted
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import check_first, rollout
+from mjx_dher.rollout import env_sizes, episode_template, rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.types import Array, Batch, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_env_parts
+from mjx_dher.types import Array, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, check_env_parts
+from mjx_dher.updates import update_round
+from mjx_dher.view import View
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
+GENERATE = 0x476F616C  # folded into a cycle's key, for its goals; no index of `jax.random.split`
 
 
 @struct.dataclass
@@ -58,7 +62,8 @@ class Loop:
     env: Env
     config: Config
     sampler: Sampler
-    priority: PriorityFn
+    priority: Priority
+    generator: Generator
     learner: Learner
     template: Episode  # shapes and dtypes of an episode
     max_transitions_per_draw: int = MAX_TRANSITIONS_PER_DRAW
@@ -67,6 +72,11 @@ class Loop:
     def num_episodes(self) -> int:
         """Episodes that the ring holds, E."""
         return config_lib.episodes_capacity(self.config, self.env.episode_length)
+
+    @property
+    def uses_values(self) -> bool:
+        """Need of one of the parts for the learner's values."""
+        return self.sampler.score is not None or self.priority.uses_values or self.generator.uses_values
 
     @property
     def steps_per_cycle(self) -> int:
@@ -100,7 +110,8 @@ def make_train(
     config: Config,
     *,
     sampler: Sampler | LogWeightsFn | None = None,
-    priority: PriorityFn | None = None,
+    priority: Priority | PriorityFn | None = None,
+    generator: Generator | GenerateFn | None = None,
     learner: Learner | None = None,
 ) -> Train:
     """Makes the training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
@@ -117,7 +128,8 @@ def make_train(
       env: the environment.
       config: sizes.
       sampler: of hindsight goals, or a function like `Sampler.log_weights`; `future` where None.
-      priority: of episodes, for `hparams.priority_fraction` of each batch; `eventful` where None.
+      priority: of episodes or transitions, for `hparams.priority_fraction` of each batch; `eventful` where None.
+      generator: of the goals that training episodes are played for; those of the reset where None.
       learner: DDPG where None, made of `config`.
 
     Raises:
@@ -129,12 +141,16 @@ def make_train(
         env=env,
         config=config,
         sampler=samplers.make("future" if sampler is None else sampler),
-        priority=priorities.make("eventful" if priority is None else priority),
+        priority=priorities.whole(priorities.make("eventful" if priority is None else priority)),
+        generator=generators.make("reset" if generator is None else generator),
         learner=learners.make("ddpg", config, env_sizes(env)) if learner is None else learner,
         template=episode_template(env),
     )
     if problem := config_lib.delay_problem(config, loop.policy_delay):
         raise ValueError(problem)
+    generators.check_env(loop.generator, env)
+    if loop.uses_values:
+        learners.check_values(loop.learner)
     return Train(
         init=functools.partial(_init, loop),
         epoch=functools.partial(_epoch, loop),
@@ -188,19 +204,24 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
     noise = loop.learner.noise(noise_key, env.episode_length, config.num_envs, hparams)
     learners.check_noise(noise, env.episode_length, config.num_envs)
-    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise)
+    progress = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / loop.num_updates
+    goals = _goals(loop, state, progress)
+    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, goals)
     weights = priorities.weights(loop.priority, episodes, env.compute_reward, hparams)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
-    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, hparams, normalizer_key)
-    annealed = anneal(hparams, state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / loop.num_updates)
-    learned, losses = _learn(loop, learner, ring, annealed, learn_key)
+    before = _view(loop, state.learner, hparams, progress)
+    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
+    annealed = anneal(hparams, progress)
+    view = _view(loop, learner, annealed, progress)
+    ring = priorities.renewed(loop.priority, ring, view)
+    learned, losses = _learn(loop, learner, ring, view, learn_key)
     # As long as the ring is empty, nothing is learned.
     learner = jax.tree.map(lambda new, old: jnp.where(replay.can_sample(ring), new, old), learned, learner)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": jnp.mean(weights),
+        "priority_mean": jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring),
         **evaluate.faults(outcome),
         **relabelled,
         **losses,
@@ -209,67 +230,53 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     return TrainState(learner=learner, replay=ring, hparams=hparams, key=key, env_steps=env_steps), metrics
 
 
+def _view(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> View:
+    values = learners.values_of(loop.learner, learner, hparams) if loop.uses_values else None
+    return View(loop.env.compute_reward, hparams, progress, values)
+
+
+def _goals(loop: Loop, state: TrainState, progress: Array) -> Callable[[GoalObs], Array] | None:
+    """Returns what gives the goals of a rollout; None where the reset's own are played for."""
+    if loop.generator is generators.reset:
+        return None
+    view = _view(loop, state.learner, state.hparams, progress)
+    key = jax.random.fold_in(state.key, GENERATE)
+    return lambda obs: generators.goals_of(loop.generator, key, obs, state.replay, view)
+
+
 def _update_normalizers(
-    loop: Loop, learner: PyTree, episodes: Episode, valid: Array, hparams: HParams, key: PRNGKey
+    loop: Loop, learner: PyTree, episodes: Episode, valid: Array, view: View, key: PRNGKey
 ) -> tuple[PyTree, Metrics]:
     """Updates the normalizers; goals are relabelled first, so that their statistics match those of training batches."""
     num_new, num_steps = episodes.action.shape[:2]
     fresh = replay.add(replay.init(loop.template, num_new), episodes, valid=valid)
     sample_key, relabel_key = jax.random.split(key)
     sample = replay.sample(fresh, sample_key, num_new * num_steps)
-    batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, loop.env.compute_reward, hparams, relabel_key)
+    hparams, score = view.hparams, scores.of_episodes(loop.sampler.score, fresh.episodes, view)
+    batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, view.compute_reward, hparams, relabel_key, score)
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
     learners.check_kept("update_normalizers", learner, updated)
     return updated, {**_relabel_metrics(sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
 
 
-def _learn(loop: Loop, learner: PyTree, ring: ReplayState, hparams: HParams, key: PRNGKey) -> tuple[PyTree, Metrics]:
+def _learn(loop: Loop, learner: PyTree, ring: ReplayState, view: View, key: PRNGKey) -> tuple[PyTree, Metrics]:
     """Makes a cycle's updates. The ring does not change meanwhile, so batches are drawn many at once.
 
     On a GPU, drawing one batch takes twice as long as learning from it, and drawing 40 hardly longer.
     """
-    config = loop.config
+    config, hparams = loop.config, view.hparams
     cumulative = replay.cumulative_priority(ring)
+    score = scores.of_episodes(loop.sampler.score, ring.episodes, view)
     shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
-        batches = draw_batches(ring, key, shape, loop.sampler, loop.env.compute_reward, hparams, cumulative, config.n_step)
-        return jax.lax.scan(functools.partial(_round, loop, hparams), learner, batches)
+        numbers = hparams, cumulative, config.n_step, score
+        batches = draw_batches(ring, key, shape, loop.sampler, view.compute_reward, *numbers, loop.priority, view)
+        return jax.lax.scan(functools.partial(update_round, loop.learner, config.target_period, hparams), learner, batches)
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))
     learner, losses = jax.lax.scan(draw_and_update, learner, keys)
     return learner, jax.tree.map(jnp.mean, losses)
-
-
-def _round(loop: Loop, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes an update for each of `batches` (leaves lead with [updates_per_round]) and moves the targets when they are due."""
-    delay, period = loop.policy_delay, loop.config.target_period
-    if delay > period:
-        return _delayed_update(loop, hparams, state, batches)
-    groups = jax.tree.map(lambda x: x.reshape(period // delay, delay, *x.shape[1:]), batches)
-    state, losses = jax.lax.scan(functools.partial(_delayed_update, loop, hparams), state, groups)
-    return _move_targets(loop.learner, hparams, state), losses
-
-
-def _delayed_update(loop: Loop, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes `policy_delay` updates, the last of them of the actor, too; returns the last one's metrics.
-
-    Targets that are due within them are moved.
-    """
-    learner, period = loop.learner, loop.config.target_period
-    for number in range(1, loop.policy_delay + 1):
-        batch = jax.tree.map(lambda x, i=number - 1: x[i], batches)
-        method = "update" if number == loop.policy_delay else "update_critic"
-        state, losses = learners.check_update(state, getattr(learner, method)(state, batch, hparams), method)
-        if loop.policy_delay > period and number % period == 0:
-            state = _move_targets(learner, hparams, state)
-    return state, losses
-
-
-def _move_targets(learner: Learner, hparams: HParams, state: PyTree) -> PyTree:
-    moved = learner.update_target(state, hparams)
-    learners.check_kept("update_target", state, moved)
-    return moved
 
 
 def _relabel_metrics(goal: Array, hindsight: Array) -> Metrics:
@@ -307,39 +314,3 @@ def is_finite(learner: PyTree) -> Array:
     """Returns [] whether all of a learner's numbers are finite: once they are not, no epoch will mend them."""
     floats = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))
-
-
-def env_sizes(env: Env) -> Sizes:
-    """Returns the sizes of an environment's observation, goal and action, without running it.
-
-    Raises:
-      ValueError: the observation is not a single vector.
-    """
-    template = episode_template(env)
-    return Sizes(template.observation.shape[-1], template.desired_goal.shape[-1], env.action_size)
-
-
-def episode_template(env: Env) -> Episode:
-    """Returns the shapes and types of one episode of `env`, without running it.
-
-    Raises:
-      ValueError: the observation is not a single vector, or `env` is no environment.
-    """
-    check_env_parts(env)
-    first = jax.eval_shape(env.reset, jax.random.key(0))
-    check_first(first, ())
-    obs = first.obs
-    observation = obs["observation"]
-    if not (hasattr(observation, "shape") and len(observation.shape) == 1):
-        raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")
-
-    def repeat(x: Any, times: int) -> Any:
-        return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
-
-    num_steps = env.episode_length
-    return Episode(
-        observation=repeat(observation, num_steps + 1),
-        achieved_goal=repeat(obs["achieved_goal"], num_steps + 1),
-        desired_goal=obs["desired_goal"],
-        action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
-    )

@@ -90,6 +90,9 @@ class Env(Protocol):
     `step` takes an action [A]. `compute_reward` takes goals [..., G] and gives rewards [...]; the learner's targets are clipped
     to [-1/(1-gamma), 0], so they should lie between -1 and 0. `testing.check_env` tries an environment out.
 
+    It may have `with_goal(state, goal)`, which gives a first state with another desired goal [G] and else the same: goal
+    generators need it.
+
     It may have `check()`, which the trainer calls on the host after each epoch, and which raises ValueError where the steps
     were not what they should be and their results do not show it.
     """

@@ -57,6 +57,10 @@ class Explodes(PointMass):
         # Counts up from 0 in an episode that will break, from 100 in any other.
         return ExplodingState(state.obs, state.reward, state.success, jnp.where(breaks, 0, 100), jnp.zeros((), bool))
 
+    def with_goal(self, state: ExplodingState, goal: Array) -> ExplodingState:
+        first = super().with_goal(state, goal)
+        return ExplodingState(first.obs, first.reward, first.success, state.step, state.failed)
+
     def step(self, state: ExplodingState, action: Array) -> ExplodingState:
         following = super().step(state, action)
         step, obs = state.step + 1, following.obs

@@ -26,7 +26,7 @@ def compile_once(monkeypatch):
     compile_runs = program.compile_runs
 
     def cached(env, specs, max_lanes, final_episodes, report):
-        choices = tuple(dict.fromkeys(spec.sampler_choice for spec in specs))
+        choices = str(program.choices_of(specs))
         lanes = min(len(specs), max_lanes or len(specs))
         lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))
         key = (type(env), specs[0].program, choices, lanes, final_episodes, memory.available_bytes)

@@ -55,6 +55,7 @@ def test_list_names_all_that_there_is(capsys):
         "kernels": spec.WEIGHT_KERNELS,
         "metrics": spec.METRICS,
         "priorities": spec.PRIORITIES,
+        "generators": spec.GENERATORS,
         "learners": spec.LEARNERS,
         "networks": spec.NETWORKS,
     }

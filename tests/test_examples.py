@@ -28,9 +28,11 @@ def test_each_is_short():
         "many_seeds.py",
         "own_episodes.py",
         "own_learner.py",
+        "own_methods.py",
         "point_mass.py",
     }
     assert max(lengths.values()) < 80
+    assert lengths["own_methods.py"] < 25
 
 
 def test_a_regression_learns_from_replay_and_weighted_relabelling(capsys):
@@ -86,13 +88,24 @@ def test_the_tutorial_shows_the_example_as_it_is():
     def lines(text):
         return [line.strip() for line in text.splitlines() if line.strip()]
 
-    code = lines((EXAMPLES / "point_mass.py").read_text()) + lines((EXAMPLES / "own_episodes.py").read_text())
+    names = ("point_mass.py", "own_episodes.py", "own_methods.py")
+    code = [line for name in names for line in lines((EXAMPLES / name).read_text())]
     blocks = re.findall(r"```python\n(.*?)```", TUTORIAL, re.S)
     shown = [lines(block) for block in blocks if "class " in block or "def " in block]
-    assert len(shown) == 5
+    assert len(shown) == 7
     for block in shown:
         start = code.index(block[0])
         assert code[start : start + len(block)] == block
+
+
+def test_the_tutorial_s_priority_and_generator_are_as_they_should_be():
+    env = PointMass()
+    assert testing.check_priority("own_methods:travelled", env).startswith("priority as it should be: weights from ")
+    # A half of the goals or so: those that the reset drew are half as far away.
+    share = int(re.search(r"(\d+)% of the goals", testing.check_generator("own_methods:halfway", env))[1])
+    assert 20 <= share <= 80
+    (command,) = re.findall(r"^PYTHONPATH=docs/examples python train\.py check (.*)$", TUTORIAL, re.M)
+    assert parse_train_args(command.split()).spec.generator == "own_methods:halfway"
 
 
 def test_the_tutorial_s_check_passes():
@@ -104,7 +117,7 @@ def test_the_tutorial_s_check_passes():
 
 
 def tutorial_command():
-    (command,) = re.findall(r"^PYTHONPATH=docs/examples python train\.py (.*?[^\\])$", TUTORIAL, re.M | re.S)
+    (command,) = re.findall(r"^PYTHONPATH=docs/examples python train\.py (--.*?[^\\])$", TUTORIAL, re.M | re.S)
     return command.replace("\\\n", "").split()
 
 

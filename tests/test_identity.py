@@ -99,6 +99,7 @@ EDITS = {
     ("weight_kernel",): "softmax",
     ("metric",): "mjx_dher.samplers:position",
     ("priority",): "mjx_dher.priorities:eventful",
+    ("generator",): "mjx_dher.generators:reset",
     ("learner",): "mjx_dher.learners.ddpg:make",
     ("networks",): "mjx_dher.networks:mlp",
     ("seed",): 7,

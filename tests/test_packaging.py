@@ -19,19 +19,20 @@ LAYERS = [
     "hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
     "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
-    "spec policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
-    "presets networks priorities samplers runs.identity runs.health testing.env envs.engines.simulator",
-    "envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
+    "spec view policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
+    "scores presets networks priorities generators runs.identity runs.health testing.env",
+    "samplers envs.engines.simulator envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
+    "methods.metrics methods.goals",
     "envs.engines.fused.memory envs.engines.fused.kinematics envs.engines.fused.contacts envs.engines.fused.linear",
-    "envs.engines.fused.solver",
-    "envs.engines.fused.constraints envs.engines.fused.setup",
+    "methods.episodes envs.engines.fused.solver",
+    "methods.transitions envs.engines.fused.constraints envs.engines.fused.setup",
     "envs.engines.fused.kernel",
     "envs.engines.fused.simulation",
     "envs.engines.warp",
     "relabel learners learners.common learners.critics runs.run_folder envs.engines",
-    "trainer testing.trial learners.stored learners.actors runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
-    "testing.learner learners.ddpg learners.actor_critic runs.loop runs.load runs.options runs.results",
-    "learners.td3 learners.sac learners.redq learners.tqc",
+    "updates testing.trial learners.stored learners.actors runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
+    "trainer learners.ddpg learners.actor_critic runs.options runs.results",
+    "testing.learner testing.views runs.loop runs.load learners.td3 learners.sac learners.redq learners.tqc",
     "envs.push envs.pick_and_place envs.slide envs.reach",
     "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program sweeps.tables tools.doctor tools.programs",
@@ -43,7 +44,7 @@ LAYERS = [
     "cli.report",
     "cli",
 ]
-EMPTY = "envs.engines.fused hopper host runs sweeps tools"  # folders: they hold a docstring
+EMPTY = "envs.engines.fused hopper host methods runs sweeps tools"  # folders: they hold a docstring
 
 
 def modules():

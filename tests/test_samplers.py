@@ -8,6 +8,7 @@ import pytest
 
 from mjx_dher import names, samplers, spec
 from mjx_dher.config import HParams
+from mjx_dher.methods import metrics
 from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS, RunSpec
 
 HP = HParams()
@@ -120,9 +121,10 @@ def test_every_name_makes_a_sampler_and_random_alone_crosses_episodes(name):
 
 
 @pytest.mark.parametrize(("field", "known"), [("weight_kernel", WEIGHT_KERNELS), ("metric", METRICS)])
-def test_names_are_those_of_functions_here(field, known):
+def test_names_are_those_of_functions(field, known):
     for name, place in known.items():
-        assert names.load_import_path(field, place) is getattr(samplers, name)
+        module = metrics if "methods" in place else samplers
+        assert names.load_import_path(field, place) is getattr(module, name)
 
 
 def first(achieved, desired, step, hparams):

@@ -131,7 +131,7 @@ def test_a_lane_is_that_run_alone(tmp_path):
     assert len({jax.tree.leaves(params)[0].tobytes() for params in learned.values()}) == len(trials)
     for sampler in ("random", "weighted"):
         own = [trial for trial in trials if trial.sampler == sampler]
-        train = program.make_loop(PointMass(), own[0], [own[0].sampler_choice])
+        train = program.make_loop(PointMass(), own[0], program.choices_of(own))
         compiled = loop.compile_program(train, jax.random.key(0), HParams())
         for trial in own:
             start = loop.Start(compiled.init(jax.random.key(trial.seed), trial.hparams))

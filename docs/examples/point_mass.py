@@ -41,6 +41,10 @@ class PointMass:
         position = state.obs["achieved_goal"] + STEP * jnp.clip(action, -1, 1)
         return self._state(position, state.obs["desired_goal"])
 
+    def with_goal(self, state: PointState, goal: Array) -> PointState:
+        """The state of an episode that is played for another goal [2]."""
+        return self._state(state.obs["achieved_goal"], goal)
+
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """0 within reach, else -1: [..., 2], [..., 2] -> [...]."""
         return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > REACH).astype(jnp.float32)

@@ -38,14 +38,34 @@ KINDS: dict[str, dict[str, str]] = {
         "closest": "the future goal nearest to the desired one (the paper's method 1); reads metric",
         "epsilon_closest": "any future goal with probability epsilon, else the closest (method 2); reads metric, epsilon",
         "weighted": "nearer future goals likelier (method 3); reads metric, weight_kernel, temperature",
+        "next_future": "the step's own next goal, one time in her_k, else any future one (Next-Future)",
     },
     "kernels": {
         "linear": "weights that fall linearly with the relative distance",
         "inverse": "weights that fall as a power of the relative distance",
         "softmax": "weights that fall exponentially with the relative distance",
     },
-    "metrics": {"position": "Euclidean distance between goals"},
-    "priorities": {"eventful": "episodes whose last achieved goal was not yet reached at their start"},
+    "metrics": {
+        "position": "Euclidean distance between goals",
+        "velocity": "distance in position and velocity to rest at the goal",
+        "resting_point": "distance of where Slide's puck would come to rest",
+        "resting_point_rough": "the same with the friction of Push's and PickAndPlace's block",
+        "time_to_goal": "steps from there to the goal, by the learner's critic",
+    },
+    "priorities": {
+        "eventful": "episodes whose last achieved goal was not yet reached at their start",
+        "energy": "episodes by the energy that the object was given (EBP)",
+        "max_entropy": "episodes by how rare their achieved goals are in the ring (MEP)",
+        "diversity": "episodes by how diverse their achieved goals are (DTGSH)",
+        "dpp": "that, and of transitions two with goals apart (DTGSH's k-DPP)",
+        "td_error": "episodes, and transitions with hindsight goals, by their errors of one step (HGR)",
+        "curriculum": "transitions with goals diverse at first, near later (CHER)",
+        "not_misleading": "transitions whose hindsight goal was not reached before they began (bias-reduced HER)",
+    },
+    "generators": {
+        "reset": "the goals that the resets drew",
+        "hgg": "goals achieved before, on the way to those of the resets (Hindsight Goal Generation)",
+    },
     "learners": {
         "ddpg": "DDPG (Lillicrap et al. 2016): deterministic actor, one critic",
         "td3": "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
@@ -68,6 +88,7 @@ OPTIONS = {
     "kernels": "--weight-kernel",
     "metrics": "--metric",
     "priorities": "--priority",
+    "generators": "--generator",
     "learners": "--learner",
     "networks": "--networks",
 }
@@ -75,7 +96,7 @@ OPTIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class ListArgs:
-    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, learners and networks, in a line each.
+    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, generators, learners and networks.
 
     All but engines and presets can be your own, too, as module:attribute (docs/tutorial.md).
     """

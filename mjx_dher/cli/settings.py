@@ -123,7 +123,7 @@ def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
     from mjx_dher.host import memory
     from mjx_dher.runs import loop, program
 
-    train = program.make_loop(env, specs[0], list(dict.fromkeys(spec.sampler_choice for spec in specs)))
+    train = program.make_loop(env, specs[0], program.choices_of(specs))
     loop.check_memory(train, specs[0].config)
     leaves = jax.tree.leaves(jax.eval_shape(train.learner.init, jax.random.key(0)))
     learner = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)

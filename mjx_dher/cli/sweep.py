@@ -27,7 +27,7 @@ from mjx_dher.sweeps import grid
 if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
-GRID = ("env", "sampler", "weight_kernel", "metric", "priority", "learner", "networks")
+GRID = ("env", "sampler", "weight_kernel", "metric", "priority", "generator", "learner", "networks")
 
 
 def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
@@ -79,9 +79,13 @@ class SweepArgs:
     weight_kernel: tuple[str, ...] = ("linear",)
     """Kernels for weighted: linear, inverse, softmax, or module:attribute."""
     metric: tuple[str, ...] = ("position",)
-    """Distances that closest, epsilon_closest and weighted go by: position, or module:attribute."""
+    """Distances that closest, epsilon_closest and weighted go by: position, velocity, resting_point, resting_point_rough,
+    time_to_goal, or module:attribute."""
     priority: tuple[str, ...] = ("eventful",)
-    """Priorities of episodes in replay: eventful, or module:attribute."""
+    """Priorities in replay: eventful, energy, max_entropy, diversity, dpp, td_error, curriculum, not_misleading, or
+    module:attribute."""
+    generator: tuple[str, ...] = ("reset",)
+    """Generators of the goals that training episodes are played for: reset, hgg, or module:attribute."""
     learner: tuple[str, ...] | None = None
     """Learners; the preset's unless given: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
     networks: tuple[str, ...] | None = None

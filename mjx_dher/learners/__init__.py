@@ -13,6 +13,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.networks import NetworksFn
 from mjx_dher.spec import LEARNERS
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
+from mjx_dher.view import Values
 
 # What the loop and the log call theirs: a learner's metrics have other names.
 RESERVED = frozenset(
@@ -29,7 +30,9 @@ class Learner(Protocol):
 
     It may have `policy_delay`, an integer of more than 1, and `update_critic`, which is called like `update`: of so many
     updates all but the last are then made by `update_critic`. It has `uses_discount`, True, where it takes the `discount` of a
-    batch, as returns of several steps need.
+    batch, as returns of several steps need. It may have `value(state, obs, action, hparams)`, the estimated return [...] of
+    actions [..., A] and then following the policy, at observations [..., D] and goals [..., G]: priorities, distances and goal
+    generators that ask for the learner's values need it.
     """
 
     def init(self, key: PRNGKey) -> PyTree:
@@ -100,6 +103,31 @@ def check_discount(learner: Any, config: Config) -> None:
         raise ValueError(
             f"n_step {config.n_step} needs a learner that takes a batch's discount; {learner!r} has no uses_discount"
         )
+
+
+def check_values(learner: Any) -> None:
+    """Raises ValueError where a part of a run asks for a learner's values and it has no method for them."""
+    if not callable(getattr(learner, "value", None)):
+        raise ValueError(
+            f"a priority, metric or generator of this run asks for the learner's values, and {learner!r} has no method"
+            " value(state, obs, action, hparams)"
+        )
+
+
+def values_of(learner: Any, state: PyTree, hparams: HParams) -> Values:
+    """Returns a learner's policy and values, as it is in `state`, as functions of observations and goals."""
+
+    def obs_of(observation: Array, goal: Array) -> GoalObs:
+        return GoalObs(observation=observation, achieved_goal=goal, desired_goal=goal)
+
+    def value(observation: Array, goal: Array, action: Array) -> Array:
+        result = learner.value(state, obs_of(observation, goal), action, hparams)
+        if getattr(result, "shape", None) != action.shape[:-1]:
+            given = list(result.shape) if hasattr(result, "shape") else f"a {type(result).__name__}"
+            raise ValueError(f"learner.value must give one number for each action, {list(action.shape[:-1])}; it gives {given}")
+        return result
+
+    return Values(lambda observation, goal: learner.act(state, obs_of(observation, goal), hparams), value)
 
 
 def policy_delay(learner: Any) -> int:

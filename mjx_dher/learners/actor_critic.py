@@ -84,6 +84,13 @@ class ActorCritic:
         """Returns the deterministic policy's actions [..., A] in [-1, 1]."""
         return self.actor.act(self.networks.actor, state.params.actor, *common.normalize_obs(state, obs, hparams))
 
+    def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
+        """Returns what the critics, as judges of the actor, say [...] of actions [..., A]."""
+        observation, goal = common.normalize_obs(state, obs, hparams)
+        flat = [x.reshape(-1, x.shape[-1]) for x in (observation, goal, action)]
+        judges = self.critics.judges(state.params.critic)
+        return self.critics.judge(critics.values(self.networks.critic, judges, *flat)).reshape(action.shape[:-1])
+
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> common.Noise:
         """Draws what `explore` takes; leaves lead with [T, N]."""
         return self.actor.noise(key, num_steps, num_envs, self.sizes.action, hparams)

@@ -107,6 +107,10 @@ class DDPG:
         """Returns the policy's actions [..., A] in [-1, 1], without exploration."""
         return _pi(self.networks, state.params.actor, *common.normalize_obs(state, obs, hparams))
 
+    def value(self, state: DDPGState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
+        """Returns Q [...] of actions [..., A]."""
+        return _q(self.networks, state.params.critic, *common.normalize_obs(state, obs, hparams), action)
+
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> common.Noise:
         """Draws what `explore` takes; leaves lead with [T, N]."""
         return common.exploration_noise(key, num_steps, num_envs, self.sizes.action, hparams)

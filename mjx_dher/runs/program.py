@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import config as config_lib
-from mjx_dher import learners, priorities, samplers, trainer
+from mjx_dher import generators, learners, priorities, samplers, trainer
 from mjx_dher.config import HParams
 from mjx_dher.host import memory
 from mjx_dher.learners import Learner
@@ -26,30 +26,52 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.trainer import Train, TrainState
 from mjx_dher.types import Env, PRNGKey, Sizes
 
-# HParams, and which of a program's samplers a lane uses; see samplers.one_of.
-Lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))  # type: ignore[misc]
-Choice = tuple[str, str, str]  # arguments of samplers.make
+# HParams, and which of a program's samplers, priorities and generators a lane uses; see `one_of` of each.
+Lane = collections.namedtuple("Lane", (*HParams._fields, "choice", "priority_choice", "generator_choice"))  # type: ignore[misc]
 EvaluateFn = Callable[[TrainState, PRNGKey], Outcome]
+
+
+class Choices(NamedTuple):
+    """What lanes of one program may differ in beside numbers: each list once, in the order of the runs."""
+
+    samplers: list[tuple[str, str, str]]  # arguments of samplers.make
+    priorities: list[str]
+    generators: list[str]
+
+    def of(self, spec: RunSpec) -> tuple[int, int, int]:
+        """Returns the numbers of a run's sampler, priority and generator."""
+        sampler, priority, generator = _parts(spec)
+        return self.samplers.index(sampler), self.priorities.index(priority), self.generators.index(generator)
+
+
+def _parts(spec: RunSpec) -> tuple[tuple[str, str, str], str, str]:
+    return spec.sampler_choice, spec.priority, spec.generator
+
+
+def choices_of(specs: Sequence[RunSpec]) -> Choices:
+    """Returns what the runs of a program choose from."""
+    return Choices(*(list(dict.fromkeys(values)) for values in zip(*map(_parts, specs))))
 
 
 class Program(NamedTuple):
     """A compiled program for runs side by side."""
 
     lanes: int
-    choices: list[Choice]
+    choices: Choices
     learner: Learner
     sizes: Sizes
     compiled: Compiled
     evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
 
 
-def make_loop(env: Env, spec: RunSpec, choices: Sequence[Choice]) -> Train:
+def make_loop(env: Env, spec: RunSpec, choices: Choices) -> Train:
     """Makes the training loop of runs that share a program, with the parts that they name."""
     return trainer.make_train(
         env,
         spec.config,
-        sampler=samplers.one_of([samplers.make(*choice) for choice in choices]),
-        priority=priorities.make(spec.priority),
+        sampler=samplers.one_of([samplers.make(*choice) for choice in choices.samplers]),
+        priority=priorities.one_of([priorities.make(name) for name in choices.priorities]),
+        generator=generators.one_of([generators.make(name) for name in choices.generators]),
         learner=learners.make(spec.learner, spec.config, trainer.env_sizes(env), spec.networks),
     )
 
@@ -64,7 +86,7 @@ def compile_runs(
     Raises:
       ValueError: memory does not suffice for one run.
     """
-    spec, choices = specs[0], list(dict.fromkeys(spec.sampler_choice for spec in specs))
+    spec, choices = specs[0], choices_of(specs)
     train = make_loop(env, spec, choices)
     loop.check_memory(train, spec.config)
     lanes = min(len(specs), max_lanes or len(specs))
@@ -123,12 +145,12 @@ def _compile_evaluation(
     return cast("concurrent.futures.Future[EvaluateFn]", compiling)
 
 
-def stack(specs: Sequence[RunSpec], choices: Sequence[Choice], lanes: int) -> tuple[PRNGKey, Any]:
+def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGKey, Any]:
     """Returns the keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
     padded = [specs[min(i, len(specs) - 1)] for i in range(lanes)]
     numbers: list[Any] = [spec.hparams for spec in padded]
-    if len(choices) > 1:
-        numbers = [Lane._make((*spec.hparams, choices.index(spec.sampler_choice))) for spec in padded]
+    if any(len(own) > 1 for own in choices):
+        numbers = [Lane._make((*spec.hparams, *choices.of(spec))) for spec in padded]
     if lanes == 1:
         return jax.random.key(padded[0].seed), trainer.as_arrays(numbers[0])
     keys = jnp.stack([jax.random.key(spec.seed) for spec in padded])

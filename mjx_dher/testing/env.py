@@ -32,6 +32,8 @@ def check_env(env: Env, seed: int = 0, tolerance: float = 1e-3) -> None:
     - `reset` and `step` are pure: the same arguments give the same results, alone and under `jax.jit` and `jax.vmap`.
     - Starts or goals differ from key to key, and the goal is constant in an episode.
     - Actions outside [-1, 1] are accepted.
+    - `with_goal`, if present, gives a first state another desired goal, which it keeps, and changes neither observation nor
+      achieved goal.
     - `compute_reward` takes any leading axes and gives the same reward as `step`. It lies in [-1, 0], because the learner's
       targets are clipped to [-1/(1-gamma), 0], and it is greatest for a goal that is achieved exactly.
     - If all rewards are -1 or 0, success is never 1 at a reward of -1, and not 0 at every reward of 0. They need not agree at
@@ -59,6 +61,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = 1e-3) -> None:
     valid = ~np.broadcast_to(played.get("failed", False), played["reward"].shape)
     _check_episodes(played, valid)
     _check_against_play(env, keys, actions, states, tolerance)
+    _check_with_goal(env, keys, tolerance)
     beyond = "step with an action of +-3"
     _check_state(env, _attempt(beyond, env.step, first, 3.0 * jnp.sign(actions[0, 0])), beyond)
     _check_reward(env, played, valid, tolerance)
@@ -255,6 +258,23 @@ def _check_against_play(env: Env, keys: jax.Array, actions: jax.Array, states: A
         start, following = _attempt("reset", env.reset, keys[n]), _attempt("step", env.step, at(t, n), actions[t, n])
         _check_same("reset, alone and under jax.jit and jax.vmap", start, at(0, n), tolerance)
         _check_same("step, alone and under jax.jit and jax.vmap", following, at(t + 1, n), tolerance)
+
+
+def _check_with_goal(env: Any, keys: jax.Array, tolerance: float) -> None:
+    """Checks that `with_goal`, where there is one, sets the goal of a first state and no more, for good."""
+    if not hasattr(env, "with_goal"):
+        return
+    first, other = env.reset(keys[0]), env.reset(keys[1])
+    goal = other.obs["desired_goal"]
+    changed = _attempt("with_goal", env.with_goal, first, goal)
+    _check_state(env, changed, "with_goal")
+    following = _attempt("step after with_goal", env.step, changed, jnp.zeros(env.action_size))
+    for name, state, told in (("with_goal", changed, "gives"), ("step after with_goal", following, "has")):
+        if not np.array_equal(state.obs["desired_goal"], goal):
+            raise EnvError(f"{name}: desired_goal must be the goal that was handed in; the state {told} another")
+    for name in ("observation", "achieved_goal"):
+        if not np.allclose(changed.obs[name], first.obs[name], rtol=tolerance, atol=tolerance):
+            raise EnvError(f"with_goal must change the desired goal alone; it changed {name}")
 
 
 def _check_reward(env: Env, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:

@@ -33,6 +33,7 @@ def check_learner(
 
     - `init` gives a pytree of arrays, `noise` arrays that lead with [T, N].
     - `act` and `explore` give finite actions [N, A] in [-1, 1]; `act` takes any leading axes.
+    - `value`, if present, gives one finite number for each action, for any leading axes.
     - `update`, `update_target` and `update_normalizers` keep the state's structure, shapes and types, as `lax.scan` needs, and
       numbers finite; `update` changes it.
     - Metrics of `update` and `summary` are dicts of scalars, with names that nothing else is logged by.
@@ -108,6 +109,10 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparam
     _check_actions("act on one observation [D]", one, (env.action_size,))
     if not jnp.allclose(one, action[0], atol=1e-3):
         raise PartError("learner.act of a batch must be that of each of its observations; it depends on the others")
+    if hasattr(made, "value"):
+        values = learners.values_of(made, state, hparams)
+        several = [jnp.stack([x, x]) for x in (obs["observation"], obs["desired_goal"], action)]
+        expect_finite("numbers of learner.value", attempt("learner.value", jax.jit(values.value), *several))
 
 
 def _check_actions(name: str, action: Any, shape: tuple[int, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Trials of samplers, metrics, kernels and priorities of one's own, on random episodes."""
+"""Trials of samplers, metrics, kernels, priorities and generators of one's own, on random episodes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import names, priorities, samplers
+from mjx_dher import learners, names, priorities, samplers, scores
 from mjx_dher.config import HParams
+from mjx_dher.learners import Learner
 from mjx_dher.names import is_import_path
-from mjx_dher.priorities import PriorityFn
+from mjx_dher.priorities import Priority, PriorityFn
+from mjx_dher.rollout import env_sizes
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
-from mjx_dher.spec import METRICS, WEIGHT_KERNELS, RunSpec, own_parts, reads
+from mjx_dher.scores import LearnedMetric
+from mjx_dher.spec import WEIGHT_KERNELS, RunSpec, own_parts, reads
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
 from mjx_dher.testing.trial import PartError, attempt, random_episodes
+from mjx_dher.testing.views import check_choice, check_generator, trial_view
 from mjx_dher.types import Env, Episode
 
 TOLERANCE = 1e-3
@@ -41,22 +45,34 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
     if own_parts(spec) in ([], ["env"]):
         return
     episodes = random_episodes(env)
-    if is_import_path(spec.metric):
-        yield check_metric(spec.metric, env, episodes)
-    if is_import_path(spec.weight_kernel):
-        yield check_kernel(spec.weight_kernel)
-    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, spec.learner, field)]
-    if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
-        yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes)}"
-    if is_import_path(spec.priority):
-        yield check_priority(spec.priority, env, spec.hparams, episodes)
+    learner = attempt("learner", learners.make, spec.learner, spec.config, env_sizes(env), spec.networks)
+    yield from _check_replayed(env, spec, episodes, learner)
     if is_import_path(spec.learner) or is_import_path(spec.networks):
         check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
         yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
 
 
+def _check_replayed(env: Env, spec: RunSpec, episodes: Episode, learner: Learner) -> Iterator[str]:
+    """Tries out what a run names of its own that decides what is learned from."""
+    if is_import_path(spec.metric):
+        yield check_metric(spec.metric, env, episodes, learner)
+    if is_import_path(spec.weight_kernel):
+        yield check_kernel(spec.weight_kernel)
+    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, spec.learner, field)]
+    if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
+        yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes, learner)}"
+    if is_import_path(spec.priority):
+        yield check_priority(spec.priority, env, spec.hparams, episodes, learner)
+    if is_import_path(spec.generator):
+        yield check_generator(spec.generator, env, spec.hparams, episodes, learner)
+
+
 def check_sampler(
-    sampler: str | Sampler | LogWeightsFn, env: Env, hparams: HParams | None = None, episodes: Episode | None = None
+    sampler: str | Sampler | LogWeightsFn,
+    env: Env,
+    hparams: HParams | None = None,
+    episodes: Episode | None = None,
+    learner: Learner | None = None,
 ) -> str:
     """Asks a sampler for the log weights of every step of random episodes.
 
@@ -68,6 +84,7 @@ def check_sampler(
       env: the environment.
       hparams: numbers; the defaults where None.
       episodes: to ask about; random ones where None.
+      learner: whose values a score may ask for, untrained; `ddpg` where None.
 
     Returns:
       A sentence: at how many of the steps it offers no goal, and whether it offers goals of the past.
@@ -78,15 +95,17 @@ def check_sampler(
     made, hparams = attempt("sampler", samplers.make, sampler), HParams() if hparams is None else hparams
     episodes = episodes or random_episodes(env)
     steps = jnp.arange(env.episode_length)
+    score = jnp.zeros((episodes.action.shape[0], env.episode_length + 1))
+    if made.score is not None:
+        score = attempt("sampler: score", scores.of_episodes, made.score, episodes, trial_view(env, hparams, learner))
 
-    def of_step(achieved: Any, desired: Any, step: Any) -> Any:
-        return samplers.weigh(made, achieved, desired, step, _as_arrays(hparams))
+    def of_step(achieved: Any, desired: Any, score: Any, step: Any) -> Any:
+        return samplers.weigh(made, achieved, desired, step, _as_arrays(hparams), score)
 
-    of_episode = jax.vmap(of_step, in_axes=(None, None, 0))
-    log_weights = attempt(
-        "sampler", jax.jit(jax.vmap(of_episode, in_axes=(0, 0, None))), episodes.achieved_goal, episodes.desired_goal, steps
-    )
-    alone = attempt("sampler, alone,", of_step, episodes.achieved_goal[0], episodes.desired_goal[0], steps[-1])
+    of_episode = jax.vmap(of_step, in_axes=(None, None, None, 0))
+    asked = episodes.achieved_goal, episodes.desired_goal, score
+    log_weights = attempt("sampler", jax.jit(jax.vmap(of_episode, in_axes=(0, 0, 0, None))), *asked, steps)
+    alone = attempt("sampler, alone,", of_step, *(x[0] for x in asked), steps[-1])
     return _check_log_weights(np.asarray(log_weights), np.asarray(alone))
 
 
@@ -117,7 +136,9 @@ def _weights(log_weights: NDArray) -> NDArray:
     return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 
 
-def check_metric(metric: str | MetricFn, env: Env, episodes: Episode | None = None) -> str:
+def check_metric(
+    metric: str | MetricFn | LearnedMetric, env: Env, episodes: Episode | None = None, learner: Learner | None = None
+) -> str:
     """Asks a metric for the distances of random episodes' goals.
 
     They must be [T+1], finite and not negative, and not all alike.
@@ -128,10 +149,14 @@ def check_metric(metric: str | MetricFn, env: Env, episodes: Episode | None = No
     Raises:
       PartError: names the first violation.
     """
-    made = _resolve("metric", metric, METRICS, ("achieved", "desired"))
+    made = attempt("metric", scores.make_metric, metric)
     episodes = episodes or random_episodes(env)
-    compute = jax.jit(jax.vmap(functools.partial(samplers.measure, made)))
-    distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
+    if isinstance(made, LearnedMetric):
+        view = trial_view(env, learner=learner)
+        distances = np.asarray(attempt("metric", scores.of_episodes, made.score, episodes, view))
+    else:
+        compute = jax.jit(jax.vmap(functools.partial(samplers.measure, made)))
+        distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
     if not np.isfinite(distances).all():
         raise PartError("metric: distances must be finite; one is not")
     if distances.min() < 0:
@@ -173,23 +198,45 @@ def check_kernel(kernel: str | KernelFn) -> str:
 
 
 def check_priority(
-    priority: str | PriorityFn, env: Env, hparams: HParams | None = None, episodes: Episode | None = None
+    priority: str | Priority | PriorityFn,
+    env: Env,
+    hparams: HParams | None = None,
+    episodes: Episode | None = None,
+    learner: Learner | None = None,
 ) -> str:
     """Asks a priority for the weights of random episodes: scalars, finite and not negative.
 
+    One that renews weights, or that chooses among transitions, is asked for that, too.
+
     Returns:
-      A sentence: in which range they lie.
+      A sentence: in which range weights lie.
 
     Raises:
       PartError: names the first violation.
     """
     made, hparams = attempt("priority", priorities.make, priority), HParams() if hparams is None else hparams
 
-    def weigh(episode: Any) -> Any:
-        return jnp.asarray(made(episode, env.compute_reward, _as_arrays(hparams)))
-
     episodes = episodes or random_episodes(env)
+    more = check_choice(made, env, hparams, episodes, learner) if isinstance(made, Priority) else []
+    of_episode = priorities.whole(made).weigh
+    if of_episode is None:
+        return f"priority as it should be: {'; '.join(more)}"
+
+    def weigh(episode: Any) -> Any:
+        return jnp.asarray(of_episode(episode, env.compute_reward, _as_arrays(hparams)))
+
     weights = np.asarray(attempt("priority", jax.jit(jax.vmap(weigh)), episodes))
+    _check_weights(weights)
+    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
+    if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
+        raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
+    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
+    told = [f"weights from {weights.min():.3g} to {weights.max():.3g}{none}", *more]
+    return f"priority as it should be: {'; '.join(told)}"
+
+
+def _check_weights(weights: NDArray) -> None:
+    """Raises PartError unless weights are numbers [N], finite and not negative."""
     if weights.ndim != 1:
         raise PartError(f"priority: it must give one weight [] for an episode; it gives {list(weights.shape[1:])}")
     if weights.dtype.kind not in "fiub":
@@ -198,11 +245,6 @@ def check_priority(
         raise PartError("priority: weights must be finite; one is not")
     if weights.min() < 0:
         raise PartError(f"priority: weights must not be negative; the least is {weights.min():.3g}")
-    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
-    if not np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE):
-        raise PartError("priority: weights under jax.vmap must be those alone; they depend on other episodes")
-    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
-    return f"priority as it should be: weights from {weights.min():.3g} to {weights.max():.3g}{none}"
 
 
 def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:

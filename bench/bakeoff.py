@@ -1,0 +1,209 @@
+"""The bake-off of hindsight's methods: every arm of bench/bakeoff_arms.py against `future`, with the same seeds.
+
+    python bench/bakeoff.py --out bakeoff --plan        what would be trained, and how long it would take
+    python bench/bakeoff.py --out bakeoff               trains and reports; the same command goes on where it was stopped
+    python bench/bakeoff.py --out bakeoff --report      reports what has ended
+    python bench/bakeoff.py --out toy --toy --seeds 3   the same on the point mass, on a CPU in minutes
+
+Each learner and task is a sweep in a folder of its own (`python train.py plot bakeoff/paper-slide` draws it, too). The report
+is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. docs/what_helps.md says beforehand what is compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bakeoff_arms import ARMS, BASELINE, GROUPS, LEARNERS, TASKS, THRESHOLDS, estimated_minutes, spec_of
+from bakeoff_report import Row, Scores, compare, forest
+from rich.console import Console
+
+from mjx_dher import envs, stats
+from mjx_dher.cli.common import Screen, make_env
+from mjx_dher.host import files
+from mjx_dher.host.caches import prepare
+from mjx_dher.runs import identity
+from mjx_dher.runs.options import Options
+from mjx_dher.runs.stopping import Stop
+from mjx_dher.spec import RunSpec, validate
+from mjx_dher.sweeps import comparison, grid, sweep, tables
+
+TABLE = "bakeoff.csv"
+TOY_TASK = "point_mass:PointMass"
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Returns the arguments, checked; ends the program with status 2 and a sentence for those that cannot be used."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps and of the report")
+    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=LEARNERS)
+    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
+    parser.add_argument("--arms", nargs="+", choices=[arm.name for arm in ARMS], default=[arm.name for arm in ARMS])
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--lanes", type=int, help="runs side by side, at most; as many as memory holds on a GPU, 1 on a CPU")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop, to go on later, after the epoch that ends then")
+    parser.add_argument("--plan", action="store_true", help="say what would be trained, and train nothing")
+    parser.add_argument("--report", action="store_true", help="report what has ended, and train nothing")
+    parser.add_argument("--toy", action="store_true", help="the point mass, tiny networks: tries the mechanics on a CPU")
+    args = parser.parse_args(argv)
+    for name in ("seeds", "lanes"):
+        value = getattr(args, name)
+        if value is not None and not 1 <= value <= 1000:
+            parser.error(f"--{name} must lie between 1 and 1000; got {value}")
+    if not 0 <= args.first_seed <= 2**32 - 1001:
+        parser.error(f"--first-seed must lie between 0 and {2**32 - 1001}; got {args.first_seed}")
+    if not args.minutes > 0:
+        parser.error(f"--minutes must be more than 0; got {args.minutes}")
+    if args.toy:
+        args.learners, args.tasks = ("paper",), (TOY_TASK,)
+        sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
+    args.arms = [arm for arm in ARMS if arm.name in (BASELINE, *args.arms)]
+    return args
+
+
+def folder_of(args: argparse.Namespace, learner: str, task: str) -> Path:
+    """Returns the folder of a sweep."""
+    return args.out / f"{learner}-{identity.in_a_path(task)}"
+
+
+def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> list[RunSpec]:
+    """Returns the runs of the arms of a group, seed by seed, so that what is compared ends together."""
+    settings = [spec_of(learner, task, arm, args.toy) for arm in args.arms if arm.group == group]
+    for setting in settings:
+        validate(setting, envs.list_envs())
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    return [dataclasses.replace(setting, seed=seed) for seed in seeds for setting in settings]
+
+
+def plan(args: argparse.Namespace, console: Console) -> None:
+    """Prints the runs of each sweep, how many of them are done, and the minutes that all of them take."""
+    for learner in args.learners:
+        for task in args.tasks:
+            folder = folder_of(args, learner, task)
+            runs = [run for group in GROUPS for run in trials_of(args, learner, task, group)]
+            done = sum(grid.is_done(folder, run) for run in runs)
+            steps = runs[0].config.total_steps
+            console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} of them done; learner {runs[0].learner}")
+    if not args.toy:
+        minutes = estimated_minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
+        console.print(
+            f"about {minutes:.0f} minutes of one H200, by what sweeps of `future` took there (bench/README.md,"
+            " docs/results.md); what the methods cost beyond that has not been measured"
+        )
+
+
+def train(args: argparse.Namespace, console: Console) -> bool:
+    """Trains what is not done; returns whether all is."""
+    prepare()
+    until = time.monotonic() + 60 * args.minutes
+    with Stop(console, args.out) as stop:
+        for learner in args.learners:
+            for task in args.tasks:
+                for group in GROUPS:
+                    if stop.asked is not None or time.monotonic() > until:
+                        return False
+                    if not _train_group(args, (learner, task, group), console, stop, until):
+                        return False
+    return True
+
+
+def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console: Console, stop: Stop, until: float) -> bool:
+    """Trains the runs of a group that are not done, in one program; returns whether all of them are."""
+    learner, task, group = which
+    folder = folder_of(args, learner, task)
+    todo = [run for run in trials_of(args, learner, task, group) if not grid.is_done(folder, run)]
+    if not todo:
+        return True
+    files.make_folder(folder / grid.CELLS)
+    console.print(f"{folder}, {group}: {len(todo)} runs")
+    screen = Screen(console, todo)
+    try:
+        sweep.run(
+            folder,
+            todo,
+            make_env,
+            options=Options(final_episodes=100 if args.toy else 500, checkpoint_every=1 if args.toy else 5),
+            lanes=args.lanes,
+            should_stop=lambda: stop.asked is not None or time.monotonic() > until,
+            report=console.print,
+            on_epoch=screen.show,
+        )
+    finally:
+        screen.close()
+    return all(grid.is_done(folder, run) for run in todo)
+
+
+def read(args: argparse.Namespace, learner: str, task: str) -> dict[str, Scores]:
+    """Returns what the runs that have ended came to, by arm; empty where there are none."""
+    folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
+    if not any((folder / grid.CELLS).glob("*/result.json")):
+        return {}
+    wanted = {str(_told(spec_of(learner, task, arm, args.toy))): arm.name for arm in ARMS}
+    by_arm: dict[str, list[dict[str, Any]]] = {}
+    for trial in tables.read(folder):
+        told = {name: trial["settings"][name] for name in (*_PARTS, *_NUMBERS)}
+        if (name := wanted.get(str(told))) is not None:
+            by_arm.setdefault(name, []).append(trial)
+    return {name: _scores(task, name, by_arm[name], threshold) for arm in ARMS if (name := arm.name) in by_arm}
+
+
+_PARTS, _NUMBERS = ("sampler", "metric", "priority", "generator"), ("priority_fraction", "hindsight_reward")
+
+
+def _told(run: RunSpec) -> dict[str, Any]:
+    return {**{name: getattr(run, name) for name in _PARTS}, **{name: float(getattr(run.hparams, name)) for name in _NUMBERS}}
+
+
+def _scores(task: str, name: str, trials: list[dict[str, Any]], threshold: float) -> Scores:
+    (groups,) = comparison.groups(trials).values()
+    (group,) = groups
+    reach = stats.first_reach(group.env_steps, group.success, threshold)
+    return Scores(group.seeds, stats.area_under_curve(group.epoch, group.success), group.final, reach, group.failed)
+
+
+def report(args: argparse.Namespace, console: Console) -> int:
+    """Writes bakeoff.csv and a forest plot a task of what has ended; returns the number of rows."""
+    rows: list[Row] = []
+    for task in args.tasks:
+        for learner in args.learners:
+            scores = read(args, learner, task)
+            rows += compare(learner, task, scores) if BASELINE in scores else []
+    if not rows:
+        console.print(f"{args.out}: no run of `{BASELINE}` has ended, and so nothing can be compared yet")
+        return 0
+    with files.atomic_write(args.out / TABLE) as partial, partial.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(Row._fields)
+        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+    console.print(f"wrote {args.out / TABLE}")
+    for task in args.tasks:
+        if own := [row for row in rows if row.task == task]:
+            path = args.out / f"{identity.in_a_path(task)}_forest.png"
+            forest(own, path)
+            console.print(f"wrote {path}")
+    return len(rows)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Plans, trains and reports; 0 where all is done, 3 where runs are left for the same command."""
+    args, console = parse(argv), Console(highlight=False, soft_wrap=True)
+    if args.plan:
+        plan(args, console)
+        return 0
+    done = args.report or train(args, console)
+    report(args, console)
+    if not done:
+        console.print("stopped; the same command goes on")
+    return 0 if done else 3
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""The arms of bench/bakeoff.py: what each changes, what is claimed of it, and the settings that all share."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_dher import presets
+from mjx_dher.spec import RunSpec
+
+BASELINE = "future"
+TASKS = ("push", "pick_and_place", "slide")
+LEARNERS = ("paper", "best")
+THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
+# Arms whose runs share a program. Those that ask the learner about the whole ring at each cycle, and those that draw four
+# times as many transitions, would make the others' runs dearer.
+GROUPS = ("plain", "learner", "transitions", "errors")
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """A setting that is compared with `future`."""
+
+    name: str
+    group: str
+    parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
+    numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
+    claim: str = ""
+    source: str = ""
+
+    @property
+    def prioritized(self) -> bool:
+        """Whether the arm draws by a priority."""
+        return "priority" in self.parts
+
+
+ARMS = (
+    Arm(BASELINE, "plain", {"sampler": "future"}, source="Andrychowicz et al. 2017"),
+    Arm(
+        "next_future",
+        "plain",
+        {"sampler": "next_future"},
+        claim="sooner on 7 of 8 tasks, higher success on 6 of 8",
+        source="Özgür et al. 2025, arXiv 2504.11247",
+    ),
+    Arm(
+        "energy",
+        "plain",
+        {"priority": "energy"},
+        claim="more success and fewer samples on all of four tasks",
+        source="Zhao & Tresp 2018, arXiv 1810.01363",
+    ),
+    Arm(
+        "max_entropy",
+        "plain",
+        {"priority": "max_entropy"},
+        claim="better in success and in samples",
+        source="Zhao et al. 2019, arXiv 1905.08786",
+    ),
+    Arm(
+        "diversity",
+        "plain",
+        {"priority": "diversity"},
+        claim="half of DTGSH, not claimed alone",
+        source="Dai et al. 2021, arXiv 2108.07887",
+    ),
+    Arm(
+        "dpp",
+        "transitions",
+        {"priority": "dpp"},
+        claim="sooner and higher on all of five tasks; PickAndPlace about 0.94 for 0.90 (the author)",
+        source="Dai et al. 2021, arXiv 2108.07887",
+    ),
+    Arm(
+        "td_error",
+        "errors",
+        {"priority": "td_error"},
+        claim="significantly sooner on four tasks",
+        source="Luu & Yoo 2021",
+    ),
+    Arm(
+        "curriculum",
+        "transitions",
+        {"priority": "curriculum"},
+        claim="better than the state of the art, on Reach and the Hand tasks",
+        source="Fang et al. 2019",
+    ),
+    Arm(
+        "not_misleading",
+        "transitions",
+        {"priority": "not_misleading"},
+        claim="vast improvement on two tasks of the authors'",
+        source="Manela & Biess 2021, arXiv 1905.05498",
+    ),
+    Arm(
+        "hgg",
+        "plain",
+        {"generator": "hgg"},
+        claim="substantially fewer samples where goals are far",
+        source="Ren et al. 2019, arXiv 1906.04279",
+    ),
+    Arm(
+        "archer",
+        "plain",
+        {},
+        {"hindsight_reward": 0.5},
+        claim="fewer samples on Reacher and Finger",
+        source="Lanka & Wu 2018, arXiv 1809.02070",
+    ),
+    Arm("velocity", "plain", {"sampler": "weighted", "metric": "velocity"}, claim="none: the paper's open question"),
+    Arm("resting_point", "plain", {"sampler": "weighted", "metric": "resting_point"}, claim="none: the paper's open question"),
+    Arm("time_to_goal", "learner", {"sampler": "weighted", "metric": "time_to_goal"}, claim="none: the paper's open question"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """Sizes of a task's runs, and what one of them costs."""
+
+    changes: Mapping[str, Any]  # to the preset's Config
+    seconds: float  # of an H200 a run, from measured sweeps of `future`, scaled by the environment steps
+
+
+# As docs/results.md's fast sweeps, cut where `future` has learned: 7.0, 16.1 and 39.9 s a run of 50, 50 and 200 epochs.
+_FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
+# As bench/README.md's five side by side: 4.4, 11.8 and 40.2 s a run of 1.54, 1.02 and 8.19 million steps.
+SIZES = {
+    ("paper", "push"): Size({**_FAST, "total_steps": 1_000_000}, 7.0 * 25 / 50),
+    ("paper", "pick_and_place"): Size({**_FAST, "num_envs": 1600, "total_steps": 2_000_000}, 16.1 * 25 / 50),
+    ("paper", "slide"): Size({**_FAST, "total_steps": 2_000_000}, 39.9 * 50 / 200),
+    ("best", "push"): Size({"cycles_per_epoch": 1, "total_steps": 819_200}, 4.4 * 0.819 / 1.536),
+    ("best", "pick_and_place"): Size({"total_steps": 640_000}, 11.8 * 0.64 / 1.024),
+    ("best", "slide"): Size({"cycles_per_epoch": 1, "total_steps": 1_740_800}, 40.2 * 1.741 / 8.192),
+}
+COMPILE_SECONDS = 30.0  # a program
+TOY = {
+    "num_envs": 16,
+    "cycles_per_epoch": 5,
+    "updates_per_cycle": 20,
+    "target_period": 20,
+    "batch_size": 64,
+    "hidden_sizes": (32, 32),
+    "total_steps": 4_000,
+    "replay_size": 20_000,
+    "eval_episodes": 50,
+}
+
+
+def parts_of(task: str, arm: Arm) -> dict[str, str]:
+    """Returns the parts of an arm by field of RunSpec; where an object comes to rest depends on the task."""
+    parts = dict(arm.parts)
+    if parts.get("metric") == "resting_point" and task != "slide":
+        parts["metric"] = "resting_point_rough"
+    return parts
+
+
+def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Returns a run of an arm, seed 0.
+
+    `paper` is DDPG under the paper's settings, `best` the preset `gpu`. Priorities are drawn by for the whole batch in
+    `paper`, as their authors do, and in `best` for the preset's half of it, where they take the place of `eventful`.
+    """
+    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts_of(task, arm))
+    changes = TOY if toy else SIZES[learner, task].changes
+    numbers = dict(arm.numbers)
+    if arm.prioritized and learner == "paper":
+        numbers["priority_fraction"] = 1.0
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **changes), hparams=run.hparams._replace(**numbers))
+
+
+def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
+    """Returns the minutes of one H200 that the runs take by what sweeps of `future` took, compilation included."""
+    sizes = [SIZES[learner, task] for learner in learners for task in tasks]
+    programs = len(sizes) * len({arm.group for arm in arms})
+    return (sum(size.seconds for size in sizes) * len(arms) * seeds + COMPILE_SECONDS * programs) / 60

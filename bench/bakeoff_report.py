@@ -1,0 +1,160 @@
+"""The comparison of bench/bakeoff.py's arms with `future`: rows of a table, and forest plots."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from bakeoff_arms import ARMS, BASELINE, Arm
+from numpy.typing import NDArray
+
+from mjx_dher import stats
+
+ALPHA, POWER = 0.05, 0.8
+
+
+class Scores(NamedTuple):
+    """What the runs of an arm came to, by seed; all [S]."""
+
+    seeds: tuple[int, ...]
+    area: NDArray  # mean success over the epochs
+    final: NDArray  # success of the last policy
+    steps: NDArray  # environment steps to the threshold; infinite where it is never reached
+    failed: int
+
+
+class Row(NamedTuple):
+    """An arm of a learner and task beside `future`. Differences are paired by seed; intervals are at 95 %."""
+
+    learner: str
+    task: str
+    arm: str
+    seeds: int
+    failed: int
+    mean_success: float
+    final: float
+    steps_to_threshold: float  # median; infinite if half of the seeds or more never reach it
+    difference: float  # of mean success
+    low: float
+    high: float
+    final_difference: float
+    better: float  # probability that a seed of the arm has more mean success than one of `future`
+    better_low: float
+    better_high: float
+    p_value: float
+    p_corrected: float  # by Holm's method, over all arms of a learner and task
+    smallest_effect: float  # that would be seen four times in five, for this spread of the differences
+    claim: str
+    source: str
+
+
+def smallest_effect(spread: float, seeds: int, tests: int) -> float:
+    """Returns the mean difference for which the permutation test has p <= 0.05 / tests four times in five; NaN where none has.
+
+    `spread` is the standard deviation of the differences, which are taken as normal: 2,000 draws of them. Holm's method holds
+    the smallest of `tests` p-values to that level. Beyond 12 seeds signs are drawn, too, 4,096 of them.
+    """
+    if seeds < 2 or 2.0 ** (1 - seeds) > ALPHA / tests:
+        return math.nan
+    rng = np.random.default_rng(0)
+    drawn = rng.normal(size=(2000, seeds))
+    every = np.array(list(itertools.product((1, -1), repeat=seeds))) if seeds <= 12 else rng.choice((1, -1), size=(4096, seeds))
+
+    def power(effect: float) -> float:
+        differences = drawn + effect
+        larger = np.abs(differences @ every.T) >= np.abs(differences.sum(axis=1, keepdims=True)) - 1e-12
+        return float(np.mean(larger.mean(axis=1) <= ALPHA / tests))
+
+    low, high = 0.0, 20.0
+    for _ in range(14):
+        middle = (low + high) / 2
+        low, high = (middle, high) if power(middle) < POWER else (low, middle)
+    return high * spread
+
+
+def compare(learner: str, task: str, scores: dict[str, Scores]) -> list[Row]:
+    """Returns a row an arm: each against `future` on the seeds that both have."""
+    base, arms = scores[BASELINE], {arm.name: arm for arm in ARMS}
+    others = [name for name in scores if name != BASELINE]
+    rows = [_row(learner, task, arms[name], scores[name], base, len(others)) for name in (BASELINE, *others)]
+    tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
+    for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested]) if tested else []):
+        rows[number] = rows[number]._replace(p_corrected=p)
+    return rows
+
+
+def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: int) -> Row:
+    common = [seed for seed in own.seeds if seed in base.seeds]
+    nan, paired = math.nan, {}
+    if arm.name != BASELINE and len(common) > 1:
+        mine, theirs = ([scores.seeds.index(seed) for seed in common] for scores in (own, base))
+        difference = own.area[mine] - base.area[theirs]
+        low, high = stats.bootstrap_interval(difference, np.mean)
+        better_low, better_high = stats.improvement_interval(own.area, base.area)
+        paired = {
+            "difference": float(difference.mean()),
+            "low": low,
+            "high": high,
+            "final_difference": float((own.final[mine] - base.final[theirs]).mean()),
+            "better": stats.probability_of_improvement(own.area, base.area),
+            "better_low": better_low,
+            "better_high": better_high,
+            "p_value": stats.paired_p_value(own.area[mine], base.area[theirs]),
+            "smallest_effect": smallest_effect(float(difference.std(ddof=1)), len(common), max(tests, 1)),
+        }
+    empty = dict.fromkeys(
+        ("difference", "low", "high", "final_difference", "better", "better_low", "better_high", "p_value", "smallest_effect"),
+        nan,
+    )
+    return Row(
+        learner=learner,
+        task=task,
+        arm=arm.name,
+        seeds=len(own.seeds),
+        failed=own.failed,
+        mean_success=float(own.area.mean()),
+        final=float(own.final.mean()),
+        steps_to_threshold=float(np.median(own.steps)),
+        p_corrected=nan,
+        claim=arm.claim,
+        source=arm.source,
+        **(empty | paired),
+    )
+
+
+def forest(rows: Sequence[Row], path: Path) -> None:
+    """Draws the paired differences to `future` of a task's arms, a panel a learner, with intervals and corrected p."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    learners = list(dict.fromkeys(row.learner for row in rows))
+    names = [arm.name for arm in ARMS if any(row.arm == arm.name for row in rows) and arm.name != BASELINE]
+    height = 1.3 + 0.3 * max(len(names), 1)
+    figure, axes = plt.subplots(1, len(learners), figsize=(5.2 * len(learners), height), sharey=True, squeeze=False)
+    for axis, learner in zip(axes[0], learners):
+        for row in rows:
+            if row.learner != learner or math.isnan(row.difference):
+                continue
+            place = names.index(row.arm)
+            shown = "black" if row.p_corrected < ALPHA else "0.5"
+            around = [[row.difference - row.low], [row.high - row.difference]]
+            axis.errorbar(row.difference, place, xerr=around, fmt="o", color=shown, capsize=3, markersize=4)
+            axis.annotate(
+                f"p {row.p_corrected:.2g}", (1.01, place), xycoords=("axes fraction", "data"), fontsize=7, va="center"
+            )
+        axis.axvline(0.0, color="0.6", linewidth=0.8)
+        axis.set_title(learner, fontsize=10)
+        axis.set_xlabel(f"mean success over epochs, difference to {BASELINE}")
+        axis.grid(axis="x", alpha=0.2)
+    axes[0][0].set_yticks(range(len(names)), names)
+    axes[0][0].invert_yaxis()
+    figure.suptitle(f"{rows[0].task}: paired by seed, 95 % intervals;\nblack where p corrected < {ALPHA}", fontsize=10)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

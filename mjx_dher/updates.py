@@ -1,0 +1,46 @@
+"""A round of updates: critics, the actor once every `policy_delay` of them, and the targets once every `target_period`."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+
+from mjx_dher import learners
+from mjx_dher.config import HParams
+from mjx_dher.learners import Learner
+from mjx_dher.types import Batch, Metrics, PyTree
+
+
+def update_round(learner: Learner, period: int, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
+    """Makes an update for each of `batches` and moves the targets when they are due, after every `period` of them.
+
+    Leaves of `batches` lead with the larger of `period` and the learner's policy_delay.
+    """
+    delay = learners.policy_delay(learner)
+    if delay > period:
+        return _delayed_update(learner, period, hparams, state, batches)
+    groups = jax.tree.map(lambda x: x.reshape(period // delay, delay, *x.shape[1:]), batches)
+    state, losses = jax.lax.scan(functools.partial(_delayed_update, learner, period, hparams), state, groups)
+    return _move_targets(learner, hparams, state), losses
+
+
+def _delayed_update(learner: Learner, period: int, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
+    """Makes `policy_delay` updates, the last of them of the actor, too; returns the last one's metrics.
+
+    Targets that are due within them are moved.
+    """
+    delay = learners.policy_delay(learner)
+    for number in range(1, delay + 1):
+        batch = jax.tree.map(lambda x, i=number - 1: x[i], batches)
+        method = "update" if number == delay else "update_critic"
+        state, losses = learners.check_update(state, getattr(learner, method)(state, batch, hparams), method)
+        if delay > period and number % period == 0:
+            state = _move_targets(learner, hparams, state)
+    return state, losses
+
+
+def _move_targets(learner: Learner, hparams: HParams, state: PyTree) -> PyTree:
+    moved = learner.update_target(state, hparams)
+    learners.check_kept("update_target", state, moved)
+    return moved

@@ -1,0 +1,149 @@
+"""bench/bakeoff.py: its arms, what they cost, what is made of their scores; and a whole one on the point mass, at night."""
+
+import argparse
+import csv
+import math
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from mjx_dher import envs
+from mjx_dher.spec import GENERATORS, PRIORITIES, SAMPLERS, validate
+
+
+@pytest.fixture
+def bakeoff(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import bakeoff
+
+    return bakeoff
+
+
+@pytest.fixture
+def arms(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import bakeoff_arms
+
+    return bakeoff_arms
+
+
+@pytest.fixture
+def report(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import bakeoff_report
+
+    return bakeoff_report
+
+
+def test_every_arm_is_a_run_of_every_task_and_learner(arms):
+    for learner in arms.LEARNERS:
+        for task in arms.TASKS:
+            specs = {arm.name: arms.spec_of(learner, task, arm) for arm in arms.ARMS}
+            for spec in specs.values():
+                validate(spec, envs.list_envs())
+            assert len(set(specs.values())) == len(arms.ARMS) >= 13
+            assert {arm.group for arm in arms.ARMS} == set(arms.GROUPS)
+            for group in arms.GROUPS:  # one program each
+                assert len({specs[arm.name].program for arm in arms.ARMS if arm.group == group}) == 1
+    built_in = {arm.parts.get("priority") for arm in arms.ARMS} | {arm.parts.get("generator") for arm in arms.ARMS}
+    assert {*PRIORITIES, *GENERATORS} - {"eventful", "reset"} <= built_in
+    assert "next_future" in SAMPLERS
+
+
+def test_the_plan_fits_into_two_hours(arms):
+    assert 60 < arms.estimated_minutes(arms.LEARNERS, arms.TASKS, arms.ARMS, 10) < 110
+
+
+def scores(report, areas, first=0):
+    areas = np.asarray(areas, float)
+    seeds = tuple(range(first, first + len(areas)))
+    return report.Scores(seeds, areas, areas, np.where(areas > 0.5, 1000.0, np.inf), 0)
+
+
+def test_arms_are_compared_seed_by_seed(report):
+    base = np.linspace(0.3, 0.6, 10)
+    ahead = base + np.linspace(0.01, 0.05, 10)
+    alike = base + np.tile([0.01, -0.01], 5)
+    rows = report.compare(
+        "paper", "push", {"future": scores(report, base), "energy": scores(report, ahead), "hgg": scores(report, alike)}
+    )
+    future, energy, hgg = rows
+    assert math.isnan(future.difference)
+    assert math.isnan(future.p_corrected)
+    np.testing.assert_allclose([energy.difference, hgg.difference], [0.03, 0.0], atol=1e-12)
+    assert energy.p_value == 2 / 1024
+    assert energy.p_corrected == 2 * 2 / 1024
+    assert hgg.p_corrected == hgg.p_value > 0.5
+    assert energy.low > 0.02 > hgg.low
+    assert energy.steps_to_threshold == np.median(np.where(ahead > 0.5, 1000.0, np.inf))
+
+
+def test_only_seeds_that_both_have_are_paired(report):
+    base, other = scores(report, [0.1, 0.2, 0.3]), scores(report, [0.5, 0.6, 0.7], first=1)
+    _, row = report.compare("best", "slide", {"future": base, "dpp": other})
+    np.testing.assert_allclose(row.difference, np.mean([0.5 - 0.2, 0.6 - 0.3]))
+
+
+def test_the_smallest_effect_of_ten_seeds_is_that_of_ten_equal_signs(report):
+    """With 13 tests p must be 2/1024: all ten differences have one sign, with probability Phi(x)^10 = 0.8."""
+    from scipy.stats import norm
+
+    by_hand = norm.ppf(0.8**0.1)
+    assert abs(report.smallest_effect(1.0, 10, 13) - by_hand) < 0.06
+    assert abs(report.smallest_effect(0.1, 10, 13) - 0.1 * by_hand) < 0.006
+    assert report.smallest_effect(1.0, 10, 1) < 1.1
+    assert math.isnan(report.smallest_effect(1.0, 5, 13))  # no five seeds have so small a p
+
+
+def test_forests_are_drawn(report, tmp_path):
+    rng = np.random.default_rng(0)
+    given = {name: scores(report, rng.uniform(size=4)) for name in ("future", "energy", "archer")}
+    rows = [row for learner in ("paper", "best") for row in report.compare(learner, "push", given)]
+    report.forest(rows, tmp_path / "forest.png")
+    assert (tmp_path / "forest.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--seeds", "0"], "--seeds must lie between 1 and 1000"),
+        (["--seeds", str(10**20)], "--seeds must lie between"),
+        (["--first-seed", "-1"], "--first-seed must lie"),
+        (["--minutes", "nan"], "--minutes must be more than 0"),
+        (["--arms", "energi"], "invalid choice"),
+    ],
+)
+def test_wrong_arguments_are_refused(bakeoff, capsys, argv, message):
+    with pytest.raises(SystemExit) as ended:
+        bakeoff.parse(["--out", "x", *argv])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_plan_trains_nothing(bakeoff, tmp_path, capsys):
+    assert bakeoff.main(["--out", str(tmp_path / "b"), "--plan", "--arms", "energy", "--seeds", "3"]) == 0
+    text = capsys.readouterr().out
+    assert "best-slide: 6 runs" in text
+    assert "minutes of one H200" in text
+    assert not (tmp_path / "b").exists()
+
+
+def test_nothing_to_report_is_said(bakeoff, tmp_path, capsys):
+    assert bakeoff.main(["--out", str(tmp_path / "b"), "--report", "--toy"]) == 0
+    assert "nothing can be compared yet" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_bakeoff_stops_and_goes_on_and_reports(bakeoff, tmp_path):
+    argv = ["--out", str(tmp_path), "--toy", "--seeds", "2", "--lanes", "10"]
+    assert bakeoff.main([*argv, "--minutes", "0.02"]) == 3
+    assert bakeoff.main(argv) == 0
+    with (tmp_path / "bakeoff.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["arm"] for row in rows] == [arm.name for arm in bakeoff.ARMS]
+    assert {row["seeds"] for row in rows} == {"2"}
+    assert {row["failed"] for row in rows} == {"0"}
+    done = bakeoff.parse(argv)
+    assert isinstance(done, argparse.Namespace)
+    assert bakeoff.main(argv) == 0  # nothing is left, and it says the same

@@ -1,0 +1,238 @@
+"""Goal generators, priorities of transitions and learned distances in the training loop, and what of own ones is refused."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_trainer import SMALL
+
+from mjx_dher import HParams, RunSpec, generators, learners, make_train, priorities, replay, samplers, testing
+from mjx_dher.methods import goals, metrics
+from mjx_dher.priorities import Priority
+from mjx_dher.rollout import rollout
+from mjx_dher.runs import identity
+from mjx_dher.runs.loop import state_template
+from mjx_dher.scores import LearnedMetric
+from mjx_dher.spec import GENERATORS, METRICS, PRIORITIES, SAMPLERS
+from mjx_dher.testing import PartError
+from mjx_dher.view import View
+from point_mass import PointMass
+
+ENV = PointMass()
+VIEW = View(ENV.compute_reward, HParams())
+
+
+class WithoutGoals(PointMass):
+    """A task whose goals cannot be set."""
+
+    with_goal = None
+
+
+def corner(key, obs, ring, view):
+    """All of them to one corner."""
+    return jnp.full_like(obs["desired_goal"], 0.3)
+
+
+def first_of(env=ENV, number=5):
+    return jax.vmap(env.reset)(jax.random.split(jax.random.key(0), number))
+
+
+def test_a_rollout_is_played_for_the_goals_that_are_given():
+    actions = jnp.zeros((ENV.episode_length, 5, 2))
+    episodes, outcome = rollout(
+        ENV, lambda action, obs: action, jax.random.key(0), 5, actions, lambda obs: corner(0, obs, 0, 0)
+    )
+    np.testing.assert_allclose(episodes.desired_goal, 0.3)
+    np.testing.assert_allclose(episodes.achieved_goal[:, 0], first_of().obs["achieved_goal"])
+    assert outcome.valid.all()
+
+
+def test_a_goal_that_is_not_finite_leaves_the_reset_s():
+    first = first_of()
+    own = first.obs["desired_goal"]
+    some = generators.Generator(lambda key, obs, ring, view: own.at[1, 0].set(jnp.nan).at[0].set(0.1).at[2, 1].set(jnp.inf))
+    found = generators.goals_of(some, jax.random.key(0), first.obs, None, VIEW)
+    np.testing.assert_array_equal(found, own.at[0].set(0.1))
+
+
+@pytest.mark.parametrize(
+    ("gives", "generate"),
+    [
+        ("float32[5]", lambda key, obs, ring, view: obs["desired_goal"][:, 0]),
+        ("int32[5, 2]", lambda key, obs, ring, view: jnp.ones((5, 2), jnp.int32)),
+        ("a list", lambda key, obs, ring, view: [0.1, 0.2]),
+    ],
+)
+def test_goals_of_the_wrong_shape_are_refused(gives, generate):
+    with pytest.raises(ValueError, match=r"goals \[N, G\] = \[5, 2\]") as error:
+        generators.goals_of(generators.Generator(generate), jax.random.key(0), first_of().obs, None, VIEW)
+    assert gives in str(error.value)
+
+
+def test_make_takes_a_name_a_place_or_a_function():
+    assert generators.make("reset") is generators.reset
+    assert generators.make("mjx_dher.methods.goals:hgg") is generators.make("hgg") is goals.hgg
+    assert generators.make(corner).generate is corner
+    for wrong in ("hggg", "mjx_dher.generators:rset", lambda obs: obs, 3):
+        with pytest.raises(ValueError, match="generator"):
+            generators.make(wrong)
+
+
+def test_a_generator_needs_an_environment_that_takes_goals():
+    with pytest.raises(ValueError, match="with_goal"):
+        make_train(WithoutGoals(), SMALL, generator=corner)
+    make_train(WithoutGoals(), SMALL)
+
+
+def test_what_asks_the_learner_needs_one_that_answers():
+    made = learners.make("ddpg", SMALL, learners.Sizes(2, 2, 2))
+    silent = dataclasses.make_dataclass("Silent", [])()
+    for name in (method for method in vars(learners.Learner) if not method.startswith("_")):
+        object.__setattr__(silent, name, getattr(made, name))
+    parts = (
+        {"priority": priorities.make("td_error")},
+        {"generator": "hgg"},
+        {"sampler": samplers.make("closest", metric="time_to_goal")},
+    )
+    for part in parts:
+        with pytest.raises(ValueError, match="value"):
+            make_train(ENV, SMALL, learner=silent, **part)
+        make_train(ENV, SMALL, **part)
+
+
+def test_what_is_half_a_priority_is_refused():
+    for wrong, message in (
+        (Priority(), "none of them"),
+        (Priority(renew=lambda ring: 1.0), "renew must be a function"),
+        (Priority(choose=lambda key: 1), "choose must be a function"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            priorities.make(wrong)
+    ring = testing.views.ring_of(testing.trial.random_episodes(ENV))
+    with pytest.raises(ValueError, match=r"weights \[E\] = \[32\]; this one gives \[2\]"):
+        priorities.renewed(Priority(renew=lambda ring, view: jnp.ones(2)), ring, VIEW)
+    nan = priorities.renewed(Priority(renew=lambda ring, view: jnp.full(32, jnp.nan)), ring, VIEW)
+    np.testing.assert_array_equal(nan.priority, 0)
+    for wrong in (
+        lambda key, sample, batch, number, view: jnp.zeros(number),
+        lambda key, sample, batch, number, view: jnp.arange(2),
+    ):
+        with pytest.raises(ValueError, match=r"choose gives indices \[B\]"):
+            priorities.chosen(Priority(choose=wrong), jax.random.key(0), *_candidates(ring), 4, VIEW)
+
+
+def _candidates(ring):
+    sample = replay.sample(ring, jax.random.key(0), 16)
+    from mjx_dher.relabel import relabel
+
+    return sample, relabel(ring, sample, samplers.make("future"), ENV.compute_reward, HParams(), jax.random.key(1))
+
+
+def test_a_score_of_the_wrong_kind_is_refused():
+    sampler = samplers.make("weighted", metric=LearnedMetric(lambda episode, view: jnp.zeros(3)))
+    program = make_train(ENV, SMALL, sampler=sampler)
+    with pytest.raises(ValueError, match=r"score gives numbers \[T\+1\] = \[11\]"):
+        jax.eval_shape(program.epoch, state_template(program))
+    with pytest.raises(ValueError, match="cross_episode"):
+        samplers.make(samplers.Sampler(lambda *five: five[0], True, metrics.time_to_goal.score))
+
+
+def test_trials_name_what_is_wrong():
+    episodes = testing.trial.random_episodes(ENV)
+    for wrong, message in (
+        (lambda key, obs, ring, view: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
+        (lambda key, obs, ring, view: jnp.full((16, 2), jnp.nan), "no goal is finite"),
+        (lambda key, obs, ring, view: 1 / 0, "ZeroDivisionError"),
+    ):
+        with pytest.raises(PartError, match=message):
+            testing.check_generator(wrong, ENV, None, episodes)
+    with pytest.raises(PartError, match="with_goal"):
+        testing.check_generator(corner, WithoutGoals())
+    assert "100% of the goals" in testing.check_generator(corner, ENV, None, episodes)
+    with pytest.raises(PartError, match="negative"):
+        testing.check_priority(Priority(renew=lambda ring, view: -ring.priority - 1.0), ENV, None, episodes)
+    with pytest.raises(PartError, match="indices"):
+        testing.check_priority(
+            Priority(choose=lambda key, sample, batch, number, view: 99 + jnp.arange(number)), ENV, None, episodes
+        )
+    with pytest.raises(PartError, match="negative"):
+        testing.check_metric(LearnedMetric(lambda episode, view: -jnp.ones(11)), ENV, episodes)
+
+
+def test_built_in_parts_pass_their_trials():
+    episodes = testing.trial.random_episodes(ENV)
+    assert "chosen" in testing.check_priority("td_error", ENV, None, episodes)
+    assert "goals of the past never" in testing.check_sampler(
+        samplers.make("weighted", metric="time_to_goal"), ENV, None, episodes
+    )
+
+
+def test_a_task_that_changes_more_than_the_goal_is_named():
+    class Moves(PointMass):
+        def with_goal(self, state, goal):
+            return self._state(state.obs["achieved_goal"] + 0.1, goal)
+
+    class Ignores(PointMass):
+        def with_goal(self, state, goal):
+            return state
+
+    with pytest.raises(testing.EnvError, match="changed observation"):
+        testing.check_env(Moves())
+    with pytest.raises(testing.EnvError, match="handed in"):
+        testing.check_env(Ignores())
+
+
+def test_every_part_by_name_shares_a_program_with_its_kind():
+    base = RunSpec()
+    shared = {
+        **{("sampler", name): base for name in SAMPLERS},
+        **{("metric", name): base for name in METRICS},
+        **{("generator", name): base for name in GENERATORS},
+    }
+    for (field, name), other in shared.items():
+        assert dataclasses.replace(base, **{field: name}).program == other.program, name
+    kinds = {dataclasses.replace(base, priority=name).program for name in PRIORITIES}
+    assert len(kinds) == 2
+    assert dataclasses.replace(base, priority="my:own").program not in kinds
+
+
+def test_settings_that_are_new_change_no_name_of_a_trial():
+    """As version 0.1.0 had it; tests/test_identity.py has more of them."""
+    assert not {"generator", "hindsight_reward"} & set(identity.identity(RunSpec(), "native", {}))
+    named = {identity.trial_name(RunSpec(generator=name)) for name in GENERATORS}
+    assert len(named) == len(GENERATORS)
+    assert identity.trial_name(RunSpec(hparams=HParams(hindsight_reward=0.5))) != identity.trial_name(RunSpec())
+
+
+@pytest.mark.slow
+def test_lanes_learn_as_runs_alone_do():
+    """A priority and a generator that share a program with others compute what they compute alone."""
+    kinds = [("eventful", "reset"), ("energy", "hgg"), ("max_entropy", "reset")]
+    hparams = HParams(priority_fraction=0.5)
+
+    def finish(program, key, numbers):
+        state = program.init(key, numbers)
+        for _ in range(2):
+            state, _ = program.epoch(state)
+        return state.learner.params
+
+    from mjx_dher.runs.program import Lane
+
+    names = list(dict.fromkeys(name for name, _ in kinds)), ["reset", "hgg"]
+    together = make_train(
+        ENV,
+        SMALL,
+        priority=priorities.one_of(map(priorities.make, names[0])),
+        generator=generators.one_of(map(generators.make, names[1])),
+    )
+    lanes = [Lane(*hparams, 0, names[0].index(p), names[1].index(g)) for p, g in kinds]
+    stacked = jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *lanes)
+    keys = jnp.stack([jax.random.key(3)] * 3)
+    joined = jax.jit(jax.vmap(lambda key, numbers: finish(together, key, numbers)))(keys, stacked)
+    for lane, (priority, generator) in enumerate(kinds):
+        alone = make_train(ENV, SMALL, priority=priorities.make(priority), generator=generators.make(generator))
+        params = jax.jit(lambda key, program=alone: finish(program, key, hparams))(jax.random.key(3))
+        for a, b in zip(jax.tree.leaves(joined), jax.tree.leaves(params), strict=True):
+            np.testing.assert_allclose(a[lane], b, rtol=1e-3, atol=1e-4)
