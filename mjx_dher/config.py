@@ -93,7 +93,8 @@ class Config:
 class HParams(NamedTuple):
     """Numbers of the algorithm: a pytree, traced, so that a sweep over numbers compiles once.
 
-    The defaults are those of the original HER code line (Plappert et al. 2018, arXiv 1802.09464) and of the paper.
+    The defaults are those of the HER code line (Plappert et al. 2018, arXiv 1802.09464; openai/baselines). docs/results.md
+    says which of them the paper names: actor_lr, critic_lr, random_eps and noise_std.
     """
 
     actor_lr: Share = 1e-3
@@ -102,6 +103,9 @@ class HParams(NamedTuple):
     """Adam's step size (learning rate) for the critic."""
     lr_end: Share = 1.0
     """Fraction of both step sizes that is left at the end of the run, reached linearly; 1 (constant) in the paper."""
+    adam_eps: Annotated[float, Number("(0, 1]")] = 1e-8
+    """Number that Adam adds to the root of the second moments. The gradients of W workers summed, not averaged, are the same
+    as this divided by W."""
     gamma: Annotated[float, Number("[0, 1)")] = 0.98
     """Discount; target values are clipped to [-1/(1-gamma), 0]."""
     polyak: Share = 0.95
@@ -112,6 +116,8 @@ class HParams(NamedTuple):
     """Probability of a uniformly random action while exploring."""
     noise_std: Annotated[float, Number("[0, inf)"), ReadBy("ddpg", "td3", "dtqc")] = 0.2
     """Standard deviation of the Gaussian noise on the other actions; a learner that draws its actions needs none."""
+    random_noise: Annotated[float, Number("[0, 1]"), ReadBy("ddpg", "td3", "dtqc")] = 0.0
+    """Noise on the random actions, too, as a fraction of noise_std; actions are clipped to [-1, 1] after it."""
     her_k: NotNegative = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
     priority_fraction: Share = 0.0
@@ -120,6 +126,8 @@ class HParams(NamedTuple):
     """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
     temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0
     """Evenness of the weights, for weighted: the larger, the more even (infinite: the same as future)."""
+    weight_scale: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 0.05
+    """Distance that counts as 1, in metres, for weighted with weight_normalization none."""
     target_noise: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.2
     """Standard deviation of the Gaussian noise on the actions of targets, which smooths these."""
     target_noise_clip: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.5

@@ -13,14 +13,28 @@ from jax.typing import DTypeLike
 
 from mjx_dher import names
 from mjx_dher.spec import NETWORKS
-from mjx_dher.types import Array, Sizes
+from mjx_dher.types import Array, PRNGKey, Sizes
 
 
-def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, layer_norm: bool = False) -> Array:
+def _mlp(
+    x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, layer_norm: bool = False, fan_in: bool = False
+) -> Array:
     for size in hidden_sizes:
-        x = nn.Dense(size, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x)
+        x = nn.Dense(size, dtype=dtype, **_initializers(x, fan_in))(x)
         x = nn.relu(nn.LayerNorm(dtype=dtype)(x) if layer_norm else x)
-    return nn.Dense(output_size, dtype=jnp.float32, kernel_init=nn.initializers.xavier_uniform())(x)
+    return nn.Dense(output_size, dtype=jnp.float32, **_initializers(x, fan_in))(x)
+
+
+def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:
+    """Returns the initializers of a layer that takes `x` [..., I]: Xavier's and no bias, or all in +-1/sqrt(I)."""
+    if not fan_in:
+        return {"kernel_init": nn.initializers.xavier_uniform()}
+    bound = x.shape[-1] ** -0.5
+
+    def uniform(key: PRNGKey, shape: Sequence[int], dtype: DTypeLike = jnp.float32) -> Array:
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return {"kernel_init": uniform, "bias_init": uniform}
 
 
 class Actor(nn.Module):
@@ -29,12 +43,13 @@ class Actor(nn.Module):
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
+    fan_in: bool = False  # see the function of that name
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> Array:
         """Maps observations [..., D] and goals [..., G] to actions [..., A]."""
         inputs = jnp.concatenate([observation, goal], axis=-1)
-        return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype))
+        return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype, fan_in=self.fan_in))
 
 
 class GaussianActor(nn.Module):
@@ -43,12 +58,13 @@ class GaussianActor(nn.Module):
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
+    fan_in: bool = False  # see the function of that name
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> tuple[Array, Array]:
         """Maps observations [..., D] and goals [..., G] to means [..., A] and log standard deviations [..., A]."""
         inputs = jnp.concatenate([observation, goal], axis=-1)
-        outputs = _mlp(inputs, self.hidden_sizes, 2 * self.action_size, self.dtype)
+        outputs = _mlp(inputs, self.hidden_sizes, 2 * self.action_size, self.dtype, fan_in=self.fan_in)
         return outputs[..., : self.action_size], outputs[..., self.action_size :]
 
 
@@ -59,12 +75,13 @@ class Critic(nn.Module):
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
     layer_norm: bool = False  # before each ReLU
     size: int | None = None  # M, numbers that it gives; one, without an axis, where None
+    fan_in: bool = False  # see the function of that name
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array, action: Array) -> Array:
         """Maps observations [..., D], goals [..., G] and actions [..., A] to values [...] or [..., M]."""
         inputs = jnp.concatenate([observation, goal, action], axis=-1)
-        values = _mlp(inputs, self.hidden_sizes, self.size or 1, self.dtype, self.layer_norm)
+        values = _mlp(inputs, self.hidden_sizes, self.size or 1, self.dtype, self.layer_norm, self.fan_in)
         return values[..., 0] if self.size is None else values
 
 
@@ -104,6 +121,16 @@ def layer_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike
     """
     networks = mlp(action_size, hidden_sizes, dtype, heads)
     return networks._replace(critic=networks.critic.clone(layer_norm=True))
+
+
+def fan_in(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
+    """Makes the default networks with first weights and biases uniform in +-1/sqrt(inputs of the layer).
+
+    So PyTorch's linear layers begin, and with them the code line that the paper's numbers are those of. Xavier's bound,
+    sqrt(6 / (inputs + outputs)), is 1.7 times that in a layer of as many outputs as inputs, and its biases are 0.
+    """
+    networks = mlp(action_size, hidden_sizes, dtype, heads)
+    return Networks(actor=networks.actor.clone(fan_in=True), critic=networks.critic.clone(fan_in=True))
 
 
 def make(name: str | NetworksFn) -> NetworksFn:

@@ -31,8 +31,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
 
     `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
     warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
-    Replay": its workers' episodes are rolled out side by side, and their averaged gradients are one gradient of the joint
-    batch.
+    Replay", and where that is silent, of the code that its numbers are those of (docs/results.md has a table): its workers'
+    episodes are rolled out side by side, and the gradient of the joint batch stands for the sum of theirs.
 
     Args:
       name: the preset.
@@ -50,7 +50,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
         best = _DDPG._replace(learner=str(learner))
     setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "paper": _paper}[name]
     config, hparams = setup(env)
-    return RunSpec(env=env, config=config, hparams=hparams, learner=best.learner, networks=networks or best.networks, **changes)
+    networks = networks or ("fan_in" if name == "paper" else best.networks)
+    return RunSpec(env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **changes)
 
 
 def _cpu(env: str) -> tuple[Config, HParams]:
@@ -91,15 +92,19 @@ def _gpu(env: str) -> tuple[Config, HParams]:
 def _paper(env: str) -> tuple[Config, HParams]:
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
+    total_steps = epochs * 50 * 2 * workers * 50
     config = Config(
         num_envs=2 * workers,
         cycles_per_epoch=50,
         updates_per_cycle=40,
         target_period=40,
         batch_size=256 * workers,
-        total_steps=epochs * 50 * 2 * workers * 50,
+        total_steps=total_steps,
+        # Each worker has a ring of a million; they never hold more than is played.
+        replay_size=min(1_000_000 * workers, total_steps),
     )
-    return config, HParams()
+    # Adam sees the workers' gradients summed: the mean gradient, with its number to add divided by their number, is the same.
+    return config, HParams(random_noise=1.0, adam_eps=1e-8 / workers)
 
 
 def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:

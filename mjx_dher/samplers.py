@@ -20,10 +20,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import names
+from mjx_dher import names, readings
 from mjx_dher.config import HParams
+from mjx_dher.readings import NormalizationFn
 from mjx_dher.scores import LearnedMetric, ScoreFn, make_metric, score_of
-from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS
+from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from mjx_dher.types import Array, Episode, PRNGKey
 from mjx_dher.view import pick
 
@@ -138,13 +139,14 @@ def weighted(
     hparams: HParams,
     kernel: KernelFn,
     metric: MetricFn = position,
+    normalization: NormalizationFn = readings.by_mean,
 ) -> Array:
     """Prefers future goals that are nearer to the desired goal (the paper's method 3).
 
-    The weight of a candidate depends on its *normalized distance*: its distance to the goal that the episode was played
-    for, divided by the mean of that distance over the candidates of the same transition,
+    The weight of a candidate depends on its relative distance r, which `normalization` makes of d = metric(achieved, desired)
+    over the candidates of the same transition, those after its step. By default it is
 
-        r_i = d_i / mean_j d_j,   d_i = metric(achieved_i, desired),   i, j in step+1 ... T,
+        r_i = d_i / mean_j d_j,
 
     so weights do not depend on the scale of the task, and equal distances (r_i = 1 for all) give `future` exactly. With
     temperature tau the kernels are, in r,
@@ -153,20 +155,25 @@ def weighted(
         inverse   w = r^(-1/tau)
         softmax   w = exp(-(r - 1) / tau)
 
-    They agree to first order around the mean distance and differ in what they do far from it: `inverse` all but always
-    takes a candidate that lies on the goal, `linear` at tau = 1 never makes one more than twice as likely as one at the mean
-    distance and drops those beyond twice the mean. `linear` at tau = 1 is the default: the plainest reading of the paper's
-    words, with no number to tune and no single candidate able to crowd out the others. (Normalizing by the *sum* of
-    the n candidates' distances, w = 1 - d_i / sum_j d_j, is this linear kernel at tau = n - 1: for most transitions
-    all but uniform.)
+    They agree to first order around r = 1 and differ in what they do far from it: `inverse` all but always takes a
+    candidate that lies on the goal, `linear` at tau = 1 never makes one more than twice as likely as one at the mean
+    distance and drops those beyond twice the mean. The paper gives no formula: this is one reading of its words, with no
+    number to tune and no single candidate able to crowd out the others. `readings` has others, and docs/samplers.md says
+    how they differ.
+
+    Where `linear` leaves no candidate a weight, the nearest has it, as it has in the limit of a small temperature.
     """
     mask = future_mask(achieved.shape[0], step)
     distance = jnp.where(mask, distances(metric, achieved, desired), 0.0)
-    mean = jnp.sum(distance) / jnp.sum(mask, dtype=distance.dtype)
-    # Where every candidate lies on the goal, all are equally near.
-    relative = jnp.where(mask & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
+    relative = normalization(distance, mask, hparams.weight_scale)
+    relative = _checked("a normalization gives relative distances", normalization, relative, mask.size)
     log_weights = _checked("a kernel gives log weights", kernel, kernel(relative, hparams.temperature), mask.size)
-    return jnp.where(mask, log_weights, -jnp.inf)
+    log_weights = jnp.where(mask, log_weights, -jnp.inf)
+    if kernel is not linear or normalization in (readings.by_mean, readings.mirrored):
+        return log_weights  # by the mean, some candidate has r <= 1, and a weight
+    beyond = jnp.all(log_weights == -jnp.inf)
+    relative = jnp.where(mask, relative, jnp.inf)
+    return jnp.where(beyond, _uniform(relative == jnp.min(relative)), log_weights)
 
 
 def linear(relative: Array, temperature: Array | float) -> Array:
@@ -192,7 +199,12 @@ _PLAIN: dict[str, Sampler] = {
 }
 
 
-def make(name: str | Sampler | LogWeightsFn, kernel: str | KernelFn = "linear", metric: str | MetricFn = "position") -> Sampler:
+def make(
+    name: str | Sampler | LogWeightsFn,
+    kernel: str | KernelFn = "linear",
+    metric: str | MetricFn = "position",
+    normalization: str | NormalizationFn = "mean",
+) -> Sampler:
     """Makes the sampler called `name`.
 
     Args:
@@ -202,20 +214,24 @@ def make(name: str | Sampler | LogWeightsFn, kernel: str | KernelFn = "linear", 
         temperature []) -> log weight [T+1].
       metric: for closest, epsilon_closest and weighted: position, "module:attribute", or a function (achieved [T+1, G],
         desired [G]) -> distance [T+1].
+      normalization: for `weighted`: mean, sum, max, minmax, none, far, "module:attribute", or a function (distance [T+1],
+        candidates [T+1], scale []) -> relative distance [T+1].
 
     Raises:
-      ValueError: no such sampler, module, attribute, kernel or metric (the message names the nearest), or something that is no
-        sampler, kernel or metric.
+      ValueError: no such sampler, module, attribute, kernel, metric or normalization (the message names the nearest), or
+        something that is none.
     """
     if not isinstance(name, str):
         return _to_sampler(name)
     names.check_name("sampler", name, SAMPLERS, own=True)
     kernel = names.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
     distance = make_metric(metric)
+    parameters = ("distance", "candidates", "scale")
+    normalization = names.resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, parameters)
     by_distance: dict[str, LogWeightsFn] = {
         "closest": closest,
         "epsilon_closest": epsilon_closest,
-        "weighted": functools.partial(weighted, kernel=kernel),
+        "weighted": functools.partial(weighted, kernel=kernel, normalization=normalization),
     }
     if name in by_distance:
         return _by_metric(by_distance[name], distance)

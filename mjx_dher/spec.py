@@ -18,6 +18,17 @@ SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest"
 SAMPLERS_ELSEWHERE = {"next_future": "mjx_dher.methods.goals:next_future"}  # the others are in mjx_dher.samplers
 # Parts by name, and where they are; an own one is named by its place alone.
 WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
+WEIGHT_NORMALIZATIONS = {
+    name: f"mjx_dher.readings:{function}"
+    for name, function in {
+        "mean": "by_mean",
+        "sum": "by_sum",
+        "max": "by_max",
+        "minmax": "by_range",
+        "none": "by_scale",
+        "far": "mirrored",
+    }.items()
+}
 METRICS = {
     "position": "mjx_dher.samplers:position",
     **{
@@ -40,7 +51,7 @@ LEARNERS = {
     "dtqc": "mjx_dher.learners.tqc:make_deterministic",
 }
 Argument = bool | int | float | str  # of an environment's constructor
-NETWORKS = {name: f"mjx_dher.networks:{name}" for name in ("mlp", "layer_norm")}
+NETWORKS = {name: f"mjx_dher.networks:{name}" for name in ("mlp", "layer_norm", "fan_in")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +69,9 @@ class RunSpec:
     module:attribute."""
     weight_kernel: Annotated[str, ReadBy("weighted")] = "linear"
     """Fall of the weights with distance, for the sampler weighted: linear, inverse or softmax, or module:attribute."""
+    weight_normalization: Annotated[str, ReadBy("weighted")] = "mean"
+    """Normalization of distances, for the sampler weighted: mean, sum, max, minmax, none (by weight_scale, in metres) or far
+    (the weights rise with distance), or module:attribute."""
     metric: Annotated[str, ReadBy("closest", "epsilon_closest", "weighted")] = "position"
     """Distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by: position, velocity,
     resting_point, resting_point_rough or time_to_goal, or module:attribute."""
@@ -70,7 +84,8 @@ class RunSpec:
     learner: str = "ddpg"
     """Learner: ddpg, td3, sac, redq, tqc, dtqc (tqc with a deterministic actor), or module:attribute."""
     networks: str = "mlp"
-    """Networks of the learner: mlp, layer_norm (in its critics), or module:attribute."""
+    """Networks of the learner: mlp, layer_norm (in its critics), fan_in (mlp that begins as PyTorch's), or
+    module:attribute."""
     seed: int = 0
     """Random seed."""
     config: Config = dataclasses.field(default_factory=Config)
@@ -88,22 +103,25 @@ class RunSpec:
         return to_arguments(self.env_kwargs)
 
     @property
-    def sampler_choice(self) -> tuple[str, str, str]:
+    def sampler_choice(self) -> tuple[str, str, str, str]:
         """Arguments of `samplers.make`."""
-        return self.sampler, self.weight_kernel, self.metric
+        return self.sampler, self.weight_kernel, self.metric, self.weight_normalization
 
     @property
     def program(self) -> RunSpec:
         """Description of the compiled program that the run can share: all that its lanes must agree in."""
         alike = next((own[0] for own in map(list, _PRIORITIES_OF_LANES) if self.priority in own), self.priority)
         shared = dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0)
-        return dataclasses.replace(shared, priority=alike, generator="reset", hparams=HParams())
+        return dataclasses.replace(
+            shared, weight_normalization="mean", priority=alike, generator="reset", hparams=HParams()
+        )
 
 
 _PRIORITIES_OF_LANES = (EPISODE_PRIORITIES, TRANSITION_PRIORITIES)
 PARTS = {  # by field, the names that are built in; each field takes module:attribute, too
     "sampler": SAMPLERS,
     "weight_kernel": WEIGHT_KERNELS,
+    "weight_normalization": WEIGHT_NORMALIZATIONS,
     "metric": METRICS,
     "priority": PRIORITIES,
     "generator": GENERATORS,
@@ -157,11 +175,13 @@ def read_by() -> dict[str, ReadBy]:
     return {name: parts for owner in (RunSpec, Config, HParams) for name, parts in config_lib.metadata(owner, ReadBy).items()}
 
 
-def reads(sampler: str, learner: str, field: str) -> bool:
-    """Returns whether a setting makes a difference to runs with this sampler and learner.
+def reads(sampler: str, learner: str, field: str, normalization: str = "none") -> bool:
+    """Returns whether a setting makes a difference to runs with this sampler, learner and `weight_normalization`.
 
-    A sampler, or learner, of one's own may read any setting that some sampler, or learner, reads.
+    A sampler, learner or normalization of one's own may read any setting that some sampler, learner or normalization reads.
     """
+    if field == "weight_scale" and sampler in SAMPLERS and normalization in WEIGHT_NORMALIZATIONS and normalization != "none":
+        return False
     parts = read_by().get(field)
     if parts is None:
         return True

@@ -4,6 +4,7 @@ import dataclasses
 import pytest
 
 from mjx_dher import config, envs, presets, spec
+from mjx_dher.cli import train as cli_train
 from mjx_dher.config import Config, HParams, Number
 from mjx_dher.spec import RunSpec
 
@@ -17,12 +18,32 @@ def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
     assert (run.env, c.num_envs, c.batch_size) == (env, 2 * workers, 256 * workers)
     assert (c.cycles_per_epoch, c.updates_per_cycle, c.target_period) == (50, 40, 40)
     assert config.num_epochs(c, 50) == epochs
-    assert c.replay_size == 1_000_000
-    assert c.hidden_sizes == (256, 256, 256)
+    assert c.replay_size == c.total_steps <= workers * 1_000_000  # a ring of a million for each worker
+    assert (c.hidden_sizes, run.networks, run.learner) == ((256, 256, 256), "fan_in", "ddpg")
     assert (h.actor_lr, h.critic_lr, h.gamma, h.polyak, h.action_l2) == (1e-3, 1e-3, 0.98, 0.95, 1.0)
-    assert (h.random_eps, h.noise_std, h.her_k) == (0.3, 0.2, 4.0)
+    assert (h.random_eps, h.noise_std, h.random_noise, h.her_k) == (0.3, 0.2, 1.0, 4.0)
+    assert h.adam_eps == 1e-8 / workers  # gradients summed over the workers
     assert (h.priority_fraction, h.lr_end) == (0.0, 1.0)  # what the paper does not have is off
     assert (h.obs_clip, h.norm_clip, h.norm_eps) == (200.0, 5.0, 0.01)
+
+
+def test_each_reading_of_the_paper_can_be_changed():
+    """By the options that docs/results.md names beside each."""
+    options = [
+        "--preset",
+        "paper",
+        "--replay-size",
+        "1000000",
+        "--networks",
+        "mlp",
+        "--random-noise",
+        "0",
+        "--adam-eps",
+        "1e-8",
+    ]
+    run = cli_train.parse_train_args([*options, "--env", "slide"]).spec
+    assert (run.config.replay_size, run.networks) == (1_000_000, "mlp")
+    assert run.hparams == HParams()
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)
@@ -42,6 +63,7 @@ BAD_PARTS = [
     ({"env": "pusj"}, "env must be one of pick_and_place, push, .*; got 'pusj' .did you mean 'push'"),
     ({"sampler": "wieghted"}, "sampler must be one of random, .*; got 'wieghted' .did you mean 'weighted'"),
     ({"weight_kernel": "cubic"}, "weight_kernel must be one of linear, inverse, softmax, .*; got 'cubic'"),
+    ({"weight_normalization": "meam"}, "weight_normalization must be one of mean, .*; got 'meam' .did you mean 'mean'"),
     ({"metric": "speed"}, "metric must be one of position, .*; got 'speed'"),
     ({"priority": "energetic"}, "priority must be one of eventful, .*; got 'energetic'"),
     ({"generator": "hg"}, r"generator must be one of reset, hgg.*; got 'hg' \(did you mean 'hgg'\?\)"),
@@ -149,6 +171,12 @@ def test_what_a_sampler_or_a_learner_reads():
     assert not spec.reads("mine:sampler", "sac", "noise_std")
     assert spec.reads("future", "mine:learner", "noise_std")
     assert not spec.reads("future", "mine:learner", "temperature")
+    assert not spec.reads("future", "ddpg", "weight_normalization")
+    assert spec.reads("weighted", "ddpg", "weight_scale", "none")
+    assert not spec.reads("weighted", "ddpg", "weight_scale", "mean")
+    assert not spec.reads("future", "ddpg", "weight_scale", "none")
+    assert spec.reads("weighted", "ddpg", "weight_scale", "mine:own")
+    assert spec.reads("mine:sampler", "ddpg", "weight_scale", "mean")
 
 
 def test_each_setting_is_read_by_parts_of_one_kind_that_exist():

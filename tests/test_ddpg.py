@@ -1,3 +1,5 @@
+import dataclasses
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from mjx_dher.config import HParams
 from mjx_dher.learners import common, ddpg
 from mjx_dher.learners.common import Params
 from mjx_dher.learners.ddpg import DDPG
-from mjx_dher.networks import Actor, Critic, Networks, mlp
+from mjx_dher.networks import Actor, Critic, Networks, fan_in, mlp
 from mjx_dher.types import Batch, Sizes
 from probes import BATCH, LinearActor
 
@@ -75,6 +77,23 @@ def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
     np.testing.assert_allclose(losses["q_mean"], -0.875, rtol=1e-6)
 
 
+def test_summed_gradients_are_averaged_ones_with_a_smaller_adam_eps(state):
+    """Of 8 workers: 8 times the gradient, by Adam with eps 1e-3, is the gradient, by Adam with eps 1e-3 / 8."""
+    summed = dataclasses.replace(LEARNER, compute_gradients=lambda *args: _times(8.0, *ddpg.compute_gradients(*args)))
+    of_sum, of_mean, of_default = state, state, state
+    for _ in range(5):
+        of_sum, _ = summed.update(of_sum, BATCH, HP._replace(adam_eps=1e-3))
+        of_mean, _ = LEARNER.update(of_mean, BATCH, HP._replace(adam_eps=1e-3 / 8))
+        of_default, _ = LEARNER.update(of_default, BATCH, HP._replace(adam_eps=1e-3))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), of_sum.params, of_mean.params)
+    moved = ravel_pytree(of_mean.params)[0] - ravel_pytree(of_default.params)[0]
+    assert float(jnp.abs(moved).max()) > 1e-6  # and not the same as with the larger one
+
+
+def _times(factor, gradients, losses):
+    return jax.tree.map(lambda x: factor * x, gradients), losses
+
+
 def test_update_normalizes_what_the_networks_see(state):
     state = LEARNER.update_normalizers(state, jnp.array([[-2.0], [6.0]]), jnp.array([[1.0], [1.0]]), HP)
     np.testing.assert_allclose(state.observation_norm.mean, [2.0])
@@ -128,6 +147,17 @@ def test_exploration_is_a_mixture_of_uniform_and_clipped_gaussian():
     np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), is_random)  # an action is random as a whole
 
 
+def test_random_actions_have_a_fraction_of_the_noise_and_stay_within_bounds():
+    """Without it, the same random actions; at 1, those and all of the noise, clipped."""
+    plain, whole, half = (make_noise(noise_std=0.2, random_noise=fraction) for fraction in (0.0, 1.0, 0.5))
+    for noise in (whole, half):
+        np.testing.assert_array_equal(noise.gaussian, plain.gaussian)
+        np.testing.assert_array_equal(noise.is_random, plain.is_random)
+    np.testing.assert_array_equal(whole.uniform, jnp.clip(plain.uniform + plain.gaussian, -1, 1))
+    np.testing.assert_allclose(half.uniform, jnp.clip(plain.uniform + 0.5 * plain.gaussian, -1, 1), atol=1e-7)
+    assert 0.01 < float(jnp.mean(jnp.abs(whole.uniform) == 1.0)) < 0.2
+
+
 def test_every_step_tosses_its_own_coin():
     is_random = np.asarray(make_noise(random_eps=0.3).is_random)
     assert abs(np.mean(is_random[1:] & is_random[:-1]) - 0.09) < 0.004
@@ -147,6 +177,21 @@ def test_paper_networks():
     assert kernels(actor_params) == [(28, 256), (256, 256), (256, 256), (256, 4)]
     assert kernels(critic_params) == [(32, 256), (256, 256), (256, 256), (256, 1)]
     assert float(jnp.abs(actor.apply(actor_params, obs + 1e6, goal)).max()) <= 1.0
+
+
+def test_fan_in_begins_as_pytorch_s_linear_layers_do():
+    """Weights and biases are uniform in +-1/sqrt(inputs); of those of `mlp` biases are 0 and weights Xavier's."""
+    obs, goal, action = jnp.zeros(25), jnp.zeros(3), jnp.zeros(4)
+    for networks, bound_of in ((fan_in, lambda i, o: i**-0.5), (mlp, lambda i, o: (6 / (i + o)) ** 0.5)):
+        made = networks(4, (256, 256, 256))
+        for params in (made.actor.init(jax.random.key(0), obs, goal), made.critic.init(jax.random.key(1), obs, goal, action)):
+            for layer in params["params"].values():
+                bound = bound_of(*layer["kernel"].shape)
+                assert 0.95 * bound < float(jnp.abs(layer["kernel"]).max()) <= bound
+                assert abs(float(layer["kernel"].std()) - bound / np.sqrt(3)) < 0.05 * bound
+                bias = float(jnp.abs(layer["bias"]).max())
+                assert bias == 0 if networks is mlp else 0 < bias <= bound
+    assert isinstance(made.actor, Actor)  # so that kernels and exported policies are what they are
 
 
 def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():

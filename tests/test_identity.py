@@ -97,6 +97,7 @@ EDITS = {
     ("engine",): "native",
     ("sampler",): "final",
     ("weight_kernel",): "softmax",
+    ("weight_normalization",): "sum",
     ("metric",): "mjx_dher.samplers:position",
     ("priority",): "mjx_dher.priorities:eventful",
     ("generator",): "mjx_dher.generators:reset",

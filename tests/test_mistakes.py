@@ -12,7 +12,16 @@ import mjx_dher
 from mjx_dher import Config, HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.rollout import rollout
 from mjx_dher.runs import driver
-from mjx_dher.testing import check_env, check_kernel, check_learner, check_metric, check_priority, check_sampler
+from mjx_dher.spec import WEIGHT_NORMALIZATIONS
+from mjx_dher.testing import (
+    check_env,
+    check_kernel,
+    check_learner,
+    check_metric,
+    check_normalization,
+    check_priority,
+    check_sampler,
+)
 from point_mass import PointMass, soon
 
 ENV = PointMass()
@@ -31,6 +40,7 @@ CHECKS = {
     "sampler": (mistakes.SAMPLERS, lambda part: check_sampler(part, ENV)),
     "metric": (mistakes.METRICS, lambda part: check_metric(part, ENV)),
     "weight_kernel": (mistakes.KERNELS, check_kernel),
+    "weight_normalization": (mistakes.NORMALIZATIONS, check_normalization),
     "priority": (mistakes.PRIORITY, lambda part: check_priority(part, ENV)),
     "learner": (mistakes.LEARNERS, lambda part: check_learner(part, ENV, SMALL)),
     "networks": (mistakes.NETWORKS, lambda part: check_learner("ddpg", ENV, SMALL, networks=part)),
@@ -52,6 +62,9 @@ def test_what_is_right_passes(capsys):
         check_sampler(name, ENV)
     for kernel in ("linear", "inverse", "softmax"):
         check_kernel(kernel)
+    for normalization in WEIGHT_NORMALIZATIONS:
+        check_normalization(normalization)
+    assert "0.0952 to 1.9 for distances" in check_normalization("mean")
     check_metric("position", ENV)
     check_priority("eventful", ENV)
     check_learner("ddpg", ENV, SMALL)
@@ -92,6 +105,7 @@ THROUGH = [
     ("metric", "without_axis", ["--sampler", "closest"]),
     ("metric", "similarity", []),  # no sampler reads it, but it was handed in
     ("weight_kernel", "pole", ["--sampler", "weighted"]),
+    ("weight_normalization", "by_least", ["--sampler", "weighted"]),
     ("priority", "negative", []),
     ("learner", "unbounded", []),
     ("networks", "swapped", []),

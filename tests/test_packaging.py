@@ -19,7 +19,7 @@ LAYERS = [
     "hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
     "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
-    "spec view policy evaluate hopper.kernels envs.engines.native envs.engines.mjx tools.render",
+    "spec view policy evaluate readings hopper.kernels envs.engines.native envs.engines.mjx tools.render",
     "scores presets networks priorities generators runs.identity runs.health testing.env",
     "samplers envs.engines.simulator envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
     "methods.metrics methods.goals",

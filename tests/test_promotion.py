@@ -11,10 +11,10 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import envs, generators, make_train, priorities, replay, samplers, spec
-from mjx_dher.learners import ddpg
+from mjx_dher.learners import common
 from mjx_dher.runs.loop import state_template
 from mjx_dher.runs.program import Lane
-from mjx_dher.spec import GENERATORS, METRICS, SAMPLERS, WEIGHT_KERNELS
+from mjx_dher.spec import GENERATORS, METRICS, SAMPLERS, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from point_mass import PointMass
 from probes import Explodes
 
@@ -22,13 +22,16 @@ from probes import Explodes
 @pytest.fixture(autouse=True)
 def strict(monkeypatch):
     """Optax's own arithmetic is exempt: Adam raises a float to the power of its count."""
-    update = ddpg._ADAM.update
+    adam = common.adam
 
-    def as_ever(*args):
-        with jax.numpy_dtype_promotion("standard"):
-            return update(*args)
+    def as_ever(hparams=None):
+        def update(*args):
+            with jax.numpy_dtype_promotion("standard"):
+                return adam(hparams).update(*args)
 
-    monkeypatch.setattr(ddpg, "_ADAM", ddpg._ADAM._replace(update=as_ever))
+        return adam(hparams)._replace(update=update)
+
+    monkeypatch.setattr(common, "adam", as_ever)
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):
         yield
 
@@ -58,6 +61,7 @@ def test_an_epoch_with_a_priority_of_one_s_own():
 
 def test_an_epoch_with_every_sampler_and_kernel_as_a_sweep_has_them():
     every = [*(samplers.make(name) for name in SAMPLERS), *(samplers.make("weighted", k) for k in WEIGHT_KERNELS)]
+    every += [samplers.make("weighted", normalization=n) for n in WEIGHT_NORMALIZATIONS]
     program = make_train(PointMass(), SMALL, sampler=samplers.one_of(every))
     lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)

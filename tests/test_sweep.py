@@ -65,6 +65,26 @@ def test_what_a_sampler_does_not_read_makes_no_trials_of_its_own():
     }
 
 
+def test_readings_are_lanes_of_one_program_and_a_scale_counts_where_it_is_read():
+    specs = [
+        spec_of(sampler=sampler, weight_normalization=normalization, hparams=HParams(weight_scale=scale))
+        for sampler in ("future", "weighted")
+        for normalization in ("mean", "sum", "none")
+        for scale in (0.02, 0.05)
+    ]
+    trials = grid.trials(specs, [0])
+    assert len({trial.program for trial in trials}) == 1
+    own = [(t.sampler, t.weight_normalization, t.hparams.weight_scale) for t in trials]
+    assert own == [
+        ("future", "mean", 0.02),
+        ("weighted", "mean", 0.02),
+        ("weighted", "sum", 0.02),
+        ("weighted", "none", 0.02),
+        ("weighted", "none", 0.05),
+    ]
+    assert len({trial_name(trial) for trial in trials}) == len(trials)
+
+
 def test_environments_stay_together():
     trials = grid.trials([dataclasses.replace(spec_of(), env=env) for env in ("reach", "push")], [0, 1, 2])
     assert [trial.env for trial in trials] == ["reach"] * 3 + ["push"] * 3

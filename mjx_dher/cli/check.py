@@ -30,6 +30,8 @@ class CheckArgs:
     """Sampler of hindsight goals."""
     weight_kernel: str = "linear"
     """Kernel; with the sampler weighted, which reads it."""
+    weight_normalization: str = "mean"
+    """Normalization of distances; with the sampler weighted, which reads it."""
     metric: str = "position"
     """Distance; with a sampler that reads it: closest, epsilon_closest or weighted."""
     priority: str = "eventful"

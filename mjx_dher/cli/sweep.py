@@ -27,7 +27,7 @@ from mjx_dher.sweeps import grid
 if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
-GRID = ("env", "sampler", "weight_kernel", "metric", "priority", "generator", "learner", "networks")
+GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "priority", "generator", "learner", "networks")
 
 
 def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
@@ -78,6 +78,8 @@ class SweepArgs:
     """Samplers of hindsight goals, by name or as module:attribute."""
     weight_kernel: tuple[str, ...] = ("linear",)
     """Kernels for weighted: linear, inverse, softmax, or module:attribute."""
+    weight_normalization: tuple[str, ...] = ("mean",)
+    """Normalizations of distances for weighted: mean, sum, max, minmax, none, far, or module:attribute."""
     metric: tuple[str, ...] = ("position",)
     """Distances that closest, epsilon_closest and weighted go by: position, velocity, resting_point, resting_point_rough,
     time_to_goal, or module:attribute."""
@@ -89,7 +91,7 @@ class SweepArgs:
     learner: tuple[str, ...] | None = None
     """Learners; the preset's unless given: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
     networks: tuple[str, ...] | None = None
-    """Networks; the preset's for the learner unless given: mlp, layer_norm, or module:attribute."""
+    """Networks; the preset's for the learner unless given: mlp, layer_norm, fan_in, or module:attribute."""
     seeds: int = 10
     """Runs of each setting; every setting has the same seeds, and so the same first networks and resets."""
     first_seed: int = 0

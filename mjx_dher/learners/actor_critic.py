@@ -28,8 +28,6 @@ from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
-_ADAM = optax.scale_by_adam()  # the step size is applied apart, because it is traced
-
 
 @struct.dataclass
 class ActorCriticState:
@@ -67,8 +65,8 @@ class ActorCritic:
         return ActorCriticState(
             params=params,
             target=jax.tree.map(jnp.copy, self._lagging(params)),
-            actor_moments=_ADAM.init(params.actor),
-            critic_moments=_ADAM.init(params.critic),
+            actor_moments=common.adam().init(params.actor),
+            critic_moments=common.adam().init(params.critic),
             observation_norm=normalizer.init(self.sizes.observation),
             goal_norm=normalizer.init(self.sizes.goal),
             key=jax.random.key_data(update_key),
@@ -116,7 +114,7 @@ class ActorCritic:
         target_key, actor_key = jax.random.split(key)
         atoms = self.target(state, batch, hparams, target_key)
         (loss, q_mean), gradient = jax.value_and_grad(self._critic_loss, has_aux=True)(state.params.critic, batch, atoms)
-        direction, critic_moments = _ADAM.update(gradient, state.critic_moments)
+        direction, critic_moments = common.adam(hparams).update(gradient, state.critic_moments)
         critic = jax.tree.map(lambda p, d: p - hparams.critic_lr * d, state.params.critic, direction)
         metrics = {"critic_loss": loss, "q_mean": q_mean}
         state = dataclasses.replace(
@@ -157,7 +155,7 @@ class ActorCritic:
             return self.actor.loss(self.learning.actor, actor, *inputs, judge, key, hparams)
 
         (loss, more), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params.actor)
-        direction, moments = _ADAM.update(gradient, state.actor_moments)
+        direction, moments = common.adam(hparams).update(gradient, state.actor_moments)
         actor = jax.tree.map(lambda p, d: p - hparams.actor_lr * d, state.params.actor, direction)
         state = dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor), actor_moments=moments)
         return state, {**metrics, "actor_loss": loss, **more}

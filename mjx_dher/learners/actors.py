@@ -124,7 +124,9 @@ class Gaussian:
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> common.Noise:
         """Draws what `explore` takes; leaves lead with [T, N]."""
-        return common.exploration_noise(key, num_steps, num_envs, action_size, hparams._replace(noise_std=1.0))
+        return common.exploration_noise(
+            key, num_steps, num_envs, action_size, hparams._replace(noise_std=1.0, random_noise=0.0)
+        )
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: common.Noise) -> Array:
         """Returns a draw of the policy [N, A], or a uniformly random action where the noise says so."""

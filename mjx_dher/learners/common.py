@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 
 from mjx_dher import normalizer
@@ -31,6 +32,11 @@ class Losses(NamedTuple):
     q_mean: Array  # mean Q value of the critic on the batch
 
 
+def adam(hparams: HParams | None = None) -> optax.GradientTransformation:
+    """Returns Adam without its step size, which is applied apart, because it is traced; None where moments alone are made."""
+    return optax.scale_by_adam() if hparams is None else optax.scale_by_adam(eps=hparams.adam_eps)
+
+
 State = TypeVar("State", bound=Any)  # has observation_norm and goal_norm, NormalizerStates [D] and [G]
 
 
@@ -43,14 +49,18 @@ class Noise(NamedTuple):
 
 
 def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-    """Draws noise for `num_envs` episodes of `num_steps` steps: a fraction `random_eps` of the actions is uniformly random."""
+    """Draws noise for `num_envs` episodes of `num_steps` steps: a fraction `random_eps` of the actions is uniformly random.
+
+    Random actions have a fraction `random_noise` of the noise of the others.
+    """
     gaussian_key, uniform_key = jax.random.split(key)
     shape = (num_steps, num_envs)
     uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1), jnp.float32)
+    gaussian = hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size), jnp.float32)
     return Noise(
-        gaussian=hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size), jnp.float32),
+        gaussian=gaussian,
         is_random=uniform[..., -1] < hparams.random_eps,
-        uniform=2.0 * uniform[..., :-1] - 1.0,
+        uniform=jnp.clip(2.0 * uniform[..., :-1] - 1.0 + hparams.random_noise * gaussian, -1.0, 1.0),
     )
 
 

@@ -20,8 +20,6 @@ from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
-_ADAM = optax.scale_by_adam()  # the step size is applied apart, because it is traced
-
 
 @struct.dataclass
 class DDPGState:
@@ -95,7 +93,7 @@ class DDPG:
         return DDPGState(
             params=params,
             target=jax.tree.map(jnp.copy, params),
-            opt_state=_ADAM.init(params),
+            opt_state=common.adam().init(params),
             observation_norm=normalizer.init(self.sizes.observation),
             goal_norm=normalizer.init(self.sizes.goal),
             num_updates=jnp.zeros((), jnp.int32),
@@ -124,7 +122,7 @@ class DDPG:
         params = state.params
         normalized = common.normalize_batch(state, batch, hparams)
         grads, losses = self.compute_gradients(self.learning, params, state.target, normalized, hparams)
-        direction, opt_state = _ADAM.update(grads, state.opt_state)
+        direction, opt_state = common.adam(hparams).update(grads, state.opt_state)
         params = Params(
             actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
             critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),

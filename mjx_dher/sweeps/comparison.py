@@ -51,7 +51,8 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     varying = [name for name in settings[0] if name not in ("sampler", "env") and len({str(s[name]) for s in settings}) > 1]
     by_setting: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
     for trial, setting in zip(trials, settings):
-        own = {name: setting[name] for name in varying if reads(setting["sampler"], setting["learner"], name)}
+        parts = setting["sampler"], setting["learner"]
+        own = {name: setting[name] for name in varying if reads(*parts, name, setting["weight_normalization"])}
         by_setting.setdefault(str((setting["sampler"], own)), (own, []))[1].append(trial)
     order = {name: number for number, name in enumerate(SAMPLERS)}
     labels = [_label(alike[0], own, _format) for own, alike in by_setting.values()]

@@ -38,7 +38,7 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
 
 def _with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
     """Returns `spec` with those settings of `base` that neither its sampler nor its learner reads."""
-    unread = [name for name in read_by() if not reads(spec.sampler, spec.learner, name)]
+    unread = [name for name in read_by() if not reads(spec.sampler, spec.learner, name, spec.weight_normalization)]
     numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
     sizes = {name: getattr(base.config, name) for name in unread if name in _SIZES}
     parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}

@@ -10,7 +10,15 @@ In a test:
 
 from mjx_dher.testing.env import EnvError, check_env
 from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.parts import PartError, check_kernel, check_metric, check_parts, check_priority, check_sampler
+from mjx_dher.testing.parts import (
+    PartError,
+    check_kernel,
+    check_metric,
+    check_normalization,
+    check_parts,
+    check_priority,
+    check_sampler,
+)
 from mjx_dher.testing.views import check_generator
 
 __all__ = [
@@ -21,6 +29,7 @@ __all__ = [
     "check_kernel",
     "check_learner",
     "check_metric",
+    "check_normalization",
     "check_parts",
     "check_priority",
     "check_sampler",

@@ -16,10 +16,11 @@ from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
 from mjx_dher.names import is_import_path
 from mjx_dher.priorities import Priority, PriorityFn
+from mjx_dher.readings import NormalizationFn
 from mjx_dher.rollout import env_sizes
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.scores import LearnedMetric
-from mjx_dher.spec import WEIGHT_KERNELS, RunSpec, own_parts, reads
+from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS, RunSpec, own_parts, reads
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
 from mjx_dher.testing.trial import PartError, attempt, random_episodes
@@ -58,7 +59,9 @@ def _check_replayed(env: Env, spec: RunSpec, episodes: Episode, learner: Learner
         yield check_metric(spec.metric, env, episodes, learner)
     if is_import_path(spec.weight_kernel):
         yield check_kernel(spec.weight_kernel)
-    read = [field for field in ("metric", "weight_kernel") if reads(spec.sampler, spec.learner, field)]
+    if is_import_path(spec.weight_normalization):
+        yield check_normalization(spec.weight_normalization)
+    read = [field for field in ("metric", "weight_kernel", "weight_normalization") if reads(spec.sampler, spec.learner, field)]
     if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
         yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes, learner)}"
     if is_import_path(spec.priority):
@@ -195,6 +198,42 @@ def check_kernel(kernel: str | KernelFn) -> str:
         if temperature == 1.0:
             near, mean, far = np.exp(log_weights[[0, 10, 20]])
     return f"weight_kernel as it should be: weights {near:.3g}, {mean:.3g} and {far:.3g} at relative distances 0, 1 and 2"
+
+
+def check_normalization(normalization: str | NormalizationFn) -> str:
+    """Asks a normalization for the relative distances of 20 candidates among 30 distances, at scales of 0.01, 0.05 and 1.
+
+    They must be as many floating-point numbers as there are distances, not NaN, and finite for candidates: those whose
+    distances are 0.01 to 0.2, those whose distances are all 0.1, or all 0, and where one alone is left.
+
+    Returns:
+      A sentence: in which range they lie for distances of 0.01 to 0.2.
+
+    Raises:
+      PartError: names the first violation.
+    """
+    made = _resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, ("distance", "candidates", "scale"))
+    later, last = jnp.arange(30) >= 10, jnp.arange(30) == 29
+    rising = jnp.where(later, jnp.linspace(-0.09, 0.2, 30), 0.0)
+    cases = {
+        "from 0.01 to 0.2": (rising, later),
+        "of 0.1 throughout": (jnp.full(30, 0.1), later),
+        "of 0 throughout": (jnp.zeros(30), later),
+        "of which one alone is left": (rising, last),
+    }
+    lowest = highest = 0.0
+    for told, (distance, candidates) in cases.items():
+        for scale in (0.01, 0.05, 1.0):
+            compute = jax.jit(lambda d, c, s: jnp.asarray(made(d, c, s)))
+            relative = np.asarray(attempt("weight_normalization", compute, distance, candidates, jnp.float32(scale)))
+            if relative.shape != (30,) or relative.dtype.kind != "f":
+                found = f"{relative.dtype} {list(relative.shape)}"
+                raise PartError(f"weight_normalization: relative distances must be floats [30]; they are {found}")
+            if np.isnan(relative).any() or not np.isfinite(relative[np.asarray(candidates)]).all():
+                raise PartError(f"weight_normalization: a relative distance is not finite, for distances {told}")
+            if distance is rising and candidates is later:
+                lowest, highest = float(relative[10:].min()), float(relative[10:].max())
+    return f"weight_normalization as it should be: {lowest:.3g} to {highest:.3g} for distances from 0.01 to 0.2 m"
 
 
 def check_priority(
