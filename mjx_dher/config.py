@@ -102,7 +102,7 @@ class HParams(NamedTuple):
     critic_lr: Share = 1e-3
     """Adam's step size (learning rate) for the critic."""
     lr_end: Share = 1.0
-    """Fraction of both step sizes that is left at the end of the run, reached linearly; 1 (constant) in the paper."""
+    """Fraction of both step sizes that is left at the end of the run, reached linearly; 1: constant."""
     adam_eps: Annotated[float, Number("(0, 1]")] = 1e-8
     """Number that Adam adds to the root of the second moments. The gradients of W workers summed, not averaged, are the same
     as this divided by W."""
@@ -121,7 +121,7 @@ class HParams(NamedTuple):
     her_k: NotNegative = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
     priority_fraction: Share = 0.0
-    """Fraction of each batch drawn from episodes in proportion to their priority; the rest is uniform. 0 in the paper."""
+    """Fraction of each batch drawn from episodes in proportion to their priority; the rest is uniform."""
     epsilon: Annotated[float, Number("[0, 1]"), ReadBy("epsilon_closest")] = 0.2
     """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
     temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0

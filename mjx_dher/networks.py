@@ -1,4 +1,4 @@
-"""Networks of a learner. The default, `mlp`, is the paper's: four linear layers, ReLU between them."""
+"""Networks of a learner. The default, `mlp`: four linear layers, as the paper has them, ReLU between them."""
 
 from __future__ import annotations
 

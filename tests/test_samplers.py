@@ -1,4 +1,3 @@
-import collections
 import sys
 import types
 
@@ -58,101 +57,6 @@ def test_probabilities(name, step, expected):
 def test_weight_kernels(kernel, temperature, weights):
     got = table(samplers.make("weighted", kernel), 1, HP._replace(temperature=temperature))
     np.testing.assert_allclose(got, np.array([0, 0, *weights]) / np.sum(weights), atol=1e-6)
-
-
-# The candidates after step 1 are at 1, 3 and 2. At a scale of 2 m, x = d / 2 is 0.5, 1.5 and 1.
-READINGS = [
-    ("mean", "linear", 1.0, [1.5, 0.5, 1.0]),  # 2 - d / 2
-    ("sum", "linear", 1.0, [5 / 6, 3 / 6, 4 / 6]),  # 1 - d / 6
-    ("sum", "linear", 0.25, [1 / 3, 0.0, 0.0]),  # 1 - 4 d / 6 is below 0 for two of them
-    ("sum", "softmax", 1.0, [np.exp(-1 / 6), np.exp(-3 / 6), np.exp(-2 / 6)]),
-    ("sum", "inverse", 1.0, [6 / 7, 6 / 9, 6 / 8]),  # 1 / (1 + d / 6)
-    ("max", "linear", 1.0, [2 / 3, 0.0, 1 / 3]),  # 1 - d / 3
-    ("max", "linear", 0.2, [1.0, 0.0, 0.0]),  # 1 - 5 d / 3 is below 0 for all: the nearest
-    ("max", "inverse", 0.5, [9 / 16, 1 / 4, 9 / 25]),  # 1 / (1 + d / 3)^2
-    ("minmax", "linear", 1.0, [1.0, 0.0, 0.5]),  # 1 - (d - 1) / 2
-    ("minmax", "softmax", 0.5, [1.0, np.exp(-2.0), np.exp(-1.0)]),
-    ("none", "softmax", 1.0, [np.exp(-0.5), np.exp(-1.5), np.exp(-1.0)]),
-    ("none", "linear", 1.0, [0.5, 0.0, 0.0]),
-    ("none", "linear", 2.0, [0.75, 0.25, 0.5]),
-    ("none", "linear", 0.4, [1.0, 0.0, 0.0]),  # all are beyond 0.8 m: the nearest
-    ("none", "inverse", 1.0, [1 / 1.5, 1 / 2.5, 1 / 2]),
-    ("far", "linear", 1.0, [1.0, 3.0, 2.0]),  # d
-    ("far", "linear", 0.5, [0.0, 2.0, 1.0]),  # 1 + 2 (d / 2 - 1)
-    ("far", "softmax", 1.0, [np.exp(-0.5), np.exp(0.5), 1.0]),
-    ("far", "inverse", 1.0, [1 / 1.5, 2.0, 1.0]),  # 1 / (2 - d / 2)
-]
-
-
-@pytest.mark.parametrize(("normalization", "kernel", "temperature", "weights"), READINGS)
-def test_readings(normalization, kernel, temperature, weights):
-    sampler = samplers.make("weighted", kernel, normalization=normalization)
-    got = table(sampler, 1, HP._replace(temperature=temperature, weight_scale=2.0))
-    np.testing.assert_allclose(got, np.array([0, 0, *weights]) / np.sum(weights), atol=1e-6)
-
-
-@pytest.mark.parametrize("normalization", WEIGHT_NORMALIZATIONS)
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
-@pytest.mark.parametrize("temperature", [0.25, 1.0])
-def test_equal_distances_make_every_reading_exactly_future(normalization, kernel, temperature):
-    """Of 0, of a millionth, of twice and a hundred times the scale; and the last step, after which one goal is left."""
-    sampler, hparams = samplers.make("weighted", kernel, normalization=normalization), HP._replace(temperature=temperature)
-    log_weights = jax.jit(sampler.log_weights)
-    for distance in (0.0, 1e-6, 0.1, 5.0):
-        achieved = jnp.full((7, 3), distance) * jnp.array([1.0, 0, 0])
-        for step in range(6):
-            got = samplers.probabilities(log_weights(achieved, DESIRED, jnp.array(step), hparams))
-            expected = samplers.probabilities(samplers.future(achieved, DESIRED, jnp.array(step), hparams))
-            np.testing.assert_array_equal(got, expected)
-
-
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
-@pytest.mark.parametrize("normalization", [name for name in WEIGHT_NORMALIZATIONS if name != "none"])
-def test_readings_that_have_no_scale(normalization, kernel):
-    sampler = samplers.make("weighted", kernel, normalization=normalization)
-    np.testing.assert_allclose(table(sampler, 0), table(sampler, 0, achieved=ACHIEVED * 1e-3), atol=1e-5)
-
-
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
-def test_weights_of_a_length_even_out_as_distances_shrink(kernel):
-    """What the paper says of its method 3: "more and more random as the network learns"."""
-    sampler, far_off = samplers.make("weighted", kernel, normalization="none"), []
-    for shrunk in (1.0, 0.1, 0.01, 0.001):
-        probabilities = table(sampler, 0, HP._replace(weight_scale=2.0), ACHIEVED * shrunk)
-        far_off.append(0.5 * np.abs(probabilities - table(samplers.make("future"), 0)).sum())
-    assert far_off == sorted(far_off, reverse=True)
-    assert far_off[0] > 0.1
-    assert far_off[-1] < 1e-3
-
-
-@pytest.mark.parametrize("normalization", WEIGHT_NORMALIZATIONS)
-def test_a_candidate_on_the_goal_is_no_trouble(normalization):
-    """The candidates after step 0 are at 0, 0, 3 and 2; of the nearest two neither is preferred."""
-    achieved = ACHIEVED.at[1:3].set(0.0)
-    for kernel in WEIGHT_KERNELS:
-        got = table(samplers.make("weighted", kernel, normalization=normalization), 0, achieved=achieved)
-        assert np.isfinite(got).all()
-        assert got[0] == 0
-        assert got[1] == got[2]
-        assert (got[1] > got[3]) == (normalization != "far")
-
-
-def test_a_distance_that_is_none_leaves_no_goal_in_any_reading():
-    for normalization in WEIGHT_NORMALIZATIONS:
-        for kernel in WEIGHT_KERNELS:
-            sampler = samplers.make("weighted", kernel, lambda a, d: a[:, 0].at[3].set(jnp.nan), normalization)
-            log_weights = sampler.log_weights(ACHIEVED, DESIRED, jnp.array(1), HP)
-            assert samplers.draw(jax.random.key(0), log_weights[None])[0] == 5, (normalization, kernel)
-
-
-def test_readings_are_lanes_of_one_program():
-    """The choice is traced, so one compiled function serves all."""
-    every = [samplers.make("weighted", k, normalization=n) for n in WEIGHT_NORMALIZATIONS for k in WEIGHT_KERNELS]
-    lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))
-    joined = jax.jit(lambda choice: samplers.one_of(every).log_weights(ACHIEVED, DESIRED, jnp.array(1), lane(*HP, choice)))
-    for choice, sampler in enumerate(every):
-        np.testing.assert_allclose(samplers.probabilities(joined(choice)), table(sampler, 1), atol=1e-6)
-    assert joined._cache_size() == 1
 
 
 @pytest.mark.parametrize("kernel", WEIGHT_KERNELS)

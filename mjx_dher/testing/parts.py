@@ -227,8 +227,8 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
             compute = jax.jit(lambda d, c, s: jnp.asarray(made(d, c, s)))
             relative = np.asarray(attempt("weight_normalization", compute, distance, candidates, jnp.float32(scale)))
             if relative.shape != (30,) or relative.dtype.kind != "f":
-                found = f"{relative.dtype} {list(relative.shape)}"
-                raise PartError(f"weight_normalization: relative distances must be floats [30]; they are {found}")
+                given = f"{relative.dtype} {list(relative.shape)}"
+                raise PartError(f"weight_normalization: relative distances must be floats [30]; they are {given}")
             if np.isnan(relative).any() or not np.isfinite(relative[np.asarray(candidates)]).all():
                 raise PartError(f"weight_normalization: a relative distance is not finite, for distances {told}")
             if distance is rising and candidates is later:

@@ -1,0 +1,220 @@
+"""Runs the experiment of docs/results.md: each figure is one command, which goes on where it was stopped.
+
+    python bench/paper.py --plan              # what would run, and how long it takes by an estimate
+    python bench/paper.py samplers            # one figure: its sweeps, and its curves into docs/paper
+    python bench/paper.py all                 # the whole set
+    python docs/make_results_figures.py       # tables and pictures of docs/results.md from the curves
+
+A figure is one or more calls of `train.py sweep`, each with a folder of its own under --out. One GPU is meant; two share the
+work as `bench/paper.py samplers k` and `bench/paper.py slide readings ...` on one folder. `--toy` takes Reach, two seeds and
+sizes that a CPU trains in seconds: to try the mechanics, never for a figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+CURVES = ROOT / "docs" / "paper"
+COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")
+XLA_FLAGS = "--xla_gpu_enable_cublaslt=true --xla_gpu_enable_triton_gemm=false"
+SEEDS = 10
+# An epoch of the paper is 50 cycles of two episodes a worker; here it is one cycle of as many episodes and updates.
+FAST = "--preset paper --cycles-per-epoch 1 --updates-per-cycle 2000 --learner-dtype bfloat16 --checkpoint-every 0 --lanes 40"
+EPISODES = {"push": 800, "pick_and_place": 1600, "slide": 800}  # an epoch
+TOY = (
+    "--preset paper --engine native --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 8"
+    " --hidden-sizes 8 --eval-episodes 2 --final-episodes 2 --replay-size 400 --checkpoint-every 0"
+)
+
+
+class Sweep(NamedTuple):
+    """One call of `train.py sweep`: its name within the figure, task, epochs, how many settings it has, and what they are."""
+
+    name: str
+    task: str
+    epochs: int
+    settings: int
+    options: str
+
+
+_LINEAR = "--sampler weighted --weight-kernel linear --weight-normalization"
+_SOFTMAX = "--sampler weighted --weight-kernel softmax --weight-normalization"
+_K = "--sampler future --sweep.her-k 1 2 8 16"
+_EVENTFUL = "--sampler future --sweep.priority-fraction 0.5"
+FIGURES: dict[str, tuple[Sweep, ...]] = {
+    "samplers": (
+        Sweep(
+            "samplers",
+            "push",
+            50,
+            8,
+            "--sampler episode future closest epsilon_closest weighted --sweep.epsilon 0.1 0.2 0.3 0.5",
+        ),
+    ),
+    "pick_and_place": (Sweep("pick_and_place", "pick_and_place", 50, 2, "--sampler future weighted"),),
+    "slide": (Sweep("slide", "slide", 200, 2, "--sampler future weighted"),),
+    "readings": (
+        Sweep("readings_push", "push", 30, 5, f"{_LINEAR} sum max minmax none far"),
+        Sweep("readings_push_softmax", "push", 30, 2, f"{_SOFTMAX} mean none"),
+        Sweep("readings_pick_and_place", "pick_and_place", 20, 3, f"{_LINEAR} sum minmax far"),
+        Sweep("readings_pick_and_place_softmax", "pick_and_place", 20, 1, f"{_SOFTMAX} none"),
+        Sweep("readings_slide", "slide", 40, 3, f"{_LINEAR} sum minmax far"),
+        Sweep("readings_slide_softmax", "slide", 40, 1, f"{_SOFTMAX} none"),
+    ),
+    "k": (
+        Sweep("k_push", "push", 50, 4, _K),
+        Sweep("k_pick_and_place", "pick_and_place", 50, 4, _K),
+        Sweep("k_slide", "slide", 50, 4, _K),
+    ),
+    "settings": (
+        Sweep("ring_slide", "slide", 100, 1, "--sampler future --replay-size 1000000"),
+        Sweep("noise_slide", "slide", 50, 1, "--sampler future --sweep.random-noise 0"),
+    ),
+    "eventful": (
+        Sweep("eventful_push", "push", 30, 1, _EVENTFUL),
+        Sweep("eventful_pick_and_place", "pick_and_place", 30, 1, _EVENTFUL),
+        Sweep("eventful_slide", "slide", 50, 1, _EVENTFUL),
+    ),
+}
+
+
+def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
+    """Returns the arguments of `train.py` for a sweep."""
+    if toy:
+        sizes = f"{TOY} --env reach --seeds 2 --total-steps 300"  # three epochs
+        options = sweep.options.replace("--replay-size 1000000", "--replay-size 200")
+    else:
+        episodes = EPISODES[sweep.task]
+        sizes = f"{FAST} --env {sweep.task} --num-envs {episodes} --seeds {SEEDS} --total-steps {sweep.epochs * episodes * 50}"
+        options = sweep.options
+    threshold = "0.6" if sweep.task == "slide" else "0.9"
+    baseline = "weighted" if "future" not in sweep.options else "future"
+    return [
+        "sweep",
+        *f"{sizes} {options} --threshold {threshold} --baseline {baseline}".split(),
+        "--out",
+        str(out / sweep.name),
+    ]
+
+
+# What an estimate is made of, all measured on one H200 (bench/README.md, docs/design.md), 40 runs side by side.
+_UPDATE = 23.8e-6  # seconds of gradients and drawing of an update of 2,048, a run
+_STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
+_MORE = 1.25  # whole epochs took that much more than their parts, in the sweeps of 2026-11-22
+_AROUND = 38.0  # seconds a command: compiling (24 to 47), imports, last evaluations, tables (12)
+
+
+def estimate(sweep: Sweep) -> float:
+    """Returns the seconds that a sweep takes on one H200, by the parts that were measured. It was not measured itself."""
+    workers = 2 if sweep.task == "pick_and_place" else 1  # times 8, and with them the batch
+    steps = (EPISODES[sweep.task] + 100) * 50  # with the evaluation
+    epoch = 2000 * workers * _UPDATE + steps / _STEPS_A_SECOND[sweep.task]
+    return _AROUND + _MORE * epoch * sweep.epochs * sweep.settings * SEEDS
+
+
+def plan(names: Sequence[str], out: Path, toy: bool) -> str:
+    """Returns the commands of figures, and by an estimate how long they take."""
+    lines, whole = [], 0.0
+    for name in names:
+        seconds = sum(map(estimate, FIGURES[name]))
+        whole += seconds
+        lines.append(f"# {name}: {sum(s.settings for s in FIGURES[name])} settings, {seconds / 60:.1f} minutes by the estimate")
+        lines += ["python train.py " + " ".join(command(sweep, out, toy)) for sweep in FIGURES[name]]
+    return "\n".join([*lines, f"# {whole / 60:.1f} minutes of one H200, by the estimate"])
+
+
+def run(name: str, out: Path, toy: bool) -> int:
+    """Runs the sweeps of a figure, one after the other, and collects its curves; returns the status of what did not end."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {'' if toy else XLA_FLAGS}".strip()
+    for sweep in FIGURES[name]:
+        print(f"== {name}: {sweep.name}", flush=True)
+        argv = [sys.executable, str(ROOT / "train.py"), *command(sweep, out, toy)]
+        status = subprocess.run(argv, check=False, env={**os.environ, "XLA_FLAGS": flags}).returncode
+        if status:
+            print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
+            return status
+    return 0
+
+
+def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:
+    """Returns the rows of a sweep's curves, with settings by the names that comparison.csv gives them."""
+    from mjx_dher.sweeps import comparison, tables
+
+    rows = []
+    for groups in comparison.groups(tables.read(folder)).values():
+        for group in groups:
+            setting = named(sweep, group.label)
+            for seed, success in zip(group.seeds, group.success):
+                for epoch, steps, rate in zip(group.epoch, group.env_steps, success):
+                    values = (sweep.name, setting, seed, epoch, steps, f"{rate:g}")
+                    rows.append(dict(zip(COLUMNS, map(str, values))))
+    return rows
+
+
+def named(sweep: Sweep, label: str) -> str:
+    """Returns a setting's name with what all settings of its sweep share: a label names only what differs among them."""
+    shared = {
+        "readings": lambda: _reading(sweep, label),
+        "ring": lambda: "future, ring of a million",
+        "noise": lambda: "future, random_noise 0",
+        "eventful": lambda: "future, priority_fraction 0.5",
+    }
+    return shared.get(sweep.name.partition("_")[0], lambda: label)()
+
+
+def _reading(sweep: Sweep, label: str) -> str:
+    options = sweep.options.split()
+    kernel, normalizations = options[3], options[options.index("--weight-normalization") + 1 :]
+    normalization = normalizations[0] if len(normalizations) == 1 else label.rpartition(", ")[2]
+    return f"weighted, {normalization}, {kernel}"
+
+
+def collect(out: Path, folder: Path) -> list[Path]:
+    """Writes the curves of all sweeps under `out` that have ended, a file a task; returns the files."""
+    by_task: dict[str, list[dict[str, str]]] = {}
+    for sweep in (sweep for figure in FIGURES.values() for sweep in figure):
+        if (out / sweep.name / "results.csv").is_file():
+            by_task.setdefault(sweep.task, []).extend(read_curves(out / sweep.name, sweep))
+    folder.mkdir(parents=True, exist_ok=True)
+    for task, rows in by_task.items():
+        with (folder / f"{task}_curves.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    return [folder / f"{task}_curves.csv" for task in by_task]
+
+
+def main() -> int:
+    """Runs or plans figures; returns 0, or the status of the first sweep that did not end."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"{', '.join(FIGURES)} or all, which is the default")
+    parser.add_argument("--out", type=Path, default=Path("sweeps/paper"), help="folder of the sweeps")
+    parser.add_argument("--curves", type=Path, help="folder of the curves: docs/paper, and under --out with --toy")
+    parser.add_argument("--plan", action="store_true", help="print the commands and an estimate, and run nothing")
+    parser.add_argument("--toy", action="store_true", help="Reach, two seeds, tiny sizes: tries the mechanics on a CPU")
+    args = parser.parse_args()
+    if unknown := [name for name in args.figures if name not in (*FIGURES, "all")]:
+        parser.error(f"figures are {', '.join(FIGURES)} and all; got {', '.join(unknown)}")
+    names = list(FIGURES) if not args.figures or "all" in args.figures else list(dict.fromkeys(args.figures))
+    if args.plan:
+        print(plan(names, args.out, args.toy))
+        return 0
+    for name in names:
+        status = run(name, args.out, args.toy)
+        if status:
+            return status
+        for path in collect(args.out, args.curves or (args.out / "curves" if args.toy else CURVES)):
+            print(f"wrote {path}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""Writes the tables and the forest plot of docs/results.md from the committed curves: `python docs/make_results_figures.py`.
+
+A table stands in the page between `<!-- NAME: docs/make_results_figures.py -->` and `<!-- end of NAME -->`. The curves are
+docs/paper_TASK_curves.csv (until 2026-11-22) and, once bench/paper.py has run, docs/paper/TASK_curves.csv.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import paper_forest
+import paper_set
+from paper_analysis import (
+    DOCS,
+    FIRST,
+    LAST,
+    MARGIN,
+    NAMES,
+    START,
+    STEPS,
+    THRESHOLDS,
+    Difference,
+    Sweeps,
+    area,
+    difference,
+    gain,
+    k_gain,
+    load,
+    number,
+    of,
+    reach,
+    signed,
+    sooner,
+    table,
+    window,
+)
+
+from mjx_dher import stats
+
+PAGE = DOCS / "results.md"
+
+
+def verdicts(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of the paper's claims."""
+    push, pick, slide = (data[task] for task in NAMES)
+    s = "samplers"
+    rows = [
+        ["Push: `weighted` converges sooner than `future`", *_success(gain(push, s, "weighted", "future"))],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, s, START), 2)],
+        ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, s, 0.9), 5)],
+        ["Push: `epsilon_closest` is behind `future`", *_success(gain(push, s, "future", "epsilon_closest"))],
+        ["Push: `closest` is behind `epsilon_closest`", *_success(gain(push, s, "epsilon_closest", "closest"))],
+        ["PickAndPlace: `weighted` converges sooner than `future`", *_success(gain(pick, s, "weighted", "future"))],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, s, START), 2)],
+        ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, s, 0.9), 10)],
+        ["Slide: no noticeable difference", *_alike(gain(slide, s, "weighted", "future"))],
+        ["The first epochs are alike: Push, epochs 1 to 5", *_alike(window(push, s, slice(FIRST)))],
+        ["... PickAndPlace, epochs 1 to 5", *_alike(window(pick, s, slice(FIRST)))],
+    ]
+    for task, sweeps in data.items():
+        start = "In the long term `weighted` is at least as good: " if task == "push" else "... "
+        late = window(sweeps, s, slice(-LAST[task], None))
+        rows.append([f"{start}{NAMES[task]}, last {LAST[task]} epochs", *_no_worse(late)])
+    rows.append(["k above 8 degrades: 16 against 8 (5 seeds, both samplers, 20 epochs)", *_success(k_gain(push, 16, 8), -1)])
+    return table("the paper says | our estimate | 95 % interval | p | verdict", rows)
+
+
+def _success(d: Difference, sign: int = 1) -> list[str]:
+    """Returns the cells of a claim that success is larger, or smaller where `sign` is -1."""
+    low, high = sorted((sign * d.low, sign * d.high))
+    verdict = "**yes**" if low > 0 else "**no**, the opposite" if high < 0 else "not shown"
+    mean, interval, p = signed(d)
+    return [f"mean success {mean}", interval, p, verdict]
+
+
+def _epochs(d: Difference, claimed: float) -> list[str]:
+    """Returns the cells of a claim that epochs are saved, at least `claimed`."""
+    left = f"**no**: {claimed:g} are outside the interval" if d.high < claimed else "not shown" if d.low <= 0 else "**yes**"
+    mean, interval, p = signed(d, 1)
+    return [f"{mean} epochs sooner", interval, p, left]
+
+
+def _alike(d: Difference) -> list[str]:
+    within = abs(d.low) < MARGIN and abs(d.high) < MARGIN
+    verdict = (
+        "**yes**"
+        if within
+        else "not shown: up to 0.02 would be"
+        if d.low <= 0 <= d.high
+        else "**no**: a small one, for `weighted`"
+        if d.low > 0
+        else "**no**: a small one, against `weighted`"
+    )
+    mean, interval, p = signed(d)
+    return [f"mean success {mean}", interval, p, verdict]
+
+
+def _no_worse(d: Difference) -> list[str]:
+    mean, interval, p = signed(d)
+    return [f"mean success {mean}", interval, p, "**yes**, to within 0.02" if d.low > -MARGIN else "not shown"]
+
+
+def samplers(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of the samplers, on all tasks."""
+    order = ("future", "weighted", "episode", "epsilon_closest", "closest", "random")
+    rows = []
+    for task, sweeps in data.items():
+        names = [name for name in order if ("samplers", name) in sweeps]
+        compared = {name: gain(sweeps, "samplers", name, "future") for name in names[1:]}
+        corrected = dict(zip(compared, stats.holm([d.p for d in compared.values()])))
+        for name in names:
+            curves, last = sweeps["samplers", name], LAST[task]
+            epochs, base = reach(curves, THRESHOLDS[task]), area(sweeps["samplers", "future"])
+            better = "" if name == "future" else f"{stats.probability_of_improvement(area(curves), base):.2f}"
+            cells = [of(curves.success[:, -last:].mean(axis=1)), of(area(curves)), of(epochs, 0, np.median)]
+            there = f"{np.isfinite(epochs).sum()} of {len(epochs)}"
+            p = number(corrected[name]) if name in corrected else ""
+            rows.append([NAMES[task] if name == "future" else "", f"`{name}`", *cells, there, better, p])
+    head = "task | sampler | late success, IQM | mean success, IQM | epochs to 0.90 (Slide: 0.60), median | seeds there"
+    return table(f"{head} | P(better than `future`) | p, corrected", rows)
+
+
+def ks(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of hindsight goals."""
+    push, rows = data["push"], []
+    for k in (1, 2, 4, 8, 16):
+        future, weighted = (push["k", f"{name}, her_k {k}"] for name in ("future", "weighted"))
+        against = signed(k_gain(push, k, 4)) if k != 4 else ["", "", ""]
+        rows.append([str(k), of(area(future)), of(area(weighted)), *against])
+    return table(
+        "k | `future`: mean success, IQM | `weighted`: mean success, IQM | both, against k 4 | 95 % interval | p", rows
+    )
+
+
+def kernels(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of kernels and temperatures."""
+    push, rows, default = data["push"], [], "weighted, linear, temperature 1"
+    for kernel in ("linear", "inverse", "softmax"):
+        for temperature in ("0.25", "1", "4"):
+            name = f"weighted, {kernel}, temperature {temperature}"
+            against = ["", "", ""] if name == default else signed(gain(push, "kernels", name, default))
+            rows.append([f"`{kernel}`", temperature, of(area(push["kernels", name])), *against])
+    return table("kernel | temperature | mean success, IQM | against `linear` at 1 | 95 % interval | p", rows)
+
+
+def repeats(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of `weighted` against `future` in every sweep that has both."""
+    rows = []
+    for task, sweeps in data.items():
+        for sweep in dict.fromkeys(sweep for sweep, setting in sweeps if setting == "weighted" and (sweep, "future") in sweeps):
+            curves, threshold = sweeps[sweep, "future"], THRESHOLDS[task]
+            success, epochs = gain(sweeps, sweep, "weighted", "future"), sooner(sweeps, sweep, threshold)
+            length = curves.success.shape[1]
+            rows.append([NAMES[task], sweep, str(length), *signed(success), *signed(epochs, 1)[:2]])
+    return table(
+        "task | sweep | epochs | mean success, `weighted` less `future` | 95 % interval | p | epochs sooner | 95 % interval",
+        rows,
+    )
+
+
+CHANGES = (  # what, task, the sweep, and the one that it is compared with
+    ("the paper's cycles: 16 episodes, 40 updates", "push", "the paper's own cycles", "samplers"),
+    ("cycles 2.5 times as long", "push", "long cycles", "samplers"),
+    ("bfloat16", "push", "bfloat16", "samplers"),
+    ("bfloat16, long cycles", "push", "bfloat16 and long cycles", "long cycles"),
+    ("`fast`: bfloat16, a cycle an epoch", "push", "fast", "samplers"),
+    ("... PickAndPlace", "pick_and_place", "fast", "samplers"),
+    ("... Slide, from cycles half as long", "slide", "fast", "samplers"),
+    ("`hopper`: from `fast`, the learner's kernels", "push", "hopper", "fast"),
+    ("... again", "push", "hopper again", "fast"),
+    ("... PickAndPlace", "pick_and_place", "hopper", "fast"),
+    ("... Slide", "slide", "hopper", "fast"),
+)
+
+
+def robustness(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of what was changed about the sweeps for speed."""
+    rows = []
+    for what, task, sweep, before in CHANGES:
+        settings = [name for own, name in data[task] if own == sweep and (before, name) in data[task]]
+        for setting in sorted(settings, key=("future", "weighted", "epsilon_closest", "closest").index):
+            new, old = data[task][sweep, setting], data[task][before, setting]
+            epochs = min(new.success.shape[1], old.success.shape[1])
+            d = difference(area(new, epochs), area(old, epochs))
+            told = f"{area(old, epochs).mean():.3f}, then {area(new, epochs).mean():.3f}"
+            rows.append([what if setting == "future" else "", str(epochs), f"`{setting}`", told, *signed(d)])
+    return table("change | epochs | sampler | mean success | difference | 95 % interval | p", rows)
+
+
+PUBLISHED = (  # million steps to a success rate, as read off a published curve (to 3 points of success), and its end
+    ("DDPG and HER, PyTorch and MPI (a), 5 seeds, median", "0.64", "0.99", "2.6", "0.93", "2.4", "0.72"),
+    ("TQC and HER (b), one run", "", "1.00 after 1.0", "", "1.00 after 1.0", "", "0.80 after 2.5"),
+)
+
+
+def field(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of published curves beside ours, in environment steps."""
+    rows = [list(row) for row in PUBLISHED]
+    for name in ("future", "weighted"):
+        cells = []
+        for task, sweeps in data.items():
+            curves = sweeps["samplers", name]
+            steps = float(np.median(reach(curves, THRESHOLDS[task]))) * STEPS[task] / 1e6
+            cells += [f"{steps:.2f}", f"{np.median(curves.success[:, -LAST[task] :].mean(axis=1)):.2f}"]
+        rows.append([f"ours, `{name}`, 10 seeds, median", *cells])
+    return table("who | Push: to 0.90 | at the end | PickAndPlace: to 0.90 | at the end | Slide: to 0.60 | at the end", rows)
+
+
+BLOCKS: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {
+    "verdicts": verdicts,
+    "samplers": samplers,
+    "k": ks,
+    "kernels": kernels,
+    "repeats": repeats,
+    "robustness": robustness,
+    "field": field,
+}
+
+
+def blocks() -> dict[str, str]:
+    """Returns all tables by name."""
+    data = load()
+    return {name: make(data) for name, make in BLOCKS.items()} | paper_set.blocks(data)
+
+
+def with_tables(page: str, blocks: Mapping[str, str]) -> str:
+    """Returns the page with its tables as they are now.
+
+    Raises:
+      ValueError: the page has no place for one of them.
+    """
+    for name, text in blocks.items():
+        begin, end = f"<!-- {name}: docs/make_results_figures.py -->\n", f"<!-- end of {name} -->"
+        if page.count(begin) != 1 or page.count(end) != 1:
+            raise ValueError(f"the page has not one place for {name}")
+        page = re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, t=begin + text + "\n" + end: t, page, flags=re.DOTALL)
+    return page
+
+
+def main() -> None:
+    """Writes tables and pictures."""
+    PAGE.write_text(with_tables(PAGE.read_text(), blocks()))
+    paper_forest.draw(load(), DOCS / "images" / "paper_forest.png")
+
+
+if __name__ == "__main__":
+    main()

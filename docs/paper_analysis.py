@@ -1,0 +1,132 @@
+"""Reads learning curves and compares them by seed, for the tables and pictures of docs/results.md."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mjx_dher import stats
+
+DOCS = Path(__file__).parent
+NAMES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide"}
+THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
+LAST = {"push": 10, "pick_and_place": 10, "slide": 20}  # epochs that count as the long term
+STEPS = {"push": 40_000, "pick_and_place": 80_000, "slide": 40_000}  # of an epoch
+START, FIRST, MARGIN = 0.2, 5, 0.02  # success at which a run has begun to learn; first epochs; what counts as no worse
+
+
+class Curves(NamedTuple):
+    """Success of one setting's seeds after each epoch."""
+
+    seeds: tuple[int, ...]  # S of them
+    success: NDArray  # [S, P]
+
+
+Sweeps = Mapping[tuple[str, str], Curves]  # by sweep and setting
+
+
+class Difference(NamedTuple):
+    """Paired difference of two settings: its mean over seeds, bootstrap interval at 95 %, and the permutation test's p."""
+
+    each: NDArray  # [S]
+    mean: float
+    low: float
+    high: float
+    p: float
+
+
+def read(path: Path) -> Sweeps:
+    """Returns the curves in a CSV, by sweep and setting; a sweep that was cut short is as long as its shortest run."""
+    runs: dict[tuple[str, str], dict[int, list[float]]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            curve = runs.setdefault((row["sweep"], row["setting"]), {}).setdefault(int(row["seed"]), [])
+            if int(row["epoch"]) != len(curve) + 1:
+                raise ValueError(f"{path}: epoch {row['epoch']} of {row['sweep']}, {row['setting']} is out of order")
+            curve.append(float(row["success_rate"]))
+    return {name: _curves(by_seed) for name, by_seed in runs.items()}
+
+
+def _curves(by_seed: dict[int, list[float]]) -> Curves:
+    seeds = tuple(sorted(by_seed))
+    length = min(map(len, by_seed.values()))
+    return Curves(seeds, np.array([by_seed[seed][:length] for seed in seeds]))
+
+
+def area(curves: Curves, epochs: int | None = None) -> NDArray:
+    """Returns the mean success [S] over the (first) epochs, by trapezoids."""
+    success = curves.success[:, :epochs]
+    return stats.area_under_curve(np.arange(success.shape[1]), success)
+
+
+def reach(curves: Curves, threshold: float) -> NDArray:
+    """Returns the first epoch [S] at or above a success rate, infinity where there is none."""
+    return stats.first_reach(np.arange(1, curves.success.shape[1] + 1), curves.success, threshold)
+
+
+def difference(a: NDArray, b: NDArray) -> Difference:
+    """Returns the difference a - b of scores [S] that are paired by seed."""
+    each = a - b
+    if not np.isfinite(each).all():
+        return Difference(each, math.nan, math.nan, math.nan, math.nan)
+    return Difference(each, float(each.mean()), *stats.bootstrap_interval(each, np.mean), stats.paired_p_value(a, b))
+
+
+def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str, epochs: int | None = None) -> Difference:
+    """Returns by how much a setting's mean success over the epochs exceeds a baseline's of the same sweep."""
+    return difference(area(sweeps[sweep, setting], epochs), area(sweeps[sweep, baseline], epochs))
+
+
+def sooner(sweeps: Sweeps, sweep: str, threshold: float) -> Difference:
+    """Returns by how many epochs `weighted` is at a threshold before `future`."""
+    return difference(reach(sweeps[sweep, "future"], threshold), reach(sweeps[sweep, "weighted"], threshold))
+
+
+def window(sweeps: Sweeps, sweep: str, part: slice) -> Difference:
+    """Returns by how much the mean success of `weighted` exceeds that of `future` in some of the epochs."""
+    return difference(*(sweeps[sweep, name].success[:, part].mean(axis=1) for name in ("weighted", "future")))
+
+
+def table(head: str, rows: list[list[str]]) -> str:
+    """Returns a table as Markdown; `head` has its columns' names, apart by |."""
+    columns = [name.strip() for name in head.split("|")]
+    if wrong := [row for row in rows if len(row) != len(columns)]:
+        raise ValueError(f"a row of {len(columns)} columns has {len(wrong[0])} cells: {wrong[0]}")
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def signed(d: Difference, digits: int = 3) -> list[str]:
+    """Returns the cells of a difference: its mean, its interval and p."""
+    return [f"{d.mean:+.{digits}f}", f"{d.low:+.{digits}f} to {d.high:+.{digits}f}", number(d.p)]
+
+
+def number(p: float) -> str:
+    """Returns p to two digits that count."""
+    return f"{p:.2f}" if p >= 0.095 else f"{p:.2g}"
+
+
+def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats.interquartile_mean) -> str:
+    """Returns the statistic of scores [S] with its bootstrap interval; "never" for an infinite epoch."""
+    values = (statistic(scores), *stats.bootstrap_interval(scores, statistic))
+    middle, low, high = (
+        f"{value:.{digits}f}" if digits else ("never" if math.isinf(value) else f"{value:g}") for value in values
+    )
+    return f"{middle} ({low} to {high})" if middle != "never" or low != "never" else "never"
+
+
+def k_gain(push: Sweeps, k: int, other: int) -> Difference:
+    """Returns by how much k beats another k on Push, over the seeds of both samplers."""
+    areas = [np.concatenate([area(push["k", f"{s}, her_k {value}"]) for s in ("future", "weighted")]) for value in (k, other)]
+    return difference(*areas)
+
+
+def load() -> dict[str, Sweeps]:
+    """Returns the curves of 2026-11-22 by task."""
+    return {task: read(DOCS / f"paper_{task}_curves.csv") for task in NAMES}

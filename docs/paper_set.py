@@ -1,0 +1,150 @@
+"""The comparisons of the set that bench/paper.py runs, stated before it has run, and what ten seeds can show in it.
+
+A family is a question; p is corrected by Holm's method within it. The least p of ten pairs is 2/1024, so a family of more than
+25 comparisons could show nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from paper_analysis import (
+    DOCS,
+    MARGIN,
+    NAMES,
+    THRESHOLDS,
+    Difference,
+    Sweeps,
+    area,
+    difference,
+    gain,
+    number,
+    read,
+    signed,
+    sooner,
+    table,
+)
+
+from mjx_dher import stats
+
+FOLDER = DOCS / "paper"
+MAIN = {"push": "samplers", "pick_and_place": "pick_and_place", "slide": "slide"}  # the sweep with `future` and `weighted`
+
+
+class Comparison(NamedTuple):
+    """A setting of a task against another one, each by sweep and setting; the main sweep's `future` unless given."""
+
+    task: str
+    sweep: str
+    setting: str
+    against: tuple[str, str] | None = None
+
+
+def _readings() -> list[Comparison]:
+    """Returns the readings other than the default one, on each task."""
+    linear = {"push": ("sum", "max", "minmax", "none", "far"), "pick_and_place": ("sum", "minmax", "far")}
+    softmax = {"push": ("mean", "none")}
+    found = []
+    for task in NAMES:
+        for normalization in linear.get(task, linear["pick_and_place"]):
+            found.append(Comparison(task, f"readings_{task}", f"weighted, {normalization}, linear"))
+        for normalization in softmax.get(task, ("none",)):
+            found.append(Comparison(task, f"readings_{task}_softmax", f"weighted, {normalization}, softmax"))
+    return found
+
+
+FAMILIES: dict[str, list[Comparison]] = {
+    "the paper's claim": [Comparison(task, sweep, "weighted") for task, sweep in MAIN.items()],
+    "readings": _readings(),
+    "method 2": [Comparison("push", "samplers", f"epsilon_closest, epsilon {e}") for e in (0.1, 0.2, 0.3, 0.5)]
+    + [Comparison("push", "samplers", "closest")],
+    "k against 4": [Comparison(task, f"k_{task}", f"future, her_k {k}") for task in NAMES for k in (1, 2, 8, 16)],
+    "k 16 against 8": [Comparison(t, f"k_{t}", "future, her_k 16", (f"k_{t}", "future, her_k 8")) for t in NAMES],
+    "settings of Slide": [
+        Comparison("slide", "ring_slide", "future, ring of a million"),
+        Comparison("slide", "noise_slide", "future, random_noise 0"),
+    ],
+    "eventful": [Comparison(task, f"eventful_{task}", "future, priority_fraction 0.5") for task in NAMES],
+}
+HEAD = "question | task | setting | against | epochs | mean success | 95 % interval | p | p, corrected | verdict"
+
+
+def load_set(folder: Path) -> dict[str, Sweeps]:
+    """Returns the curves of the set, by task, of those tasks that have any."""
+    return {task: read(path) for task in NAMES if (path := folder / f"{task}_curves.csv").is_file()}
+
+
+def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
+    """Returns a row for each comparison whose curves are all there; a family is corrected once it is whole."""
+    found = []
+    for family, comparisons in FAMILIES.items():
+        ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
+        differences = [_compare(data[c.task], c) for c in ready]
+        p_values = [d.p for d, _ in differences]
+        corrected = stats.holm(p_values) if len(ready) == len(comparisons) else [math.nan] * len(ready)
+        for c, (d, epochs), p in zip(ready, differences, corrected):
+            cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
+            found.append([family, *cells, "" if math.isnan(p) else number(p), verdict(d.low, d.high, p)])
+    return found
+
+
+def verdict(low: float, high: float, p: float) -> str:
+    """Returns what an interval and a corrected p say: better or worse with p below 0.05, alike within 0.02 of none."""
+    if p < 0.05:
+        return "better" if low > 0 else "worse" if high < 0 else "not shown"
+    return "alike" if low > -MARGIN and high < MARGIN else "not shown"
+
+
+def _baseline(c: Comparison) -> tuple[str, str]:
+    return c.against or (MAIN[c.task], "future")
+
+
+def _compare(sweeps: Sweeps, c: Comparison) -> tuple[Difference, int]:
+    """Returns the difference of mean success over the epochs that both have, and how many these are."""
+    a, b = sweeps[c.sweep, c.setting], sweeps[_baseline(c)]
+    if a.seeds != b.seeds:
+        raise ValueError(f"{c.sweep}, {c.setting} has seeds {a.seeds}; what it is compared with has {b.seeds}")
+    epochs = min(a.success.shape[1], b.success.shape[1])
+    return difference(area(a, epochs), area(b, epochs)), epochs
+
+
+def detectable(spread: float, seeds: int, level: float, power: float = 0.8) -> float:
+    """Returns the least mean difference that a paired t test finds, with its sign, where differences have this spread."""
+    from scipy.optimize import brentq
+    from scipy.stats import nct, t
+
+    bound = t.ppf(1 - level / 2, seeds - 1)
+
+    def missing(effect: float) -> float:
+        return float(nct.sf(bound, seeds - 1, effect * math.sqrt(seeds))) - power
+
+    return spread * float(brentq(missing, 1e-3, 3.0))
+
+
+SIZES = {1: "one comparison", 3: "the three tasks", 15: "the fifteen readings"}
+
+
+def power(data: Mapping[str, Sweeps]) -> str:
+    """Returns the table of the smallest effects that ten seeds can show, from the spread of the sweeps that there are."""
+    rows = []
+    for task, sweeps in data.items():
+        pairs = [sweep for sweep in ("samplers", "fast", "hopper", "hopper again") if (sweep, "weighted") in sweeps]
+        for measure, digits, score in (
+            ("mean success", 3, lambda s, n: gain(s, n, "weighted", "future")),
+            (f"epochs to {THRESHOLDS[task]:.2f}", 1, lambda s, n, task=task: sooner(s, n, THRESHOLDS[task])),
+        ):
+            variance = np.mean([np.var(score(sweeps, name).each, ddof=1) for name in pairs])
+            spread = math.sqrt(float(variance))
+            least = [f"{detectable(spread, 10, 0.05 / m):.{digits}f}" for m in SIZES]
+            rows.append([NAMES[task], measure, f"{spread:.{digits}f}", *least])
+    return table(f"task | measure | spread of paired differences | {' | '.join(SIZES.values())}", rows)
+
+
+def blocks(data: Mapping[str, Sweeps], folder: Path = FOLDER) -> dict[str, str]:
+    """Returns the tables of the set and of its power; `data` are the curves that the power is computed from."""
+    found = rows(load_set(folder))
+    return {"set": table(HEAD, found) if found else "Not run yet: there are no curves in docs/paper.", "power": power(data)}

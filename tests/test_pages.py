@@ -1,0 +1,141 @@
+"""What the pages say in tables: every table renders, and numbers are those of the committed curves."""
+
+import csv
+import re
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from markdown_it import MarkdownIt
+
+sys.path[:0] = [str(ROOT / "docs")]
+
+import make_results_figures  # noqa: E402
+import make_samplers_figure  # noqa: E402
+
+PAGES = sorted(
+    path
+    for path in ROOT.rglob("*.md")
+    if not any(part.startswith(".") and part != ".github" for part in path.relative_to(ROOT).parts[:-1])
+)
+MARKDOWN = MarkdownIt("commonmark").enable("table")
+
+
+def broken_tables(text):
+    """What is wrong with the tables of a page: lines that look like a row and are in none, and rows of another length."""
+    lines, in_table, apart, problems = text.splitlines(), {}, set(), []
+    for token in MARKDOWN.parse(text):
+        if token.type == "table_open":
+            in_table |= dict.fromkeys(range(*token.map), token.map[0])
+        elif token.type in ("fence", "code_block", "html_block"):
+            apart |= set(range(*token.map))
+    for number, line in enumerate(lines):
+        if number in in_table:
+            if len(cells(line)) != len(cells(lines[in_table[number]])):
+                problems.append(f"line {number + 1} has {len(cells(line))} cells")
+        elif line.lstrip().startswith("|") and number not in apart:
+            problems.append(f"line {number + 1} is no row of a table")
+    return problems
+
+
+def cells(line):
+    return re.split(r"(?<!\\)\|", line.strip().removeprefix("|").removesuffix("|"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_table_renders(page):
+    assert broken_tables(page.read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        ("| a | b |\n|---|---|\n| 1 | 2 |\n", []),
+        ("| a | b |\n|---|---|\n| 1 | 2 |\n\n| 3 | 4 |\n", ["line 5 is no row of a table"]),
+        ("| a | b |\n|---|---|\n| 1 |\n| 1 | 2 | 3 |\n", ["line 3 has 1 cells", "line 4 has 3 cells"]),
+        ("| a | b |\n| 1 | 2 |\n", ["line 1 is no row of a table", "line 2 is no row of a table"]),
+        ("text\n| a | b |\n|---|\n", ["line 2 is no row of a table", "line 3 is no row of a table"]),
+        ("```\n| a |\n```\n\n| a \\| b |\n|---|\n| c |\n", []),
+    ],
+)
+def test_a_broken_table_would_be_noticed(text, problems):
+    assert broken_tables(text) == problems
+
+
+def test_the_tables_of_results_are_those_of_the_curves():
+    page = make_results_figures.PAGE.read_text()
+    assert make_results_figures.with_tables(page, make_results_figures.blocks()) == page
+
+
+def test_each_table_of_results_with_numbers_is_made_from_the_curves():
+    """But those of settings, which are words: a number in another table would be checked by nobody."""
+    text = make_results_figures.PAGE.read_text()
+    rest = re.sub(r"<!-- (\w+): docs/make_results_figures.py -->.*?<!-- end of \1 -->", "", text, flags=re.DOTALL)
+    tables = [token.map for token in MARKDOWN.parse(rest) if token.type == "table_open"]
+    heads = [rest.splitlines()[start] for start, _ in tables]
+    assert heads == ["| item | the paper | `--preset paper` | source, and whether it departs | to change it |"]
+
+
+def test_the_table_of_readings_is_what_the_weights_are():
+    page = make_samplers_figure.PAGE.read_text()
+    assert make_samplers_figure.with_table(page) == page
+
+
+def test_readings_by_formula():
+    """Total variation from `future` as NumPy computes it from the formulas on the page."""
+    formulas = {
+        "`mean`, `linear`": lambda d: np.maximum(2 - d / d.mean(), 0),
+        "`sum`, `linear`": lambda d: 1 - d / d.sum(),
+        "`max`, `linear`": lambda d: 1 - d / d.max(),
+        "`minmax`, `linear`": lambda d: 1 - (d - d.min()) / (d.max() - d.min()),
+        "`none`, `softmax`": lambda d: np.exp(-d / 0.05),
+        "`far`, `linear`": lambda d: d,
+        "`mean`, `inverse`": lambda d: 1 / d,
+        "`epsilon_closest`": lambda d: 0.2 / d.size + 0.8 * (d == d.min()) / (d == d.min()).sum(),
+    }
+    rows = dict(make_samplers_figure.rows())
+    for name, formula in formulas.items():
+        weights = [formula(np.asarray(d, np.float32)) for d in make_samplers_figure.SITUATIONS.values()]
+        expected = [np.abs(w / w.sum() - 1 / w.size).sum() / 2 for w in weights]
+        np.testing.assert_allclose(rows[name], expected, atol=1e-5, err_msg=name)
+
+
+SUCCESS = re.compile(r"[01]\.\d{3}")
+
+
+def published(task, preset):
+    """The success rates of a preset's seeds, and its environment steps, in docs/preset_success.csv."""
+    with (ROOT / "docs" / "preset_success.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["task"], row["preset"]) == (task, preset)]
+    return [row["success"] for row in rows], {row["env_steps"] for row in rows}
+
+
+def test_the_readme_s_table_of_results_is_that_of_the_file():
+    lines = (ROOT / "README.md").read_text().splitlines()
+    (head,) = (i for i, line in enumerate(lines) if line.startswith("|") and "preset `cpu`" in line and "preset `gpu`" in line)
+    names = cells(lines[head])
+    tasks = set()
+    for line in lines[head + 2 :]:
+        if not line.startswith("|"):
+            break
+        row = cells(line)
+        task = row[0].strip().strip("`")
+        tasks.add(task)
+        for preset in ("cpu", "gpu"):
+            (column,) = (i for i, name in enumerate(names) if f"preset `{preset}`" in name)
+            rates, steps = published(task, preset)
+            assert SUCCESS.findall(row[column]) == rates, (task, preset)
+            assert {row[column + 1].strip().replace(",", "")} == (steps or {""}), (task, preset)
+    assert tasks == {"push", "pick_and_place", "slide", "reach"}
+
+
+def test_the_benchmarks_say_the_same_of_the_presets():
+    text = (ROOT / "bench" / "README.md").read_text()
+    for task in ("push", "pick_and_place", "slide"):
+        (row,) = (cells(line) for line in text.splitlines() if re.match(rf"\| {task} \| [\d,]+ \| \d+ \|", line))
+        rates, steps = published(task, "gpu")
+        assert SUCCESS.findall(row[4]) == rates
+        assert {row[1].strip().replace(",", "")} == steps
+    finals = re.findall(r"^\| \d    \| .*?\| ([01]\.\d{3}) \([01]\.\d{3}-[01]\.\d{3}\) +\| 0\.0\d\d", text, re.MULTILINE)
+    assert finals == published("push", "cpu")[0]
