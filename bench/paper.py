@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -137,11 +138,24 @@ def run(name: str, out: Path, toy: bool) -> int:
     for sweep in FIGURES[name]:
         print(f"== {name}: {sweep.name}", flush=True)
         argv = [sys.executable, str(ROOT / "train.py"), *command(sweep, out, toy)]
-        status = subprocess.run(argv, check=False, env={**os.environ, "XLA_FLAGS": flags}).returncode
+        status = wait_for(subprocess.Popen(argv, env={**os.environ, "XLA_FLAGS": flags}))
         if status:
             print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
-            return status
+            return status if status > 0 else 128 - status  # a signal, as a shell gives it
     return 0
+
+
+def wait_for(child: subprocess.Popen) -> int:
+    """Returns the status of a sweep when it has ended. A signal to stop is the sweep's, which saves what it has."""
+    before = {
+        signal.SIGTERM: signal.signal(signal.SIGTERM, lambda number, frame: child.send_signal(number)),
+        signal.SIGINT: signal.signal(signal.SIGINT, lambda number, frame: None),  # a terminal sends it to both
+    }
+    try:
+        return child.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:

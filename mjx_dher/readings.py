@@ -18,10 +18,10 @@ import jax.numpy as jnp
 
 from mjx_dher.types import Array
 
-NormalizationFn = Callable[[Array, Array, Array], Array]
+NormalizationFn = Callable[[Array, Array, Array | float], Array]
 
 
-def by_mean(distance: Array, candidates: Array, scale: Array) -> Array:
+def by_mean(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns d / mean d; 1 where every candidate lies on the goal. `linear` at temperature 1 then is 2 - d / mean d."""
     del scale
     distance = jnp.where(candidates, distance, 0.0)
@@ -30,31 +30,31 @@ def by_mean(distance: Array, candidates: Array, scale: Array) -> Array:
     return jnp.where(candidates & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
 
 
-def mirrored(distance: Array, candidates: Array, scale: Array) -> Array:
+def mirrored(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns 2 - d / mean d, the mirror image of `by_mean`: `linear` at temperature 1 is d / mean d, so p = d / sum d."""
     return 2.0 - by_mean(distance, candidates, scale)
 
 
-def by_sum(distance: Array, candidates: Array, scale: Array) -> Array:
+def by_sum(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns 1 + d / sum d: `linear` at temperature 1 is 1 - d / sum d."""
     del scale
     return _one_and(distance, jnp.sum(jnp.where(candidates, distance, 0.0)), candidates)
 
 
-def by_max(distance: Array, candidates: Array, scale: Array) -> Array:
+def by_max(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns 1 + d / max d: `linear` at temperature 1 is 1 - d / max d."""
     del scale
     return _one_and(distance, _largest(distance, candidates), candidates)
 
 
-def by_range(distance: Array, candidates: Array, scale: Array) -> Array:
+def by_range(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns 1 + (d - min d) / (max d - min d): `linear` at temperature 1 falls from 1, the nearest, to 0, the farthest."""
     del scale
     least = jnp.min(jnp.where(candidates, distance, jnp.inf))
     return _one_and(distance - least, _largest(distance, candidates) - least, candidates)
 
 
-def by_scale(distance: Array, candidates: Array, scale: Array) -> Array:
+def by_scale(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """Returns 1 + d / scale, a length in metres: `softmax` at temperature 1 is exp(-d / scale). Alone in having a scale."""
     return _one_and(distance, scale, candidates)
 
@@ -63,6 +63,6 @@ def _largest(distance: Array, candidates: Array) -> Array:
     return jnp.max(jnp.where(candidates, distance, 0.0))
 
 
-def _one_and(distance: Array, unit: Array, candidates: Array) -> Array:
+def _one_and(distance: Array, unit: Array | float, candidates: Array) -> Array:
     """Returns 1 + distance / unit of the candidates, and 1 where the unit is 0, as where all lie on the goal."""
     return jnp.where(candidates & (unit != 0), 1.0 + distance / jnp.where(unit != 0, unit, 1.0), 1.0)

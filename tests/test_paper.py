@@ -1,0 +1,199 @@
+"""The set of runs that docs/results.md states beforehand: its commands, its comparisons, and what is made of its curves."""
+
+import csv
+import importlib.util
+import math
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from mjx_dher import config
+from mjx_dher.cli import sweep as cli_sweep
+from mjx_dher.runs import identity
+from mjx_dher.sweeps import comparison
+
+sys.path[:0] = [str(ROOT / "docs")]
+
+import paper_analysis  # noqa: E402
+import paper_set  # noqa: E402
+
+_spec = importlib.util.spec_from_file_location("bench_paper", ROOT / "bench" / "paper.py")
+paper = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(paper)
+SWEEPS = [sweep for figure in paper.FIGURES.values() for sweep in figure]
+
+
+def trials_of(sweep, out, toy=False):
+    (_, *argv) = paper.command(sweep, out, toy)
+    return cli_sweep.parse_sweep_args(argv)[1]
+
+
+@pytest.fixture(scope="module")
+def trials(tmp_path_factory):
+    """What each command of the set trains."""
+    folder = tmp_path_factory.mktemp("set")
+    return {sweep: trials_of(sweep, folder) for sweep in SWEEPS}
+
+
+def test_every_command_trains_what_the_page_says(trials):
+    assert len({sweep.name for sweep in SWEEPS}) == len(SWEEPS)
+    for sweep, runs in trials.items():
+        assert len(runs) == sweep.settings * paper.SEEDS, sweep.name
+        assert {run.seed for run in runs} == set(range(10))
+        assert len({run.program for run in runs}) == 1, sweep.name  # lanes of one program
+        for run in runs:
+            assert config.num_epochs(run.config, 50) == sweep.epochs
+            assert (run.env, run.networks, run.config.learner_dtype) == (sweep.task, "fan_in", "bfloat16")
+            workers = 16 if sweep.task == "pick_and_place" else 8
+            assert run.config.batch_size == 256 * workers
+            # An epoch of the paper: 50 cycles of two episodes a worker, and of 40 updates.
+            assert run.config.num_envs * run.config.cycles_per_epoch == 100 * workers
+            assert run.config.updates_per_cycle * run.config.cycles_per_epoch == 2000
+    readings = {(r.weight_normalization, r.weight_kernel) for s, runs in trials.items() if s.task == "push" for r in runs}
+    assert {normalization for normalization, _ in readings} == {"mean", "sum", "max", "minmax", "none", "far"}
+    assert {run.config.replay_size for s, runs in trials.items() if s.name == "ring_slide" for run in runs} == {1_000_000}
+    assert {run.hparams.random_noise for s, runs in trials.items() if s.name == "noise_slide" for run in runs} == {0.0}
+
+
+def test_the_set_fits_an_hour_by_the_estimate():
+    assert 3000 < sum(map(paper.estimate, SWEEPS)) <= 3600
+    push = paper.Sweep("x", "push", 50, 1, "")  # 2,000 updates of 23.8 us and 45,000 steps at 1.68 million a second
+    assert paper.estimate(push) == pytest.approx(38 + 1.25 * (0.0476 + 45_000 / 1.68e6) * 50 * 10)
+
+
+def finished(run):
+    """A trial as `tables.read` gives it, of two epochs."""
+    settings = {**identity.settings(run), "engine": "none", "source": ""}
+    curve = {"epoch": [1, 2], "env_steps": [1, 2], "wall_seconds": [1.0, 2.0], "success_rate": [0.0, 0.1 * run.seed]}
+    final = {"success_rate": 0.0, "reset_success_rate": 0.0, "return_mean": 0.0, "episodes": 1}
+    return {
+        "settings": settings,
+        "seed": run.seed,
+        "status": "finished",
+        "lanes": 1,
+        "final": final,
+        "curve": curve,
+        "folder": run,
+    }
+
+
+def test_every_comparison_is_of_settings_that_the_set_has(trials):
+    """By the names under which their curves are written."""
+    named = {}
+    for sweep, runs in trials.items():
+        (groups,) = comparison.groups([finished(run) for run in runs]).values()
+        assert len(groups) == sweep.settings, sweep.name
+        for group in groups:
+            named[sweep.task, sweep.name, paper.named(sweep, group.label)] = len(group.seeds)
+    needed = {(c.task, c.sweep, c.setting) for family in paper_set.FAMILIES.values() for c in family}
+    needed |= {(c.task, *paper_set._baseline(c)) for family in paper_set.FAMILIES.values() for c in family}
+    assert needed <= set(named)
+    assert set(named) - needed == {("push", "samplers", "episode")}
+    assert set(named.values()) == {10}
+
+
+def test_no_family_is_larger_than_ten_pairs_can_decide():
+    """The least p of ten pairs is 2 / 2^10, and Holm's first step multiplies it by the family's size."""
+    assert all(2 / 2**10 * len(family) < 0.05 for family in paper_set.FAMILIES.values())
+
+
+def test_what_ten_seeds_can_show():
+    """A paired t test of ten pairs finds an effect of 1.0 spreads four times in five (Cohen 1988: n = 10, d = 0.996)."""
+    assert paper_set.detectable(1.0, 10, 0.05) == pytest.approx(0.996, abs=0.002)
+    assert paper_set.detectable(0.02, 10, 0.05) == pytest.approx(0.0199, abs=1e-4)
+    draws = np.random.default_rng(0).normal(0.996, 1.0, (20_000, 10))
+    t = draws.mean(axis=1) / (draws.std(axis=1, ddof=1) / math.sqrt(10))
+    assert abs((t > 2.262).mean() - 0.8) < 0.01  # 2.262: the 97.5 % point of t with nine degrees of freedom
+
+
+def write_curves(folder, task, settings):
+    """A file of curves of ten seeds and three epochs; `settings` maps sweep and setting to success in all epochs."""
+    with (folder / f"{task}_curves.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, paper.COLUMNS)
+        writer.writeheader()
+        for (sweep, setting), level in settings.items():
+            for seed in range(10):
+                for epoch in (1, 2, 3):
+                    rate = level + 0.01 * (seed % 2)  # the same for a seed, so differences do not vary
+                    values = (sweep, setting, seed, epoch, epoch, f"{rate:g}")
+                    writer.writerow(dict(zip(paper.COLUMNS, values)))
+
+
+def test_verdicts_by_hand(tmp_path):
+    main = {("slide", "future"): 0.5, ("slide", "weighted"): 0.51}
+    write_curves(tmp_path, "slide", {**main, ("noise_slide", "future, random_noise 0"): 0.4})
+    write_curves(tmp_path, "push", {("samplers", "future"): 0.5, ("samplers", "weighted"): 0.53})
+    rows = paper_set.rows(paper_set.load_set(tmp_path))
+    assert [row[:2] for row in rows] == [
+        ["the paper's claim", "Push"],
+        ["the paper's claim", "Slide"],
+        ["settings of Slide", "Slide"],
+    ]
+    assert rows[0][5:8] == ["+0.030", "+0.030 to +0.030", "0.002"]
+    assert rows[1][5] == "+0.010"
+    assert rows[2][5] == "-0.100"
+    assert [row[8] for row in rows] == ["", "", ""]  # no family is whole, so none is corrected
+    write_curves(tmp_path, "pick_and_place", {("pick_and_place", name): 0.5 for name in ("future", "weighted")})
+    rows = paper_set.rows(paper_set.load_set(tmp_path))
+    # Of 2/1024, 2/1024 and 1: Holm gives 6/1024, 6/1024 and 1.
+    assert [(row[1], row[8], row[9]) for row in rows[:3]] == [
+        ("Push", "0.0059", "better"),
+        ("PickAndPlace", "1.00", "alike"),
+        ("Slide", "0.0059", "better"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "p", "said"),
+    [
+        (0.001, 0.03, 0.04, "better"),
+        (-0.03, -0.001, 0.04, "worse"),
+        (-0.01, 0.015, 0.5, "alike"),
+        (-0.01, 0.025, 0.5, "not shown"),
+        (0.001, 0.03, 0.06, "not shown"),
+        (0.001, 0.015, math.nan, "alike"),
+    ],
+)
+def test_what_is_said_of_an_interval(low, high, p, said):
+    assert paper_set.verdict(low, high, p) == said
+
+
+def test_curves_out_of_order_are_refused(tmp_path):
+    path = tmp_path / "curves.csv"
+    path.write_text("sweep,setting,seed,epoch,success_rate\na,b,0,1,0.5\na,b,0,3,0.5\n")
+    with pytest.raises(ValueError, match="epoch 3 of a, b is out of order"):
+        paper_analysis.read(path)
+
+
+def test_a_figure_that_is_none_is_refused(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["paper.py", "samplrs"])
+    with pytest.raises(SystemExit) as ended:
+        paper.main()
+    assert ended.value.code == 2
+    assert "got samplrs" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_figure_goes_on_where_it_was_stopped(tmp_path, number):
+    """On a toy: stopped after its first run, it keeps that one, and its curves are those of a figure that was not."""
+    argv = [sys.executable, str(ROOT / "bench" / "paper.py"), "--toy", "settings", "--out"]
+    subprocess.run([*argv, str(tmp_path / "whole")], check=True, timeout=600)
+    command = [*argv, str(tmp_path / "cut")]
+    cut = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+    ended = []
+    for line in cut.stdout:
+        ended.append(line)
+        if "50%" in line:  # a signal to one is passed on; a kill is of all of them
+            cut.send_signal(number) if number == signal.SIGTERM else os.killpg(cut.pid, number)
+    assert cut.wait() != 0, ended
+    assert not (tmp_path / "cut" / "noise_slide").exists()
+    subprocess.run(command, check=True, timeout=600)
+    curves = [(tmp_path / name / "curves" / "slide_curves.csv").read_text() for name in ("whole", "cut")]
+    assert curves[0] == curves[1]
+    assert len(curves[0].splitlines()) == 1 + 2 * 2 * 3  # two sweeps, two seeds, three epochs
