@@ -53,6 +53,7 @@ def test_list_names_all_that_there_is(capsys):
         "presets": ("auto", *presets.PRESETS),
         "samplers": spec.SAMPLERS,
         "kernels": spec.WEIGHT_KERNELS,
+        "normalizations": spec.WEIGHT_NORMALIZATIONS,
         "metrics": spec.METRICS,
         "priorities": spec.PRIORITIES,
         "generators": spec.GENERATORS,

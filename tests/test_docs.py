@@ -155,13 +155,3 @@ def test_other_commands_name_what_is_there(document):
             flags = {word for word in words[2:] if word.startswith("--")}
             missing = [flag for flag in flags if flag not in script and flag[2:].replace("-", "_") not in script]
             assert not missing, f"{line}: {missing}"
-
-
-@pytest.mark.parametrize("document", DOCUMENTS)
-def test_tables_are_tables(document):
-    """Each has a head, a line below it, and as many columns in every row."""
-    prose = re.sub(r"```.*?```", "", DOCUMENTS[document], flags=re.S)
-    for table in re.findall(r"(?:^\|.*\n)+", prose, re.M):
-        rows = [re.sub(r"`[^`]*`|\\\|", "", row) for row in table.splitlines()]
-        assert re.fullmatch(r"\|(:?-+:?\|)+", rows[1].replace(" ", "")), f"{document}: no table begins with {rows[0]}"
-        assert {row.count("|") for row in rows} == {rows[0].count("|")}, f"{document}: {rows[0]}"

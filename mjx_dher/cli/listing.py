@@ -37,13 +37,21 @@ KINDS: dict[str, dict[str, str]] = {
         "final": "the last goal of the episode",
         "closest": "the future goal nearest to the desired one (the paper's method 1); reads metric",
         "epsilon_closest": "any future goal with probability epsilon, else the closest (method 2); reads metric, epsilon",
-        "weighted": "nearer future goals likelier (method 3); reads metric, weight_kernel, temperature",
+        "weighted": "nearer future goals likelier (method 3); reads metric, weight_kernel, weight_normalization, temperature",
         "next_future": "the step's own next goal, one time in her_k, else any future one (Next-Future)",
     },
     "kernels": {
         "linear": "weights that fall linearly with the relative distance",
         "inverse": "weights that fall as a power of the relative distance",
         "softmax": "weights that fall exponentially with the relative distance",
+    },
+    "normalizations": {
+        "mean": "distances relative to their mean",
+        "sum": "distances relative to their sum: all but future",
+        "max": "distances relative to the largest",
+        "minmax": "distances from the smallest to the largest, as 0 to 1",
+        "none": "distances relative to weight_scale, in metres",
+        "far": "mean, mirrored: farther goals likelier",
     },
     "metrics": {
         "position": "Euclidean distance between goals",
@@ -77,6 +85,7 @@ KINDS: dict[str, dict[str, str]] = {
     "networks": {
         "mlp": "hidden layers with ReLU",
         "layer_norm": "mlp with layer normalization in the critics",
+        "fan_in": "mlp with first weights and biases as PyTorch's",
     },
 }
 # The option that takes a name of each kind; those with "module:attribute" take a part of the user's own, too.
@@ -86,6 +95,7 @@ OPTIONS = {
     "presets": "--preset",
     "samplers": "--sampler",
     "kernels": "--weight-kernel",
+    "normalizations": "--weight-normalization",
     "metrics": "--metric",
     "priorities": "--priority",
     "generators": "--generator",
@@ -96,7 +106,7 @@ OPTIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class ListArgs:
-    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, generators, learners and networks.
+    """Name all tasks, engines, presets and parts (samplers, kernels, learners and so on), in a line each.
 
     All but engines and presets can be your own, too, as module:attribute (docs/tutorial.md).
     """
