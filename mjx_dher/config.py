@@ -103,7 +103,7 @@ class HParams(NamedTuple):
     """Adam's step size (learning rate) for the critic."""
     lr_end: Share = 1.0
     """Fraction of both step sizes that is left at the end of the run, reached linearly; 1: constant."""
-    adam_eps: Annotated[float, Number("(0, 1]")] = 1e-8
+    adam_eps: Annotated[float, Number("[1e-30, 1]")] = 1e-8
     """Number that Adam adds to the root of the second moments. The gradients of W workers summed, not averaged, are the same
     as this divided by W."""
     gamma: Annotated[float, Number("[0, 1)")] = 0.98
@@ -126,7 +126,7 @@ class HParams(NamedTuple):
     """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
     temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0
     """Evenness of the weights, for weighted: the larger, the more even (infinite: the same as future)."""
-    weight_scale: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 0.05
+    weight_scale: Annotated[float, Number("[1e-6, 1e6]"), ReadBy("weighted")] = 0.05
     """Distance that counts as 1, in metres, for weighted with weight_normalization none."""
     target_noise: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.2
     """Standard deviation of the Gaussian noise on the actions of targets, which smooths these."""

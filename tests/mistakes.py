@@ -150,28 +150,11 @@ KERNELS = {
 # Normalizations: (distance [T+1], candidates [T+1], scale []) -> relative distance [T+1].
 
 
-def mean_alone(distance, candidates, scale):
-    return jnp.mean(distance)
-
-
 def by_least(distance, candidates, scale):
     return distance / jnp.min(jnp.where(candidates, distance, jnp.inf))
 
 
-def rank(distance, candidates, scale):
-    return jnp.argsort(distance)
-
-
-def two_distances(distance, candidates):
-    return distance
-
-
-NORMALIZATIONS = {
-    "mean_alone": r"must be floats \[30\]; they are float32 \[\]",
-    "by_least": "not finite, for distances of 0 throughout",
-    "rank": r"must be floats \[30\]; they are int32 \[30\]",
-    "two_distances": r"weight_normalization must be a function \(distance, candidates, scale\)",
-}
+NORMALIZATIONS = {"by_least": "not finite, for distances of 0 throughout"}
 
 # Priorities: (episode, compute_reward, hparams) -> [].
 

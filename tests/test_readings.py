@@ -11,6 +11,7 @@ from test_samplers import ACHIEVED, DESIRED, HP, table
 from mjx_dher import samplers
 from mjx_dher.config import HParams
 from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
+from mjx_dher.testing import check_normalization
 
 # The candidates after step 1 are at 1, 3 and 2. At a scale of 2 m, x = d / 2 is 0.5, 1.5 and 1.
 READINGS = [
@@ -105,3 +106,27 @@ def test_readings_are_lanes_of_one_program():
     for choice, sampler in enumerate(every):
         np.testing.assert_allclose(samplers.probabilities(joined(choice)), table(sampler, 1), atol=1e-6)
     assert joined._cache_size() == 1
+
+
+@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+def test_a_scale_of_any_size_that_is_allowed_leaves_goals(kernel):
+    """With a micrometre the nearest is likeliest, by however little; with 1,000 km it is `future` but for rounding."""
+    sampler, future = samplers.make("weighted", kernel, normalization="none"), table(samplers.make("future"), 0)
+    tiny, huge = (table(sampler, 0, HP._replace(weight_scale=scale)) for scale in (1e-6, 1e6))
+    assert np.isfinite(tiny).all()
+    assert np.argmax(tiny) == 2
+    np.testing.assert_allclose(huge, future, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("normalization", "said"),
+    [
+        (lambda distance, candidates, scale: jnp.mean(distance), r"must be floats \[30\]; they are float32 \[\]"),
+        (lambda distance, candidates, scale: jnp.argsort(distance), r"must be floats \[30\]; they are int32 \[30\]"),
+        (lambda distance, candidates, scale: jnp.where(candidates, distance, jnp.nan), "not finite, for distances from 0.01"),
+        (lambda distance, candidates: distance, r"must be a function \(distance, candidates, scale\)"),
+    ],
+)
+def test_what_is_no_normalization_is_named(normalization, said):
+    with pytest.raises(ValueError, match=f"weight_normalization.*{said}"):
+        check_normalization(normalization)
