@@ -4,12 +4,14 @@ import io
 import os
 import sys
 
+import numpy as np
 import pytest
 from conftest import ROOT
 from rich.console import Console
 
-from mjx_dher import cli, names
+from mjx_dher import RunSpec, cli, names
 from mjx_dher.cli import common
+from mjx_dher.runs.loop import Progress
 
 
 def test_a_polyak_that_is_likely_a_tau_is_explained():
@@ -34,11 +36,26 @@ def test_a_number_in_a_sweep_is_named_as_it_is_there(capsys):
 
 
 def test_a_curve_of_characters():
-    assert common.sparkline([0.0, 0.5, 1.0]) == "▁▅█"
-    assert common.sparkline([0.0, 0.5, 1.0], ascii_only=True) == " =#"
-    assert common.sparkline([0.0] * 50 + [1.0] * 50, width=4) == "▁▁██"
-    assert common.sparkline([]) == ""
-    assert common.sparkline([float("nan"), 2.0, -1.0]) == "▁█▁"
+    assert common.sparkline([0.0, 0.5, 1.0], 3) == "▁▅█"
+    assert common.sparkline([0.0, 0.5, 1.0], 3, ascii_only=True) == " =#"
+    assert common.sparkline([0.0] * 50 + [1.0] * 50, 100, width=4) == "▁▁██"
+    assert common.sparkline([1.0] * 50, 100, width=4) == "██··"
+    assert common.sparkline([], 2) == "··"
+    assert common.sparkline([float("nan"), 2.0, -1.0], 3) == "▁█▁"
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_nothing_of_the_progress_is_cut_on_a_narrow_terminal(width):
+    screen = io.StringIO()
+    shown = common.Screen(Console(file=screen, force_terminal=True, width=width, color_system=None), [RunSpec()], [0.25])
+    metrics = {"success_rate": np.asarray(0.75), "return_mean": np.asarray(-20.0)}
+    shown.show([RunSpec()], Progress(2, 4, 2000, 200, 4.0, 2.0, metrics, None, True))
+    shown.close()
+    assert "\u2026" not in screen.getvalue()
+    last = screen.getvalue().rsplit("epoch 2/4", 1)
+    assert "▃▇··" in last[0]
+    assert "ETA" in last[1]
+    assert "0.75" in last[1]
 
 
 def test_messages_name_the_program_that_was_started(monkeypatch):

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
-from rich.table import Table
+from rich.table import Column, Table
 
 from mjx_dher import envs
 from mjx_dher.config import check_count, check_number
@@ -188,8 +188,10 @@ class Screen:
         self._success = list(success)  # of those that train now, an epoch each
         self._bar: Bar | None = None
         if console.is_terminal:
-            columns = (BarColumn(bar_width=20), TextColumn("{task.fields[curve]}"), TextColumn("{task.description}"))
-            self._bar = Bar(*columns, console=console)
+            # The curve of one run fills up as the run goes on, and so is its bar. A narrow terminal folds the text.
+            bar = () if self._single else (BarColumn(bar_width=20),)
+            text = TextColumn("{task.description}", table_column=Column(no_wrap=False, overflow="fold"))
+            self._bar = Bar(*bar, TextColumn("{task.fields[curve]}"), text, console=console)
             self._task = self._bar.add_task("...", total=self._total, curve="")
             self._bar.start()
 
@@ -208,7 +210,7 @@ class Screen:
         last = progress.epoch == progress.num_epochs
         line = self._line_of_one(progress, eta) if self._single else self._line_of_many(specs, progress, eta)
         if self._bar is not None:
-            curve = sparkline(self._success, ascii_only=self._console.options.ascii_only)
+            curve = sparkline(self._success, progress.num_epochs, ascii_only=self._console.options.ascii_only)
             self._bar.update(self._task, completed=self._done, description=line, curve=curve)
         elif self._single or last or time.monotonic() - self._printed > SECONDS_PER_LINE:
             self._console.print(line, soft_wrap=True, highlight=False)
@@ -240,11 +242,15 @@ class Screen:
             self._bar.stop()
 
 
-def sparkline(rates: Sequence[float], width: int = CURVE_WIDTH, ascii_only: bool = False) -> str:
-    """Returns a curve of rates in [0, 1] as a line of at most `width` characters, each the mean of its share of them."""
-    levels = " .:-=+*#" if ascii_only else "▁▂▃▄▅▆▇█"
-    parts = np.array_split(np.clip(np.nan_to_num(rates), 0, 1), min(width, len(rates))) if len(rates) else ()
-    return "".join(levels[min(int(part.mean() * len(levels)), len(levels) - 1)] for part in parts)
+def sparkline(rates: Sequence[float], total: int, width: int = CURVE_WIDTH, ascii_only: bool = False) -> str:
+    """Returns a curve of rates in [0, 1], an epoch each, in at most `width` characters that stand for as many epochs each.
+
+    Those that are left of `total` epochs are points.
+    """
+    levels, point = (" .:-=+*#", "_") if ascii_only else ("▁▂▃▄▅▆▇█", "·")
+    shares = np.array_split(np.arange(total), min(width, total))
+    parts = [np.clip(np.nan_to_num(rates[share[0] : share[-1] + 1]), 0, 1) for share in shares]
+    return "".join(levels[min(int(part.mean() * len(levels)), len(levels) - 1)] if len(part) else point for part in parts)
 
 
 def clock(seconds: float) -> str:
