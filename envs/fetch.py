@@ -49,6 +49,21 @@ class FetchTask:
     max_goal_lift: float = 0.0  # half of all goals are lifted by up to this
     finger_qvel: tuple[float, float] = (0.0, 0.0)  # settled, m/s, right and left; for fingers with joints
 
+    @property
+    def goal_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] of the goals that a reset draws."""
+        bounds = np.add(self.initial_grip_pos, self.target_offset) + self.target_range * np.array([[-1.0], [1.0]])
+        if self.object_height is not None:
+            bounds[:, 2] = self.object_height, self.object_height + self.max_goal_lift
+        return bounds
+
+    @property
+    def object_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] at which a reset puts the object."""
+        bounds = self.initial_grip_pos + self.object_range * np.array([[-1.0], [1.0]])
+        bounds[:, 2] = self.object_height
+        return bounds
+
 
 class FetchEnv(GoalEnv):
     """The Fetch arm and, except for reaching, an object; the goal is a position of the object (or of the gripper).
@@ -122,6 +137,19 @@ class FetchEnv(GoalEnv):
         """Returns the state of an episode that is played for another goal, [3] m."""
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
         return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
+
+    def with_object(self, state: State, position: Array) -> State:
+        """Returns the state after a hand has put the object to `position`, [3] m, upright and at rest."""
+        upright = jnp.concatenate([jnp.asarray(position, jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0])])
+        qpos, qvel = (
+            x.at[at].set(y)
+            for x, at, y in ((state.physics.qpos, self._object_qpos, upright), (state.physics.qvel, self._object_qvel, 0.0))
+        )
+        physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
+        obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
+        return dataclasses.replace(
+            state, physics=physics, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"])
+        )
 
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
