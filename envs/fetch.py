@@ -18,7 +18,7 @@ import numpy as np
 from mjx_dher.config import check_count, check_number
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Physics, make_engine
-from mjx_dher.envs.kinematics import Chain, quat_multiply
+from mjx_dher.envs.kinematics import Chain, integrate
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
@@ -255,7 +255,7 @@ class FetchEnv(GoalEnv):
         qpos, qvel = physics.qpos, physics.qvel
         late = qpos.at[self.arm.qpos].add(-TIMESTEP * qvel[self.arm.qvel])
         if self.has_object:
-            late = late.at[self._object_qpos].set(_integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
+            late = late.at[self._object_qpos].set(integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
         return dataclasses.replace(physics, qpos=late)
 
     def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
@@ -341,14 +341,6 @@ def matrix_to_euler(matrix: Array) -> Array:
     b = jnp.arctan2(matrix[0, 2], cos_b)
     c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
     return jnp.stack([a, b, c])
-
-
-def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
-    """Returns a free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
-    half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
-    x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
-    turn = jnp.stack([jnp.cos(half_angle), x, y, z])
-    return jnp.concatenate([qpos[:3] + dt * qvel[:3], quat_multiply(qpos[3:], turn)])
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:

@@ -42,11 +42,11 @@ from mjx_dher.viewer import page
 class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
-    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `view RUN` shows one in the
-    browser, `demo` a policy that is part of the package, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch task, `export RUN` writes its policy for other programs, `sweep`
-    trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a page about a run or a sweep, `list` names all
-    tasks and parts, `check` tries out parts of your own, `doctor` says what works on this machine, `completion SHELL` is for
-    your shell (see `eval --help` and so on); `--version`.
+    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `view RUN` shows one in
+    the browser, `demo` a policy of the package, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch
+    task, `export RUN` writes its policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves,
+    `report DIR` writes a page about a run or a sweep, `list` names all tasks and parts, `check` tries out parts of your own,
+    `doctor` says what works on this machine, `completion SHELL` is for your shell (see `eval --help` and so on); `--version`.
     """
 
     spec: RunSpec
