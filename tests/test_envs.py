@@ -5,7 +5,7 @@ import pytest
 from conftest import load_recorded
 
 from mjx_dher import envs
-from mjx_dher.envs import fetch
+from mjx_dher.envs import fetch, kinematics
 from mjx_dher.envs.engines import Physics, resolve_engine
 
 ENGINES = ("native", "jax")

@@ -50,6 +50,20 @@ def test_the_command_on_a_card_describes_the_run(name):
     assert parse_train_args(arguments).spec == run
 
 
+def test_the_documents_have_every_policy():
+    """The table has the figures of the cards, and the site the cards."""
+    page, index = ((ROOT / "docs" / name).read_text() for name in ("policies.md", "index.md"))
+    for name in policies.names():
+        facts, result = facts_of(name), results.read(policies.FOLDER / name)
+        rates = " | ".join(
+            f"{x['success_rate']:.3f} ({x['success_low']:.3f} to {x['success_high']:.3f})" if x else "not measured"
+            for x in (facts["here"], facts["original"])
+        )
+        card = f"../mjx_dher/policies/{name}/README.md"
+        assert f"| `{name}` | {rates} | {result['env_steps']:,} | [card]({card}) |\n" in page
+        assert f"[{name}]({card})" in index
+
+
 def test_every_setting_can_be_told_by_a_command():
     run = mjx_dher.preset("gpu", "slide", sampler="closest", metric="position", seed=7)
     config = run.config.__class__(**{**run.config.__dict__, "hidden_sizes": (64, 32), "n_step": 2})
