@@ -18,7 +18,7 @@ import numpy as np
 from mjx_dher.config import check_count, check_number
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Physics, make_engine
-from mjx_dher.envs.kinematics import Chain, quat_multiply
+from mjx_dher.envs.kinematics import Chain, integrate
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
@@ -48,6 +48,21 @@ class FetchTask:
     min_object_distance: float = 0.1  # and at least this far from it in the plane
     max_goal_lift: float = 0.0  # half of all goals are lifted by up to this
     finger_qvel: tuple[float, float] = (0.0, 0.0)  # settled, m/s, right and left; for fingers with joints
+
+    @property
+    def goal_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] of the goals that a reset draws."""
+        bounds = np.add(self.initial_grip_pos, self.target_offset) + self.target_range * np.array([[-1.0], [1.0]])
+        if self.object_height is not None:
+            bounds[:, 2] = self.object_height, self.object_height + self.max_goal_lift
+        return bounds
+
+    @property
+    def object_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] at which a reset puts the object."""
+        bounds = self.initial_grip_pos + self.object_range * np.array([[-1.0], [1.0]])
+        bounds[:, 2] = self.object_height
+        return bounds
 
 
 class FetchEnv(GoalEnv):
@@ -122,6 +137,19 @@ class FetchEnv(GoalEnv):
         """Returns the state of an episode that is played for another goal, [3] m."""
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
         return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
+
+    def with_object(self, state: State, position: Array) -> State:
+        """Returns the state after a hand has put the object to `position`, [3] m, upright and at rest."""
+        upright = jnp.concatenate([jnp.asarray(position, jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0])])
+        qpos, qvel = (
+            x.at[at].set(y)
+            for x, at, y in ((state.physics.qpos, self._object_qpos, upright), (state.physics.qvel, self._object_qvel, 0.0))
+        )
+        physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
+        obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
+        return dataclasses.replace(
+            state, physics=physics, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"])
+        )
 
     def step(self, state: State, action: Array) -> State:
         """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
@@ -227,7 +255,7 @@ class FetchEnv(GoalEnv):
         qpos, qvel = physics.qpos, physics.qvel
         late = qpos.at[self.arm.qpos].add(-TIMESTEP * qvel[self.arm.qvel])
         if self.has_object:
-            late = late.at[self._object_qpos].set(_integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
+            late = late.at[self._object_qpos].set(integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
         return dataclasses.replace(physics, qpos=late)
 
     def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
@@ -313,14 +341,6 @@ def matrix_to_euler(matrix: Array) -> Array:
     b = jnp.arctan2(matrix[0, 2], cos_b)
     c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
     return jnp.stack([a, b, c])
-
-
-def _integrate(qpos: Array, qvel: Array, dt: float) -> Array:
-    """Returns a free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
-    half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
-    x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
-    turn = jnp.stack([jnp.cos(half_angle), x, y, z])
-    return jnp.concatenate([qpos[:3] + dt * qvel[:3], quat_multiply(qpos[3:], turn)])
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:

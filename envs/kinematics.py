@@ -1,4 +1,4 @@
-"""Forward kinematics of the arm: pose and velocity of the gripper at given joint angles."""
+"""Kinematics: pose and velocity of the gripper at given joint angles, and how a free joint moves."""
 
 from __future__ import annotations
 
@@ -132,3 +132,11 @@ def quat_multiply(a: Array, b: Array) -> Array:
     # A sum, not a dot product, whose precision on a GPU would be the learner's.
     w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
+
+
+def integrate(qpos: Array, qvel: Array, dt: float) -> Array:
+    """Returns a free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
+    half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
+    x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
+    turn = jnp.stack([jnp.cos(half_angle), x, y, z])
+    return jnp.concatenate([qpos[:3] + dt * qvel[:3], quat_multiply(qpos[3:], turn)])

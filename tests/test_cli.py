@@ -133,7 +133,7 @@ BAD = [
     (
         ["evall", "runs/x"],
         [
-            "command must be one of train, resume, eval, render, transfer, export, sweep, plot, report, list, check, doctor,",
+            "command must be one of train, resume, eval, render, view, demo, transfer, export, sweep, plot, report, list, ",
             "got 'evall' (did you mean 'eval'?)",
         ],
     ),

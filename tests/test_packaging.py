@@ -16,7 +16,7 @@ import mjx_dher
 # All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
     "types names stats cli.commands cli.output tools.page host.files host.memory host.private_api host.subprocesses",
-    "hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
+    "policies hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
     "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
     "spec view policy evaluate readings hopper.kernels envs.engines.native envs.engines.mjx tools.render",
@@ -30,21 +30,24 @@ LAYERS = [
     "envs.engines.fused.simulation",
     "envs.engines.warp",
     "relabel learners learners.common learners.critics runs.run_folder envs.engines",
+    "viewer.page viewer.scene viewer.player",
     "updates testing.trial learners.stored learners.actors runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
     "trainer learners.ddpg learners.actor_critic runs.options runs.results",
     "testing.learner testing.views runs.loop runs.load learners.td3 learners.sac learners.redq learners.tqc",
     "envs.push envs.pick_and_place envs.slide envs.reach",
     "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
-    "testing runs.program sweeps.tables tools.doctor tools.programs",
-    "runs.driver cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
-    "cli.check cli.export cli.evaluate cli.render cli.transfer",
-    "sweeps.sweep sweeps.plotting cli.train",
+    "testing runs.program viewer.panel sweeps.tables tools.doctor tools.programs",
+    "runs.driver runs.critic cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
+    "viewer.sources cli.check cli.export cli.evaluate cli.render cli.transfer",
+    "sweeps.sweep sweeps.plotting viewer.server",
+    "cli.view",
+    "cli.train",
     "cli.sweep sweeps.report",
     "cli.plot",
     "cli.report",
     "cli",
 ]
-EMPTY = "envs.engines.fused hopper host methods runs sweeps tools"  # folders: they hold a docstring
+EMPTY = "envs.engines.fused hopper host methods runs sweeps tools viewer"  # folders: they hold a docstring
 
 
 def modules():
@@ -154,6 +157,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(distributions):
     assert {name.split("/")[0] for name in names} == {"mjx_dher", f"mjx_dher-{mjx_dher.__version__}.dist-info"}
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
     expected |= {f"mjx_dher/envs/{path.relative_to(ROOT / 'envs')}" for path in (ROOT / "envs").rglob("*.py")}
+    expected |= {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher" / "policies").glob("*/*.*")}
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
     expected |= {"mjx_dher/py.typed", "mjx_dher/hopper/kernels.cu"}
     assert {name for name in names if name.startswith("mjx_dher/")} == expected

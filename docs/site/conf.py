@@ -26,7 +26,15 @@ release = mjx_dher.__version__
 author = "The mjx-dher authors"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 root_doc = "docs/index"
-include_patterns = ["*.md", ".github/*.md", "docs/*.md", "docs/*.ipynb", "docs/api/*.md", "bench/*.md"]
+include_patterns = [
+    "*.md",
+    ".github/*.md",
+    "docs/*.md",
+    "docs/*.ipynb",
+    "docs/api/*.md",
+    "bench/*.md",
+    "mjx_dher/policies/*/*.md",
+]
 html_theme = "furo"
 html_title = f"mjx-dher {release}"
 html_extra_path = ["index.html"]  # the front page's address: it leads to docs/index.html

@@ -6,6 +6,8 @@ COMMANDS = {
     "resume": "mjx_dher.cli.train:resume_command",
     "eval": "mjx_dher.cli.evaluate:eval_command",
     "render": "mjx_dher.cli.render:render_command",
+    "view": "mjx_dher.cli.view:view_command",
+    "demo": "mjx_dher.cli.view:demo_command",
     "transfer": "mjx_dher.cli.transfer:transfer_command",
     "export": "mjx_dher.cli.export:export_command",
     "sweep": "mjx_dher.cli.sweep:sweep_command",

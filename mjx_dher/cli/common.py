@@ -16,7 +16,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
-from mjx_dher import envs
+from mjx_dher import envs, policies
 from mjx_dher.config import check_count, check_number
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
@@ -126,6 +126,20 @@ def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
                 if line not in tried:
                     tried.add(line)
                     console.print(line, soft_wrap=True)
+
+
+def find_run(run: Path, console: Console) -> Path:
+    """Returns the run folder that `run` names, and prints which it is where the name is that of a policy of the package.
+
+    Raises:
+      FolderError: there is none.
+    """
+    path = policies.find(run)
+    if policies.is_shipped(path):
+        console.print(f"{run}: the policy of the package; its card is {path / policies.CARD}", soft_wrap=True)
+    elif str(run) in policies.names():
+        console.print(f"{run}: the run in the current folder, not the policy of the package by that name", soft_wrap=True)
+    return path
 
 
 def read_run(path: Path, console: Console) -> RunSpec:

@@ -16,6 +16,7 @@ from mjx_dher.cli.common import (
     changed_arguments,
     check_engine,
     check_episodes,
+    find_run,
     make_env,
     print_summary,
     read_run,
@@ -28,10 +29,10 @@ from mjx_dher.spec import RunSpec, to_arguments
 
 @dataclasses.dataclass(frozen=True)
 class EvalArgs:
-    """Evaluate the policy of one run folder again, or of several, one after the other."""
+    """Evaluate a policy again, or several, one after the other: those of run folders, or of the package, such as push."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders."""
+    """Run folders, or policies of the package, such as push."""
     episodes: int = 500
     """Episodes to play."""
     seed: int = 1
@@ -48,17 +49,18 @@ def eval_command(argv: list[str], console: Console) -> int:
     """Evaluates the policies of run folders."""
     args = tyro.cli(EvalArgs, prog=f"{names.program()} eval", args=argv)
     if not args.runs:
-        raise ValueError("eval takes one or more run folders; got none")
+        raise ValueError("eval takes one or more run folders, or policies of the package; got none")
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
     remarks = Console(stderr=True, highlight=False, markup=False, emoji=False) if args.json else console
-    runs = [changed_arguments(read_run(path, remarks), args.env_kwargs) for path in args.runs]
+    folders = [find_run(run, remarks) for run in args.runs]
+    runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:
         settle_compiler(args.engine or run.engine)
     from mjx_dher.runs.load import load_policy
 
-    policies = [load_policy(path) for path in args.runs]  # all of them, before any is played
+    policies = [load_policy(folder) for folder in folders]  # all of them, before any is played
     keep_compiled_programs()
     for path, run, policy in zip(args.runs, runs, policies):
         _evaluate(args, path, run, policy, console)

@@ -8,23 +8,25 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import names, policies
+from mjx_dher.cli.common import find_run
 from mjx_dher.runs import run_folder
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
-    """Write the policy of a run folder as a file for other programs, and check that the file gives the same actions.
+    """Write a policy as a file for other programs, and check that the file gives the same actions.
 
     docs/policies.md describes the files. Needs the extra: `pip install -e ".[export]"`.
     """
 
     run: tyro.conf.Positional[Path]
-    """Run folder."""
+    """Run folder, or a policy of the package, such as push."""
     format: str
     """Format: onnx (a graph from observation and goal to action) or safetensors (the tensors alone)."""
     out: Path | None = None
-    """File to write, which ends in the format's name; policy.onnx or policy.safetensors in the run folder unless given."""
+    """File to write, which ends in the format's name; policy.onnx or policy.safetensors in the run folder unless
+    given, and push.onnx or so in the current one for a policy of the package."""
     overwrite: bool = False
     """Replacement of an existing `out`."""
 
@@ -36,10 +38,12 @@ def export_command(argv: list[str], console: Console) -> int:
 
     args = tyro.cli(ExportArgs, prog=f"{names.program()} export", args=argv)
     names.check_name("format", args.format, export.FORMATS)
-    run = run_folder.read_spec(args.run)
-    out = args.out or args.run / f"policy.{args.format}"
+    folder = find_run(args.run, console)
+    run = run_folder.read_spec(folder)
+    beside = Path(f"{folder.name}.{args.format}") if policies.is_shipped(folder) else folder / f"policy.{args.format}"
+    out = args.out or beside
     export.check(args.format, out, args.overwrite)
-    policy = load_policy(args.run)
+    policy = load_policy(folder)
     check_plain(policy, run, "export")
     difference = export.write(policy, run, args.format, out)
     observation_size, goal_size, action_size = export.sizes(policy)

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, names
-from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, make_env, read_run
+from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, find_run, make_env, read_run
 from mjx_dher.host.caches import check_platform
 from mjx_dher.names import check_name
 from mjx_dher.runs import run_folder
@@ -19,7 +19,7 @@ from mjx_dher.spec import RunSpec, to_arguments
 
 @dataclasses.dataclass(frozen=True)
 class RenderArgs:
-    """Play the policy of a run folder, or a task with random actions, and draw it: a video, or stills side by side.
+    """Play the policy of a run folder, one of the package, or random actions, and draw it: a video, or stills side by side.
 
     Needs no screen (EGL or OSMesa draw; MUJOCO_GL chooses) but the extra: `pip install -e ".[video]"`.
     """
@@ -27,7 +27,7 @@ class RenderArgs:
     out: Path
     """File to write: .mp4, .gif or .png (stills of the first episode). Its folder must exist."""
     run: tyro.conf.Positional[Path | None] = None
-    """Run folder; or else give --env."""
+    """Run folder, or a policy of the package, such as push; or else give --env."""
     env: str | None = None
     """Environment (a name, or module:attribute), played with uniformly random actions, where there is no run folder."""
     episodes: int = 4
@@ -57,7 +57,8 @@ def render_command(argv: list[str], console: Console) -> int:
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
     if args.run is not None and args.env is None:
-        played, policy = read_run(args.run, console), load_policy(args.run)
+        folder = find_run(args.run, console)
+        played, policy = read_run(folder, console), load_policy(folder)
     elif args.env is not None and args.run is None:
         check_name("env", args.env, envs.list_envs(), own=True)
         played, policy = RunSpec(env=args.env), None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from mjx_dher.cli.common import (
     try_parts,
     warn_of_tau,
 )
+from mjx_dher.cli.view import PORT, Beside, Page
 from mjx_dher.host import files
 from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
@@ -33,17 +35,18 @@ from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import RunSpec
 from mjx_dher.tools import figures
+from mjx_dher.viewer import page
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
-    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `render RUN` draws
-    episodes, `transfer RUN` plays one in the original Fetch task, `export RUN` writes its policy for other programs, `sweep`
-    trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a page about a run or a sweep, `list` names all
-    tasks and parts, `check` tries out parts of your own, `doctor` says what works on this machine, `completion SHELL` is for
-    your shell (see `eval --help` and so on); `--version`.
+    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `view RUN` shows one in
+    the browser, `demo` a policy of the package, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch
+    task, `export RUN` writes its policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves,
+    `report DIR` writes a page about a run or a sweep, `list` names all tasks and parts, `check` tries out parts of your own,
+    `doctor` says what works on this machine, `completion SHELL` is for your shell (see `eval --help` and so on); `--version`.
     """
 
     spec: RunSpec
@@ -58,6 +61,10 @@ class TrainArgs:
     """Say what would be trained, and what it takes, and write nothing."""
     curve: bool = True
     """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
+    view: bool = False
+    """Show in the browser how the run learns: the policy after each epoch, at play. Needs the extra view."""
+    view_port: int = PORT
+    """Port of that page; 0: any that is free."""
     options: Options = dataclasses.field(default_factory=Options)
 
 
@@ -100,12 +107,14 @@ def train_command(argv: list[str], console: Console) -> int:
             console.print(line, soft_wrap=True)
     if args.dry_run:
         return _dry_run(args, console)
+    port = page.check(Page().host, args.view_port) if args.view else None
     with run_folder.claim_new(args.out, args.spec) as folder:
         settle_compiler(args.spec.engine)
         prepare()
         env = make_env(args.spec)
         try_parts(env, [args.spec], console)
-        return _train(env, args.spec, folder, args.options, args.curve, console)
+        with Beside(folder, port, console) as beside:
+            return _train(env, args.spec, folder, args.options, args.curve, console, beside.after_epoch)
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
@@ -241,7 +250,15 @@ def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     return args
 
 
-def _train(env: Any, run: RunSpec, folder: Path, options: Options, curve: bool, console: Console) -> int:
+def _train(
+    env: Any,
+    run: RunSpec,
+    folder: Path,
+    options: Options,
+    curve: bool,
+    console: Console,
+    after_epoch: Callable[[], None] = lambda: None,
+) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
     from mjx_dher.runs import driver
     from mjx_dher.runs.claims import last_checkpoint
@@ -254,6 +271,7 @@ def _train(env: Any, run: RunSpec, folder: Path, options: Options, curve: bool, 
         screen.show(specs, progress)
         if curve:
             figures.preload()
+        after_epoch()
 
     warn_of_tau(run.hparams.polyak, console)
     try:

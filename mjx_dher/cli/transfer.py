@@ -9,20 +9,20 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import names
-from mjx_dher.cli.common import check_engine, check_episodes, make_env, print_summary, read_run, settle_compiler
+from mjx_dher.cli.common import check_engine, check_episodes, find_run, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs import run_folder
 
 
 @dataclasses.dataclass(frozen=True)
 class TransferArgs:
-    """Play the policy of a run folder, unchanged, in the original task of gymnasium-robotics and here, and compare.
+    """Play a policy, unchanged, in the original task of gymnasium-robotics and here, and compare.
 
     The original needs an older MuJoCo, and so an environment of its own: --set-up makes it once.
     """
 
     run: tyro.conf.Positional[Path]
-    """Run folder."""
+    """Run folder, or a policy of the package, such as push."""
     episodes: int = 500
     """Episodes to play, there and here."""
     seed: int = 1000
@@ -40,7 +40,8 @@ def transfer_command(argv: list[str], console: Console) -> int:
     args = tyro.cli(TransferArgs, prog=f"{names.program()} transfer", args=argv)
     check_engine(args.engine)
     check_episodes(args.episodes, args.seed)
-    run = read_run(args.run, console)
+    folder = find_run(args.run, console)
+    run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)
     from mjx_dher.envs.engines.native import usable_cores
     from mjx_dher.runs.load import check_fits, check_plain, load_policy
@@ -48,7 +49,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     from mjx_dher.stats import difference_interval
     from mjx_dher.tools import originals
 
-    policy = load_policy(args.run)
+    policy = load_policy(folder)
     check_plain(policy, run, "transfer")
     environment = originals.default_environment()
     if args.set_up:
@@ -62,7 +63,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     env = make_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
-    theirs = originals.play_apart(args.run, python, args.episodes, args.seed, workers=usable_cores())
+    theirs = originals.play_apart(folder, python, args.episodes, args.seed, workers=usable_cores())
     summary_original = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
     print_summary(summary_original, console)
     console.print(f"{run.env} here, {args.episodes} episodes, physics {run_folder.engine_name(env)} ...")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher import policies
 from mjx_dher.host.files import FolderError
 from mjx_dher.policy import Policy, from_arrays
 from mjx_dher.runs.run_folder import POLICY_FILE, read_spec
@@ -16,19 +17,20 @@ from mjx_dher.spec import RunSpec
 
 
 def load_policy(run_dir: str | Path) -> Policy:
-    """Returns the policy of a run folder, or of its policy.npz. Imports NumPy only: no JAX, no MuJoCo, no environment.
+    """Returns a policy of the package by its name, or that of a run folder. Imports NumPy only: no JAX, no MuJoCo.
 
     The policy of a learner or networks of one's own is a `learners.stored.StoredPolicy`, which is called alike and needs JAX,
     and the run folder.
 
     Args:
-      run_dir: a run folder, or a policy.npz, wherever it lies and whatever its name is.
+      run_dir: a run folder, a policy.npz, wherever it lies and whatever its name is, or a name among `policies.names()`, such
+        as "push". A run folder or file in the current folder by that name comes first.
 
     Raises:
       FolderError: there is no run folder of this program, or its policy is missing, damaged, or of a learner or networks of
         one's own that cannot be imported or do not fit it.
     """
-    run_dir = Path(run_dir)
+    run_dir = policies.find(run_dir)
     spec, path = (None, run_dir) if run_dir.is_file() else (read_spec(run_dir), run_dir / POLICY_FILE)
     if not path.is_file():
         raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")

@@ -1,0 +1,196 @@
+"""Puts the policy of a run into the package, with a card: `python docs/publish_policy.py RUN --machine "..." --commit ...`.
+
+The run folder is copied to mjx_dher/policies, under the name of its task, in place of the policy that is there. Before that the
+policy is played, here and, where the originals' environment is set up (`train.py transfer --set-up`), in the original task.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import shutil
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from mjx_dher import envs, policies, presets, spec  # noqa: E402
+from mjx_dher.host import files  # noqa: E402
+from mjx_dher.runs import results, run_folder  # noqa: E402
+from mjx_dher.spec import RunSpec  # noqa: E402
+
+LIMIT = 5_000_000  # bytes of all policies together
+KEPT = (run_folder.CONFIG_FILE, run_folder.METRICS_FILE, run_folder.POLICY_FILE, run_folder.RESULT_FILE)
+TITLES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide", "reach": "Reach"}
+
+
+def command(run: RunSpec) -> list[str]:
+    """Returns the arguments of train.py that describe a run: the preset that needs the fewest others, and those."""
+    return min((_arguments(name, run) for name in presets.PRESETS), key=len)
+
+
+def _arguments(preset: str, run: RunSpec) -> list[str]:
+    base = presets.preset(preset, run.env, run.learner)
+    given = ["--env", run.env, "--preset", preset]
+    if run.learner != presets.preset(preset, run.env).learner:
+        given += ["--learner", run.learner]
+    for owner, default in ((run, base), (run.config, base.config), (run.hparams, base.hparams)):
+        for name, value in _fields(owner).items():
+            if name not in ("env", "learner", "config", "hparams") and value != _fields(default)[name]:
+                given += [f"--{name.replace('_', '-')}", *map(_text, value if isinstance(value, tuple) else (value,))]
+    return given if "--seed" in given else [*given, "--seed", str(run.seed)]
+
+
+def _fields(owner: Any) -> dict[str, Any]:
+    if dataclasses.is_dataclass(owner):
+        return {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
+    return dict(owner._asdict())
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def card(folder: Path) -> str:
+    """Returns the card of the policy in `folder`, made of what is there: config.json, result.json and card.json."""
+    content, run = run_folder.read(folder)
+    result, facts = results.read(folder), policies.facts(folder)
+    versions = content["versions"]
+    sizes = ", ".join(map(str, run.config.hidden_sizes))
+    rows = {
+        "success here": f"{_rate(facts['here'])}, on `{facts['here']['physics']}`",
+        "success in the original": _original(facts["original"]),
+        "already at reset": f"{facts['here']['reset_success_rate']:.3f} of the episodes here",
+        "learner": f"`{run.learner}`, networks `{run.networks}`, hidden layers of {sizes}",
+        "sampler, seed": f"`{run.sampler}`, {run.seed}",
+        "environment steps": f"{result['env_steps']:,}",
+        "training": f"{result['wall_seconds']:,.0f} s on {facts['machine']}, physics `{content['physics']}`",
+        "commit": f"`{facts['commit']}`",
+        "versions": ", ".join(f"{name} {versions[name]}" for name in ("jax", "mujoco", "numpy", "python")),
+        "published": facts["date"],
+    }
+    settings = {**_fields(run.config), **_fields(run.hparams)}
+    settings = {name: x for name, x in settings.items() if spec.reads(run.sampler, run.learner, name)}
+    numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, tuple) else _text(x)}" for name, x in settings.items())
+    return "\n".join(
+        (
+            f"# The policy `{folder.name}`",
+            "",
+            f"Plays {TITLES[run.env]}: `python train.py view {folder.name}`, `mjx_dher.load_policy({folder.name!r})`.",
+            "",
+            "| | |",
+            "|---|---|",
+            *(f"| {name} | {value} |" for name, value in rows.items()),
+            "",
+            "This command trains it again. Another machine, or other versions, round otherwise, and so learn another policy.",
+            "",
+            "```bash",
+            f"python train.py {' '.join(command(run))}",
+            "```",
+            "",
+            *textwrap.wrap(f"Its settings: {numbers}.", 150, break_long_words=False),
+            "",
+        )
+    )
+
+
+def _rate(outcome: dict[str, Any]) -> str:
+    low, high = outcome["success_low"], outcome["success_high"]
+    return (
+        f"**{outcome['success_rate']:.3f}** (95 % interval {low:.3f} to {high:.3f}, {outcome['episodes']:,} episodes from seed"
+        f" {outcome['seed']})"
+    )
+
+
+def _original(outcome: dict[str, Any] | None) -> str:
+    return "not measured" if outcome is None else f"{_rate(outcome)}, {outcome['task']} on {' and '.join(outcome['versions'])}"
+
+
+def check(folder: Path, run: RunSpec) -> None:
+    """Raises ValueError for a run that cannot be part of the package."""
+    if (problem := results.problem(folder)) is not None:
+        raise ValueError(problem)
+    if results.read(folder)["status"] != run_folder.FINISHED:
+        raise ValueError(f"{folder} has failed; a policy of the package is of a run that has ended well")
+    if run.env not in TITLES or spec.own_parts(run):
+        raise ValueError(f"{folder} is of parts of its user's own, which a user of the package does not have")
+
+
+def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) -> dict[str, Any]:
+    """Plays the policy here, on native, and in the original where `python` has it; returns both summaries."""
+    from mjx_dher.envs.engines.native import usable_cores
+    from mjx_dher.host.caches import keep_compiled_programs
+    from mjx_dher.runs.load import check_fits, check_plain, load_policy
+    from mjx_dher.runs.play import play, summarize
+    from mjx_dher.tools import originals
+
+    policy = load_policy(folder)
+    check_plain(policy, run, "the package")
+    keep_compiled_programs()
+    env = envs.make(run.env, engine="native")
+    check_fits(policy, env)
+    here = {**summarize(*play(env, policy, episodes, seed)), "seed": seed, "physics": "native"}
+    if not originals.is_ready(python):
+        return {"here": here, "original": None}
+    theirs = originals.play_apart(folder, python, episodes, seed, workers=usable_cores())
+    summary = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
+    about = {"seed": seed, "task": originals.ORIGINALS[run.env], "versions": list(originals.REQUIREMENTS)}
+    return {"here": here, "original": {**summary, **about}}
+
+
+def publish(folder: Path, target: Path, facts: dict[str, Any], anyway: bool) -> None:
+    """Writes a run folder, with its card, in place of what is in `target`.
+
+    Raises:
+      ValueError: the policy there is better, unless `anyway`, or all policies together are too large.
+    """
+    if (target / policies.FACTS).exists() and not anyway:
+        before = policies.facts(target)["here"]["success_rate"]
+        if before > facts["here"]["success_rate"]:
+            raise ValueError(
+                f"the policy there scores {before:.3f}, this one {facts['here']['success_rate']:.3f}; see --anyway"
+            )
+    others = sum(path.stat().st_size for path in target.parent.rglob("*") if path.is_file() and target not in path.parents)
+    if (size := others + sum((folder / name).stat().st_size for name in KEPT)) > LIMIT:
+        raise ValueError(f"all policies together would take {size:,} bytes; the limit is {LIMIT:,}")
+    if target.exists():
+        shutil.rmtree(target)
+    files.make_folder(target)
+    for name in KEPT:
+        shutil.copyfile(folder / name, target / name)
+    files.write_json(target / policies.FACTS, facts)
+    (target / policies.CARD).write_text(card(target))
+
+
+def main(argv: Sequence[str]) -> None:
+    """Publishes a run's policy."""
+    from mjx_dher.tools import originals
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--machine", required=True, help='that it was trained on, as a reader is told: "2 cores of ..."')
+    parser.add_argument("--commit", required=True, help="that it was trained with")
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1000)
+    parser.add_argument("--python", type=Path, default=originals.interpreter(originals.default_environment()))
+    parser.add_argument("--anyway", action="store_true", help="also where the policy that is there is better")
+    args = parser.parse_args(argv)
+    run = run_folder.read_spec(args.run)
+    check(args.run, run)
+    facts = {"machine": args.machine, "commit": args.commit, "date": datetime.date.today().isoformat()}
+    facts |= measure(args.run, run, args.episodes, args.seed, args.python)
+    target = policies.FOLDER / run.env
+    publish(args.run, target, facts, args.anyway)
+    print((target / policies.CARD).read_text())
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except ValueError as error:
+        sys.exit(f"error: {error}")

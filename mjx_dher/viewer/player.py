@@ -1,0 +1,201 @@
+"""An environment and a policy in step with a clock: play, pause, move goal and object, count what is reached. Draws nothing."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_dher.tools.render import FPS, check_drawable
+
+SECONDS_PER_STEP = 1 / FPS  # of an environment, in real time
+HOLD = 15  # steps for which the end of an episode is shown before the next one begins
+SHOWN = 250  # steps that the curves show
+MOST_STEPS = 10  # that are made up for where the machine is too slow; the rest is dropped
+
+Act = Callable[[Mapping[str, np.ndarray]], np.ndarray]  # observation of one state -> action [A]
+Value = Callable[[Mapping[str, np.ndarray], np.ndarray], float]  # observation, action [A] -> what a critic expects
+Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]  # lowest and highest x, y and z
+
+
+class Game(NamedTuple):
+    """An environment and its functions for one state, compiled."""
+
+    env: Any
+    reset: Callable[[Any], Any]  # seed [] -> state
+    step: Callable[[Any, Any], Any]  # state, action [A] -> state
+    move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None where it cannot be moved
+    move_object: Callable[[Any, Any], Any] | None  # the same
+
+
+def make_game(env: Any) -> Game:
+    """Compiles an environment's functions. A goal can be moved where it has `with_goal`, an object where it has `with_object`.
+
+    Raises:
+      ValueError: the environment cannot be drawn.
+    """
+    check_drawable(env)
+    has_object = getattr(env, "has_object", True)  # the tasks here share their methods, and not all have an object
+    game = Game(
+        env=env,
+        reset=jax.jit(lambda seed: env.reset(jax.random.key(seed))),
+        step=jax.jit(env.step),
+        move_goal=jax.jit(env.with_goal) if hasattr(env, "with_goal") else None,
+        move_object=jax.jit(env.with_object) if hasattr(env, "with_object") and has_object else None,
+    )
+    state = game.reset(np.uint32(0))
+    game.step(state, np.zeros(env.action_size, np.float32))
+    for move in (game.move_goal, game.move_object):
+        if move is not None:
+            move(state, np.zeros(3, np.float32))
+    return game
+
+
+def bounds(env: Any, dragged: str) -> Bounds | None:
+    """Returns where a "goal" or an "object" may be put by hand: where resets put it, which is what policies have seen.
+
+    None where the environment does not tell.
+    """
+    box = getattr(getattr(env, "task", None), f"{dragged}_bounds", None)
+    return None if box is None else tuple((float(low), float(high)) for low, high in np.transpose(box))  # type: ignore[return-value]
+
+
+@dataclasses.dataclass
+class Tally:
+    """A count of attempts, and of those that ended with the goal reached."""
+
+    attempts: int = 0
+    reached: int = 0
+
+    def add(self, reached: bool) -> None:
+        """Counts an attempt."""
+        self.attempts += 1
+        self.reached += reached
+
+    def __str__(self) -> str:
+        return f"{self.reached} of {self.attempts}" + (f" ({self.reached / self.attempts:.0%})" if self.attempts else "")
+
+
+class Player:
+    """A policy at play in an environment.
+
+    An attempt lasts as many steps as an episode. It begins with a reset, or whenever goal or object are moved, and ends as an
+    evaluation's episode does: it is counted by whether the goal is reached at its last step. While `renew` is set, the next
+    episode begins then; it is unset when something is moved, so that nothing is taken out of a user's hand.
+
+    Args:
+      game: the environment.
+      act: the policy.
+      value: a critic, where there is one.
+      seed: of the first episode; the next ones have the next numbers.
+    """
+
+    def __init__(self, game: Game, act: Act, value: Value | None = None, seed: int = 1):
+        self.game, self.act, self.value = game, act, value
+        self.playing, self.renew, self.speed = True, True, 1.0
+        self.episodes, self.own = Tally(), Tally()  # attempts after a reset, and after a hand
+        self.note = ""
+        # Of the last steps: time, s; distance to the goal, m; the critic's value, or NaN.
+        self.history: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=SHOWN)
+        self._seed, self._steps, self._owed = seed, 0, 0.0
+        self.new_episode()
+
+    def new_episode(self) -> None:
+        """Begins the next episode."""
+        self._state = self.game.reset(np.uint32(self._seed % 2**32))
+        self._seed += 1
+        self.clock, self._held, self.is_own, self.note = 0, 0, False, ""
+        self._look()
+
+    def advance(self, seconds: float) -> int:
+        """Plays for so many seconds of the clock on the wall, times the speed; returns the number of steps made."""
+        if not self.playing:
+            return 0
+        self._owed += seconds * self.speed / SECONDS_PER_STEP
+        steps = int(self._owed + 1e-6)
+        self._owed = self._owed - steps if steps <= MOST_STEPS else 0.0
+        for _ in range(min(steps, MOST_STEPS)):
+            self.step()
+        return min(steps, MOST_STEPS)
+
+    def step(self) -> None:
+        """Makes one step of the environment, or holds the end of an episode for one."""
+        if self._held:
+            self._held -= 1
+            if not self._held:
+                self.new_episode()
+            return
+        self._state = self.game.step(self._state, self.act(self.obs))
+        self.clock += 1
+        self._steps += 1
+        self._look()
+        failed = self._failed
+        if failed or self.clock == self.length:
+            (self.own if self.is_own else self.episodes).add(self.success)
+            self._held = HOLD if failed or self.renew else 0
+        if failed:
+            self.note = "The physics blew up; a new episode begins."
+
+    def move_goal(self, position: np.ndarray) -> None:
+        """Puts the goal to a position [3], m, or as near to it as it may be, and begins an attempt of the user's own."""
+        self._move(self.game.move_goal, "goal", position)
+
+    def move_object(self, position: np.ndarray) -> None:
+        """Puts the object to a position [3], m, or as near to it as it may be; see `move_goal`."""
+        self._move(self.game.move_object, "object", position)
+
+    def _move(self, move: Callable[[Any, Any], Any] | None, dragged: str, position: np.ndarray) -> None:
+        position = np.asarray(position, np.float32)
+        if move is None or position.shape != (3,) or not np.all(np.isfinite(position)):
+            raise ValueError(f"the {dragged} cannot be moved to {position}")
+        box = bounds(self.game.env, dragged)
+        if box is not None:
+            position = np.clip(position, *np.transpose(box)).astype(np.float32)
+        if self._failed:  # which only a reset mends
+            self.new_episode()
+        self._state = move(self._state, position)
+        self.clock, self._held, self.is_own, self.renew = 0, 0, True, False
+        self._look()
+
+    def replace(self, act: Act, value: Value | None) -> None:
+        """Plays another policy from here on, and counts anew."""
+        self.act, self.value = act, value
+        self.episodes, self.own = Tally(), Tally()
+        self._look()
+
+    @property
+    def length(self) -> int:
+        """Steps of an attempt."""
+        return int(self.game.env.episode_length)
+
+    @property
+    def success(self) -> bool:
+        """Success: whether the goal is reached."""
+        return bool(np.asarray(self._state.success) > 0.5)
+
+    @property
+    def distance(self) -> float:
+        """Distance of what should be at the goal from it, m."""
+        return float(np.linalg.norm(self.obs["achieved_goal"] - self.obs["desired_goal"]))
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Configuration [nq], in the layout of the environment's model."""
+        return np.asarray(self._state.physics.qpos, np.float64)
+
+    @property
+    def _failed(self) -> bool:
+        return bool(np.any(getattr(self._state, "failed", False)))
+
+    def _look(self) -> None:
+        """Notes what is to be seen of the state."""
+        self.obs = {name: np.asarray(x, np.float32) for name, x in self._state.obs.items()}
+        value = float("nan") if self.value is None else self.value(self.obs, self.act(self.obs))
+        now = self._steps * SECONDS_PER_STEP
+        if self.history and self.history[-1][0] == now:  # moved, or begun anew, since the last step
+            self.history.pop()
+        self.history.append((now, self.distance, value))

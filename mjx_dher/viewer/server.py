@@ -1,0 +1,212 @@
+"""The viewer's server: a page in the browser that shows a player's scene, and takes a user's commands. Needs viser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
+from mjx_dher.viewer import page
+from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
+from mjx_dher.viewer.player import SECONDS_PER_STEP, Game, Player, bounds, make_game
+from mjx_dher.viewer.scene import Poses, add
+from mjx_dher.viewer.sources import Cast, Source
+
+_REACHED = (60, 180, 75)  # colour of a goal that is reached
+_SECONDS_PER_LOOK = 1.0  # between looks for a policy that has been trained further
+_SECONDS_PER_CURVE = 0.25
+_BACK = 1.3  # how much farther away than the model's camera the page's is
+
+
+class Viewer:
+    """A page with a scene and a panel, and what plays in it. Use it in a `with` block, and call `run`.
+
+    Args:
+      sources: policies to choose from; the first is at play.
+      make_env: makes a source's environment.
+      host, port: where the page is served, as `page.check` gave the port.
+      seed: of the first episode.
+
+    Raises:
+      ValueError: the first policy cannot be played, its environment cannot be drawn, or the port is taken.
+    """
+
+    def __init__(self, sources: Sequence[Source], make_env: Callable[[Source], Any], host: str, port: int, seed: int):
+        self._sources = {source.label: source for source in sources}
+        self._make_env, self._seed = make_env, seed
+        self._games: dict[tuple[Any, ...], Game] = {}
+        self._commands = Commands()
+        self._taken, self._held = DRAGGED[0], False  # what has the handle, and whether a user holds it
+        self._handle: Any = None
+        self._cast, self.player = self._prepare(sources[0])
+        self._server = _start(host, port)
+        self.address = page.address(host, self._server.get_port())
+        self._panel = Panel(self._server.gui, list(self._sources), self._commands, self.choose, lambda: self.player, self.take)
+        self._draw_scene()
+        self._name()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # viser says that it stops
+            self._server.stop()
+
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> None:
+        """Plays, in real time, while a browser looks; returns when told to stop, and on Ctrl-C raises KeyboardInterrupt."""
+        looked = drawn = before = time.monotonic()
+        while not should_stop():
+            started = time.monotonic()
+            commanded = self._commands.run()
+            watched = bool(self._server.get_clients())
+            moved = self.player.advance(started - before) if watched else 0
+            before = started
+            if started - looked > _SECONDS_PER_LOOK:
+                looked = started
+                if self._cast.refresh():
+                    self.player.replace(self._cast.act, self._cast.value)
+                    self._name()
+            if moved or commanded:
+                curves = started - drawn > _SECONDS_PER_CURVE
+                drawn = started if curves else drawn
+                with self._server.atomic():
+                    self.show(curves)
+            time.sleep(max(0.002, SECONDS_PER_STEP / max(1.0, self.player.speed) / 2 - (time.monotonic() - started)))
+
+    def choose(self, label: str) -> None:
+        """Plays the policy by this name; one that cannot be played is told in the panel, and the one before goes on."""
+        source = self._sources[label]
+        if _place(source) not in self._games:
+            self._panel.say(f"compiling `{source.env}` ...")
+        try:
+            cast, player = self._prepare(source)
+        except ValueError as error:
+            self._name()
+            self._panel.say(f"{label} cannot be played: {error}")
+            return
+        other_scene = _place(source) != _place(self._cast.source)
+        self._cast, self.player = cast, player
+        self._panel.adopt()
+        if other_scene:
+            self._draw_scene()
+        self._name()
+        self.show(True)
+
+    def _prepare(self, source: Source) -> tuple[Cast, Player]:
+        if _place(source) not in self._games:
+            self._games[_place(source)] = make_game(self._make_env(source))
+        game = self._games[_place(source)]
+        cast = Cast(source, game.env)
+        return cast, Player(game, cast.act, cast.value, self._seed)
+
+    def _name(self) -> None:
+        self._panel.name(self._cast.source.label, self._cast.about(), self._cast.critic, self._cast.value is not None)
+
+    def show(self, curves: bool) -> None:
+        """Shows the player's state."""
+        positions, orientations = self._poses.at(self.player.qpos)
+        for body, node in self._nodes.items():
+            if body:  # the world stays where it is
+                node.position, node.wxyz = positions[body], orientations[body]
+        places = {"goal": self.player.obs["desired_goal"], "object": self.player.obs["achieved_goal"]}
+        if self._handle is not None and not self._held:
+            self._handle.position = places[self._taken]
+        colour = _REACHED if self.player.success else _rgb(GOAL_RGBA)
+        if self._ball.color != colour:
+            self._ball.color = colour
+        self._ball.position = places["goal"]
+        self._panel.update(curves)
+
+    def take(self, dragged: str) -> None:
+        """Gives the handle to one of `DRAGGED`."""
+        self._taken = dragged
+        self._draw_scene()
+
+    def _draw_scene(self) -> None:
+        """Draws the environment anew."""
+        scene, env = self._server.scene, self.player.game.env
+        for name in ("/bodies", "/handle", "/ball"):
+            with contextlib.suppress(KeyError, ValueError):
+                scene.remove_by_name(name)
+        self._held = False
+        self._poses, self._nodes = Poses(env.model), add(scene, env.model)
+        moves = {"goal": self.player.game.move_goal, "object": self.player.game.move_object}
+        self._handle = None if moves.get(self._taken) is None else self._add_handle(self._taken)
+        look: dict[str, Any] = {"opacity": GOAL_RGBA[3], "cast_shadow": False, "receive_shadow": False}
+        self._ball = scene.add_icosphere("/ball", GOAL_RADIUS, _rgb(GOAL_RGBA), subdivisions=3, **look)
+        self._aim(env.model)
+        self.show(True)
+
+    def _add_handle(self, dragged: str) -> Any:
+        limits = bounds(self.player.game.env, dragged) or ((0.0, 1.0),) * 3
+        handle = self._server.scene.add_transform_controls(
+            "/handle",
+            scale=0.14,
+            line_width=4.0,
+            disable_rotations=True,
+            # Its own limits are for the way that it has been dragged, not for where it is: the player keeps it in bounds.
+            active_axes=tuple(high - low > 1e-9 for low, high in limits),
+        )
+
+        async def on_update(event: Any) -> None:  # a coroutine: what a thread ran could come out of order
+            position, phase = np.array(event.target.position), event.phase
+            self._commands.put(lambda: self._drag(dragged, position, phase))
+
+        handle.on_update(on_update)
+        return handle
+
+    def _drag(self, dragged: str, position: np.ndarray, phase: str) -> None:
+        """Follows a hand: `phase` is start, update or end."""
+        self._held = phase != "end"
+        if phase == "update":
+            {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](position)
+
+    def _aim(self, model: Any) -> None:
+        """Puts the cameras where the model's camera "front" is, if it has one."""
+        cameras = [model.camera(index) for index in range(model.ncam) if model.camera(index).name == "front"]
+        if not cameras:
+            return
+        position, center = np.array(cameras[0].pos), np.array(model.stat.center)
+        matrix = np.zeros(9)
+        import mujoco
+
+        mujoco.mju_quat2Mat(matrix, cameras[0].quat)
+        forward = -matrix.reshape(3, 3)[:, 2]
+        look_at = position + forward * float(np.dot(center - position, forward))
+        position = look_at + _BACK * (position - look_at)  # the panel takes a third of the page
+        for camera in (self._server.initial_camera, *(client.camera for client in self._server.get_clients().values())):
+            camera.position, camera.look_at = position, look_at
+            camera.fov = float(np.radians(cameras[0].fovy[0]))
+
+
+def _place(source: Source) -> tuple[Any, ...]:
+    """Returns what sources that are played in the same environment have in common."""
+    return source.env, source.env_kwargs
+
+
+def _start(host: str, port: int) -> Any:
+    """Starts viser's server.
+
+    Raises:
+      ValueError: another program has taken the port since it was checked.
+    """
+    import viser
+
+    with contextlib.redirect_stdout(io.StringIO()):  # the address is told by whoever started this
+        server = viser.ViserServer(host=host, port=port, label="mjx-dher", verbose=False)
+        if server.get_port() != port:  # it takes the next that is free
+            server.stop()
+            raise page.in_use(host, port, "another program has taken it")
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+    server.scene.configure_environment_map("studio", environment_intensity=0.22)  # light from all sides
+    return server
+
+
+def _rgb(rgba: Sequence[float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * x) for x in rgba[:3])
+    return red, green, blue

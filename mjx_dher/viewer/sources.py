@@ -1,0 +1,160 @@
+"""What the viewer can play: policies of run folders, which may still be trained, those of the package, and random actions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher import policies
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import critic, load, results, run_folder, sinks
+from mjx_dher.spec import RunSpec, to_arguments, to_texts
+from mjx_dher.viewer.player import Act, Value
+
+RANDOM = "random actions"
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A policy by name, and the environment that it is played in."""
+
+    label: str
+    env: str
+    folder: Path | None = None  # of the run; None for random actions
+    run: RunSpec | None = None
+    env_kwargs: tuple[str, ...] = ()  # arguments of the environment, NAME=VALUE each
+
+
+def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequence[str] = ()) -> Source:
+    """Returns the source of a run's policy, which must be there.
+
+    Args:
+      label: its name for the user.
+      folder: of the run.
+      env: the environment to play it in; its own, with its own arguments, where None.
+      env_kwargs: arguments of the environment that take the place of those, NAME=VALUE each.
+
+    Raises:
+      FolderError: no run folder, or one without a policy.
+    """
+    run = run_folder.read_spec(folder)
+    if not (folder / run_folder.POLICY_FILE).is_file():
+        raise FolderError(f"{folder / run_folder.POLICY_FILE} is missing: no epoch of the run has ended yet")
+    arguments = {**(run.env_arguments if env is None else {}), **to_arguments(env_kwargs)}
+    return Source(label, env or run.env, folder, run, to_texts(arguments))
+
+
+def of_package() -> list[Source]:
+    """Returns the sources of the policies that are part of the package."""
+    return [of_run(name, policies.FOLDER / name) for name in policies.names()]
+
+
+def by_random(env: str, env_kwargs: Sequence[str] = ()) -> Source:
+    """Returns the source of uniformly random actions in an environment."""
+    return Source(f"{RANDOM}, {env}", env, env_kwargs=to_texts(to_arguments(env_kwargs)))
+
+
+class Cast:
+    """A source's policy, and its critic where it has one, in an environment; follows a run that is still being trained.
+
+    Raises:
+      ValueError: the policy cannot be read, or is of other sizes than the environment.
+    """
+
+    def __init__(self, source: Source, env: Any):
+        self.source, self._env = source, env
+        self.value: Value | None = None
+        self.critic = "" if source.folder else "Random actions have no critic."
+        self.act: Act = _random(env.action_size)
+        self._seen: tuple[int, ...] = ()
+        self._critic_seen: Path | None = None
+        if source.folder is not None:
+            self._load()
+            self._load_critic()
+
+    def refresh(self) -> bool:
+        """Loads what has been trained since, and returns whether there is anything new."""
+        if self.source.folder is None or self._stamp() == self._seen:
+            return False
+        try:
+            self._load()
+        except ValueError:  # gone, or damaged, since it was read: what was read goes on
+            self._seen = self._stamp()
+            return False
+        self._load_critic()
+        return True
+
+    def about(self) -> str:
+        """Returns how far the run has come, as Markdown."""
+        folder = self.source.folder
+        if folder is None:
+            return f"{RANDOM} in `{self._env_name}`"
+        text = f"`{self._env_name}`"
+        try:
+            if results.exists(folder):
+                result = results.read(folder)
+                measured = policies.facts(folder)["here"] if policies.is_shipped(folder) else result
+                return (
+                    f"{text}, trained: success {measured['success_rate']:.3f} in {measured['episodes']:,} episodes after"
+                    f" {result['env_steps']:,} steps"
+                )
+            row: Mapping[str, Any] = sinks.read_rows(folder / run_folder.METRICS_FILE)[-1]
+            return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
+        except (FolderError, KeyError, IndexError, OSError, ValueError):  # what it plays is whole, and that is what counts
+            return text
+
+    @property
+    def _env_name(self) -> str:
+        return self.source.env
+
+    def _stamp(self) -> tuple[int, ...]:
+        assert self.source.folder is not None
+        try:
+            stat = (self.source.folder / run_folder.POLICY_FILE).stat()
+        except OSError:
+            return ()
+        return stat.st_mtime_ns, stat.st_size, stat.st_ino
+
+    def _load(self) -> None:
+        assert self.source.folder is not None
+        stamp = self._stamp()
+        policy = load.load_policy(self.source.folder)
+        try:
+            load.check_fits(policy, self._env)
+        except ValueError as error:
+            raise ValueError(f"{self.source.label} cannot be played in {self._env_name}: {error}") from None
+        self.act, self._seen = policy, stamp
+
+    def _load_critic(self) -> None:
+        """Loads the critic in the newest checkpoint, if there is another one than was read."""
+        folder, run = self.source.folder, self.source.run
+        assert folder is not None
+        assert run is not None
+        if policies.is_shipped(folder):
+            self.critic = "No critic: the policies of the package come without one."
+            return
+        newest = next(iter(run_folder.checkpoints(folder)), None)
+        if newest is None:
+            if self.value is None:
+                self.critic = (
+                    "No critic: it is in a run's checkpoints, and this run has none (with --keep-end one that has ended has)."
+                )
+            return
+        if newest == self._critic_seen:
+            return
+        self._critic_seen = newest
+        try:
+            loaded = critic.load(folder, run, self._env)
+        except (ValueError, OSError) as error:  # ValueError: kernels that this machine cannot run, too
+            self.critic = f"No critic: {error}."
+            return
+        self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
+
+
+def _random(action_size: int) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
+    draws = np.random.default_rng(0)
+    return lambda obs: draws.uniform(-1.0, 1.0, action_size).astype(np.float32)

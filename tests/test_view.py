@@ -1,0 +1,250 @@
+"""The viewer without a browser: its page, its server, its commands."""
+
+import dataclasses
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+import webbrowser
+
+import numpy as np
+import pytest
+from conftest import ROOT
+
+from mjx_dher import cli, envs, policies
+from mjx_dher.viewer import page, server, sources
+
+
+def reach():
+    return envs.make("reach", engine="native")
+
+
+def of_package(name):
+    return sources.of_run(name, policies.FOLDER / name)
+
+
+@pytest.fixture
+def port():
+    return page.check("127.0.0.1", 0)
+
+
+# The page
+
+
+def test_a_port_that_is_free_is_given(port):
+    assert page.check("127.0.0.1", port) == port
+
+
+def test_a_port_in_use_is_refused():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        number = taken.getsockname()[1]
+        with pytest.raises(ValueError, match=rf"port {number} of 127\.0\.0\.1 cannot be used \(.*in use.*--port, or 0"):
+            page.check("127.0.0.1", number)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "message"),
+    [
+        ("127.0.0.1", -1, r"port must lie in \[0, 65535\]; got -1"),
+        ("127.0.0.1", 65536, r"port must lie in \[0, 65535\]; got 65536"),
+        ("192.0.2.1", 0, "host '192.0.2.1' is no address of this machine"),
+        ("no such host", 0, "host 'no such host' is no address of this machine"),
+        ("a" * 300, 0, "is no address of this machine"),
+    ],
+)
+def test_a_bad_address_is_refused(host, port, message):
+    with pytest.raises(ValueError, match=message):
+        page.check(host, port)
+
+
+def test_the_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=r"the viewer needs viser.*\[view\]"):
+        page.check("127.0.0.1", 0)
+
+
+def test_addresses_are_those_for_a_browser_here():
+    assert page.address("127.0.0.1", 80) == "http://127.0.0.1:80"
+    assert page.address("0.0.0.0", 80) == "http://127.0.0.1:80"
+    assert page.address("::1", 80) == "http://[::1]:80"
+
+
+def test_only_a_browser_with_a_screen_is_opened(monkeypatch):
+    opened = []
+
+    class Screen(webbrowser.BaseBrowser):
+        def open(self, url, new=0, autoraise=True):
+            opened.append(url)
+            return True
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(webbrowser, "get", lambda: Screen("screen"))
+    monkeypatch.setattr(webbrowser, "open", Screen("screen").open)
+    assert not page.open_browser("http://x")  # no display
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert page.open_browser("http://x")
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
+    assert not page.open_browser("http://x")  # it would take the terminal
+
+    def none():
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", none)
+    assert not page.open_browser("http://x")
+    assert opened == ["http://x"]
+
+
+# The server
+
+
+def test_the_page_is_served_and_the_port_is_free_afterwards(port, capsys):
+    with server.Viewer(
+        [of_package("reach"), sources.by_random("reach")], lambda source: reach(), "127.0.0.1", port, 1
+    ) as viewer:
+        assert viewer.address == f"http://127.0.0.1:{port}"
+        with urllib.request.urlopen(viewer.address, timeout=10) as answer:
+            assert answer.status == 200
+            assert b"<html" in answer.read(2000).lower()
+        with pytest.raises(ValueError, match="cannot be used"):
+            page.check("127.0.0.1", port)
+        ends = time.monotonic() + 0.2
+        viewer.run(lambda: time.monotonic() > ends)
+        assert viewer.player.clock == 0  # nobody looks
+        viewer.choose("random actions, reach")
+        assert viewer.player.act is viewer._cast.act
+        assert viewer._panel._critic.content == "Random actions have no critic."
+        viewer.take("object")  # Reach has none
+        assert viewer._handle is None
+    assert page.check("127.0.0.1", port) == port
+    assert capsys.readouterr().out == ""  # what viser prints is not for users
+
+
+def test_a_policy_that_cannot_be_played_is_told_and_the_other_goes_on(port):
+    wrong = dataclasses.replace(of_package("push"), env="reach")
+    with server.Viewer([of_package("reach"), wrong], lambda source: reach(), "127.0.0.1", port, 1) as viewer:
+        before = viewer.player
+        viewer.choose("push")
+        assert viewer.player is before
+        assert "push cannot be played in reach" in viewer._panel._about.content
+        assert viewer._panel._policy.value == "reach"
+
+
+def test_a_hand_moves_the_goal(port):
+    with server.Viewer([of_package("reach")], lambda source: reach(), "127.0.0.1", port, 1) as viewer:
+        viewer._drag("goal", np.zeros(3), "start")
+        assert not viewer.player.is_own  # it is held, not moved
+        viewer._drag("goal", np.array([1.3, 0.8, 0.5]), "update")
+        viewer.show(True)
+        np.testing.assert_allclose(viewer._ball.position, [1.3, 0.8, 0.5], atol=1e-6)
+        np.testing.assert_allclose(
+            viewer._handle.position, viewer.player.game.reset(np.uint32(1)).obs["desired_goal"], atol=1e-6
+        )
+        viewer._drag("goal", np.array([9.0, 0.8, 0.5]), "update")
+        viewer._drag("goal", np.zeros(3), "end")
+        viewer.show(True)
+        highest = viewer.player.game.env.task.goal_bounds[1, 0]
+        np.testing.assert_allclose(
+            viewer._handle.position, [highest, 0.8, 0.5], atol=1e-6
+        )  # it springs back to where goals lie
+
+
+# The commands
+
+BAD = [
+    ([], ["view takes run folders, policies of the package", "push", "--env"]),
+    (["nowhere"], ["nowhere is not a run folder: no such folder"]),
+    (["docs"], ["docs is not a run folder: it has no config.json"]),
+    (["pusch"], ["did you mean 'push'?"]),
+    (["--env", "sldie"], ["env must be one of", "did you mean 'slide'?"]),
+    (["push", "--engine", "wrap"], ["engine", "'wrap'"]),
+    (["push", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
+    (["push", "--port", "70000"], ["port must lie in [0, 65535]"]),
+    (["push", "--host", "192.0.2.1"], ["host '192.0.2.1' is no address of this machine"]),
+]
+
+
+@pytest.mark.parametrize(("argv", "messages"), BAD)
+def test_bad_arguments_are_refused(argv, messages, capsys, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert cli.main(["view", *argv]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert error.startswith("error: ")
+    for message in messages:
+        assert message in error
+
+
+def test_bad_arguments_are_refused_before_jax_or_mujoco_load():
+    code = f"""
+import sys
+from mjx_dher.cli import main
+assert all(main(["view", *argv]) == 2 for argv in {[argv for argv, _ in BAD]!r})
+assert main(["demo", "--port", "-1"]) == 2
+assert main(["train", "--env", "reach", "--view", "--view-port", "-1"]) == 2
+assert not {{"jax", "mujoco", "viser"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
+
+
+def test_a_policy_of_another_environment_ends_the_command(capsys, port):
+    assert cli.main(["view", "push", "--env", "reach", "--port", str(port), "--no-open"]) == 2
+    assert "error: push cannot be played in reach" in capsys.readouterr().err
+    assert page.check("127.0.0.1", port) == port
+
+
+def begun(*argv, **variables):
+    """Starts a command that shows a page; returns the process, once it has told the address, and what it has printed."""
+    environment = {name: x for name, x in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")}
+    process = subprocess.Popen(
+        [sys.executable, "train.py", *argv],
+        cwd=ROOT,
+        env={**environment, **variables},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    lines = []
+    while not lines or "http://" not in lines[-1]:
+        lines.append(process.stdout.readline())
+        assert lines[-1], process.stderr.read()
+    return process, lines
+
+
+def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
+    process, lines = begun("demo", "--port", str(port))
+    assert lines[-1] == f"push is at play: http://127.0.0.1:{port} (Ctrl-C ends it)\n"
+    assert process.stdout.readline() == "there is no browser here that could be opened: open that address in one\n"
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as answer:
+        assert answer.status == 200
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "the viewer has ended\n", "")
+    assert page.check("127.0.0.1", port) == port
+
+
+@pytest.mark.slow
+def test_a_viewer_ends_with_the_run_that_it_shows(port, tmp_path):
+    """`train --view` begins it after the first epoch, and it ends when the run does, even by a kill."""
+    argv = ["--env", "reach", "--preset", "cpu", "--total-steps", "4000000", "--out", str(tmp_path / "run")]
+    process, _ = begun("train", *argv, "--view", "--view-port", str(port))
+    ends = time.monotonic() + 120
+    while _is_free(port):
+        assert time.monotonic() < ends
+        time.sleep(0.2)
+    process.kill()
+    process.communicate()
+    ends = time.monotonic() + 30
+    while not _is_free(port):
+        assert time.monotonic() < ends
+        time.sleep(0.2)
+
+
+def _is_free(port):
+    with socket.socket() as trial:
+        return trial.connect_ex(("127.0.0.1", port)) != 0

@@ -1,0 +1,169 @@
+"""What the viewer draws and plays: scenes, critics, runs that are still being trained."""
+
+import dataclasses
+import shutil
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_dher import Options, RunSpec, envs, policies
+from mjx_dher.config import Config
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import critic, driver
+from mjx_dher.viewer import scene, sources
+
+TINY = Config(
+    num_envs=2,
+    cycles_per_epoch=1,
+    updates_per_cycle=2,
+    target_period=1,
+    batch_size=16,
+    total_steps=200,
+    replay_size=1000,
+    hidden_sizes=(8, 8),
+    eval_episodes=2,
+)
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A run of Reach that was stopped after its first epoch, and so has a checkpoint: (folder, spec)."""
+    folder = tmp_path_factory.mktemp("view") / "run"
+    run = RunSpec(env="reach", engine="native", config=TINY)
+    driver.train_runs(reach(), [run], [folder], options=Options(final_episodes=2), should_stop=lambda: True)
+    return folder, run
+
+
+def reach():
+    return envs.make("reach", engine="native")
+
+
+def of_package(name):
+    return sources.of_run(name, policies.FOLDER / name)
+
+
+# The scene
+
+
+@pytest.mark.parametrize("name", ["push", "pick_and_place", "slide", "reach"])
+def test_what_can_be_seen_of_a_task_is_drawn(name):
+    model = envs.make(name, engine="native").model
+    drawn = {shape.name for shape in scene.shapes(model)}
+    visible = {model.geom(i).name or f"geom_{i}" for i in range(model.ngeom) if model.geom_rgba[i, 3] > 0}
+    assert drawn == visible
+    assert {"floor", "table"} <= drawn
+    assert ("object" in drawn) == (name != "reach")
+    assert not any("stand_in" in shape for shape in drawn)
+
+
+def test_shapes_lie_where_mujoco_has_them():
+    """A shape's place in its body's frame, moved with the body, is MuJoCo's own place of the geom."""
+    env = envs.make("slide", engine="native")
+    qpos = np.asarray(env.reset(jax.random.key(0)).physics.qpos, float)
+    positions, orientations = scene.Poses(env.model).at(qpos)
+    data = mujoco.MjData(env.model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(env.model, data)
+    assert len(scene.shapes(env.model)) > 10
+    for shape in scene.shapes(env.model):
+        turned = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned, shape.pos, orientations[shape.body])
+        index = next(i for i in range(env.model.ngeom) if (env.model.geom(i).name or f"geom_{i}") == shape.name)
+        np.testing.assert_allclose(positions[shape.body] + turned, data.geom_xpos[index], atol=1e-12)
+
+
+def test_every_kind_of_geom_is_drawn():
+    kinds = {
+        "plane": 'size="1 1 1"',
+        "sphere": 'size="0.1"',
+        "capsule": 'size="0.1 0.3"',
+        "ellipsoid": 'size="0.1 0.2 0.3"',
+        "cylinder": 'size="0.1 0.3"',
+        "box": 'size="0.1 0.2 0.3"',
+    }
+    geoms = "".join(f'<geom name="{kind}" type="{kind}" {size}/>' for kind, size in kinds.items())
+    tetrahedron = '<asset><mesh name="t" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>'
+    mesh = '<geom name="mesh" type="mesh" mesh="t"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{tetrahedron}<worldbody>{geoms}{mesh}</worldbody></mujoco>")
+    added = Recorder()
+    nodes = scene.add(added, model)
+    assert set(nodes) == {0}
+    names = [call.rsplit("/", 1)[-1] for call, _, _ in added.calls]
+    assert names == ["0", *kinds, "mesh"]
+    by_name = {call.rsplit("/", 1)[-1]: (args, options) for call, args, options in added.calls}
+    for kind, half in (("capsule", (0.1, 0.1, 0.4)), ("ellipsoid", (0.1, 0.2, 0.3))):
+        vertices = by_name[kind][0][0]
+        np.testing.assert_allclose([vertices.min(axis=0), vertices.max(axis=0)], [np.negative(half), half], atol=2e-3)
+    vertices, faces = by_name["mesh"][0]
+    assert (vertices.shape, faces.shape) == ((4, 3), (4, 3))
+    assert by_name["box"][1]["dimensions"] == (0.2, 0.4, 0.6)
+
+
+class Recorder:
+    """A scene of viser's that notes what is added."""
+
+    def __init__(self):
+        self.calls = []
+
+    def __getattr__(self, method):
+        return lambda name, *args, **options: self.calls.append((name, args, options)) or object()
+
+
+def test_a_geom_that_cannot_be_drawn_is_named():
+    xml = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+        <worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>"""
+    with pytest.raises(ValueError, match="does not draw geoms of kind mjGEOM_HFIELD"):
+        scene.shapes(mujoco.MjModel.from_xml_string(xml))
+
+
+# Critics
+
+
+def test_a_critic_is_in_a_checkpoint(stopped):
+    folder, run = stopped
+    loaded = critic.load(folder, run, reach())
+    assert loaded.epoch == 1
+    obs = {"observation": np.zeros(10, np.float32), "achieved_goal": np.zeros(3), "desired_goal": np.ones(3, np.float32)}
+    assert loaded.value(obs, np.zeros(4, np.float32)) != loaded.value(obs, np.ones(4, np.float32))
+    with pytest.raises(FolderError, match="has no checkpoint"):
+        critic.load(policies.FOLDER / "reach", dataclasses.replace(run), reach())
+
+
+# What is played
+
+
+def test_a_run_that_goes_on_is_followed(stopped, tmp_path):
+    folder, run = tmp_path / "run", stopped[1]
+    shutil.copytree(stopped[0], folder)
+    cast = sources.Cast(sources.of_run("mine", folder), reach())
+    assert cast.critic == "Critic of epoch 1."
+    assert cast.about() == "`reach`, epoch 1: success 0.00 after 100 steps"
+    assert not cast.refresh()
+    obs = {"observation": np.ones(10), "achieved_goal": np.zeros(3), "desired_goal": np.ones(3)}
+    before = cast.act(obs)
+    driver.train_runs(reach(), [run], [folder], options=Options(final_episodes=2))
+    assert cast.refresh()
+    assert not np.array_equal(cast.act(obs), before)
+    assert cast.about().startswith("`reach`, trained: success 0.")
+    (folder / "policy.npz").write_bytes(b"damaged")
+    assert not cast.refresh()
+    assert not np.array_equal(cast.act(obs), before)  # what was read last goes on
+
+
+def test_why_there_is_no_critic_is_told():
+    assert sources.Cast(of_package("reach"), reach()).critic == "No critic: the policies of the package come without one."
+    assert sources.Cast(sources.by_random("reach"), reach()).critic == "Random actions have no critic."
+
+
+def test_a_policy_of_another_environment_is_refused():
+    with pytest.raises(ValueError, match=r"push cannot be played in reach: the policy takes observations of 25"):
+        sources.Cast(sources.of_run("push", policies.FOLDER / "push", "reach"), reach())
+
+
+def test_a_run_without_a_policy_is_refused(tmp_path, stopped):
+    shutil.copytree(stopped[0], tmp_path / "run")
+    (tmp_path / "run" / "policy.npz").unlink()
+    with pytest.raises(FolderError, match=r"policy\.npz is missing: no epoch of the run has ended yet"):
+        sources.of_run("mine", tmp_path / "run")
