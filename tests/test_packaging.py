@@ -37,14 +37,20 @@ LAYERS = [
     "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program sweeps.tables tools.doctor tools.programs",
     "runs.driver cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
-    "cli.check cli.export cli.evaluate cli.render cli.transfer",
+    "fleet.plan fleet.own_code fleet.ledger fleet.parcels",
+    "cli.check cli.export cli.evaluate cli.render cli.transfer cli.fleet_options",
     "sweeps.sweep sweeps.plotting cli.train",
+    "fleet.chunks",
+    "fleet.cluster",
+    "fleet.driver",
+    "cli.fleet_screen",
+    "cli.fleet",
     "cli.sweep sweeps.report",
     "cli.plot",
     "cli.report",
     "cli",
 ]
-EMPTY = "envs.engines.fused hopper host methods runs sweeps tools"  # folders: they hold a docstring
+EMPTY = "envs.engines.fused fleet hopper host methods runs sweeps tools"  # folders: they hold a docstring
 
 
 def modules():
