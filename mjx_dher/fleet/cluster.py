@@ -158,10 +158,14 @@ class Cluster:
         for node, ref in asked.items():
             try:
                 nodes.append(self._ray.get(ref, timeout=SECONDS_TO_LOOK))
+            except (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError):
+                continue  # the node has just gone
             except self._ray.exceptions.GetTimeoutError:
                 raise ValueError(f"ray: node {hosts[node]} has not answered within {SECONDS_TO_LOOK:g} s") from None
             except self._ray.exceptions.RayError as error:
                 raise ValueError(f"ray: node {hosts[node]} {_reason(error)}") from error
+        if not nodes:
+            raise ValueError("ray: the nodes of the cluster have gone while they were looked at; try again")
         return nodes
 
     def measure(self, node: Node, kind: Kind) -> float:

@@ -92,6 +92,5 @@ def _read(path: Path) -> tuple[str, list[list[str]]]:
     except FileNotFoundError:
         return uuid.uuid4().hex[:12], []
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FolderError(
-            f"{path} is damaged ({error}); without it, the sweep goes on with the runs that have not ended"
-        ) from error
+        hint = "remove it, and the sweep goes on with the runs that have not ended"
+        raise FolderError(f"{path} is damaged ({error}); {hint}") from error

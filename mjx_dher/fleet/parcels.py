@@ -12,6 +12,7 @@ import tarfile
 import tempfile
 import uuid
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,7 @@ def _unpack(folder: Path, parcel: bytes) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(parcel)) as archive:
             content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are looked at
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise FolderError(f"what came back of {folder.name} is damaged ({error})") from error
     result = content.pop(run_folder.RESULT_FILE, None)
     for name, data in content.items():
