@@ -13,6 +13,7 @@ import pytest
 from sweep_helpers import CONFIG, compile_once, make_grid, run, table  # noqa: F401
 
 from mjx_dher import Options, cli, names
+from mjx_dher.cli import fleet
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.cli.fleet_screen import FleetScreen
 from mjx_dher.fleet import chunks, driver, own_code, parcels, plan
@@ -270,10 +271,11 @@ def test_a_storage_that_cannot_be_used_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     assert "cannot be written to" in parcels.probe(str(tmp_path / "file" / "x"), "s", None)
     assert parcels.probe(str(tmp_path / "new"), "s", None) is None
-    with parcels.shown(str(tmp_path / "new"), "s") as token:
-        assert parcels.probe(str(tmp_path / "new"), "s", token) is None
+    with parcels.shown(str(tmp_path / "fresh"), "s") as token:
+        assert parcels.probe(str(tmp_path / "fresh"), "s", token) is None
         assert "is not where this machine sees it" in parcels.probe(str(tmp_path / "other"), "s", token)
-    assert not (tmp_path / "new").exists()
+    assert not (tmp_path / "fresh").exists()
+    assert (tmp_path / "new").exists()  # it was there
     with pytest.raises(ValueError, match=r"storage: .*cannot be written to"), parcels.shown("/proc/nothing", "s"):
         pass
 
@@ -296,6 +298,17 @@ def test_tasks_that_had_not_ended_are_handed_out_first_as_they_were(tmp_path):
         (tmp_path / "fleet.json").write_text(damaged)
         with pytest.raises(FolderError, match=r"fleet.json is damaged .*remove it"):
             Ledger(tmp_path, trials)
+
+
+def test_a_folder_goes_again_only_where_nothing_is_left_to_go_on_with(tmp_path):
+    with fleet.claimed(tmp_path / "a" / "sweep"):
+        assert (tmp_path / "a" / "sweep" / "cells").is_dir()
+        with pytest.raises(FolderError, match="is being trained by another program"):
+            in_a_thread(lambda: fleet.claimed(tmp_path / "a" / "sweep").__enter__())
+    assert not (tmp_path / "a").exists()
+    with fleet.claimed(tmp_path / "b"):
+        (tmp_path / "b" / "fleet.json").write_text("{}")
+    assert (tmp_path / "b" / "cells").is_dir()
 
 
 def test_runs_of_a_task_share_a_program(tmp_path):

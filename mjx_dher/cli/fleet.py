@@ -111,6 +111,9 @@ def _train(
         )
     if stop.asked is None:
         ledger.close()
+        if storage is not None and order.request.storage is None:
+            with contextlib.suppress(OSError):  # not empty: runs of the plain command that have not ended
+                Path(storage).rmdir()
     return stop.asked
 
 
@@ -128,7 +131,8 @@ def claimed(out: Path) -> Iterator[None]:
         with files.lock(out):
             yield
     finally:
-        if missing and not any((out / grid.CELLS).iterdir()):
+        kept = {path.name for path in (*out.glob("*"), *(out / grid.CELLS).glob("*"))} - {files.LOCK, grid.CELLS}
+        if missing and not kept:
             (out / files.LOCK).unlink(missing_ok=True)
             for path in missing:
                 with contextlib.suppress(OSError):  # something is in it

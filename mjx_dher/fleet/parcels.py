@@ -27,11 +27,12 @@ KEPT = 2  # copies of a chunk in the storage: where the newest is damaged, the o
 def pack(folder: Path) -> bytes:
     """Returns a run folder as bytes: all files but its lock and its checkpoints."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder)
             if path.is_file() and name.parts[0] not in (files.LOCK, run_folder.CHECKPOINTS):
-                archive.writestr(name.as_posix(), path.read_bytes())
+                entry = zipfile.ZipInfo(name.as_posix())  # without a time: the same run gives the same bytes
+                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED, compresslevel=1)
     return buffer.getvalue()
 
 
@@ -208,6 +209,9 @@ def shown(root: str, sweep: str) -> Iterator[str]:
     """
     from etils import epath
 
+    was_there = True
+    with contextlib.suppress(Exception):  # the trial that follows says what is wrong
+        was_there = epath.Path(root).exists()
     if (wrong := probe(root, sweep, None)) is not None:
         raise ValueError(f"storage: {wrong}")
     token: Any = epath.Path(root) / f"fleet-{sweep}" / f"seen-{uuid.uuid4().hex}"
@@ -219,6 +223,7 @@ def shown(root: str, sweep: str) -> Iterator[str]:
             token.unlink()
             if not any(token.parent.iterdir()):
                 token.parent.rmdir()
+            if not was_there and not any(token.parent.parent.iterdir()):
                 token.parent.parent.rmdir()
 
 
