@@ -1,5 +1,6 @@
 """A fleet without Ray: how large tasks are, what is refused, own code, the screen."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -7,13 +8,16 @@ from pathlib import Path
 import pytest
 from sweep_helpers import CONFIG, make_grid
 
-from mjx_dher import cli, names
+import mjx_dher
+from mjx_dher import Options, cli, names
+from mjx_dher.cli import fleet
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.cli.fleet_screen import FleetScreen
 from mjx_dher.fleet import chunks, driver, own_code, plan
 from mjx_dher.fleet.chunks import Told
 from mjx_dher.fleet.plan import Kind, Node, Request
 from mjx_dher.spec import RunSpec
+from mjx_dher.sweeps import grid
 
 GPU, CPU = Kind("gpu", 1, 1), Kind("cpu", 0, 2)
 
@@ -44,6 +48,19 @@ def test_a_task_is_as_large_as_memory_allows():
     assert plan.most_of(GPU, Request("auto"), None, None) is None
     assert plan.most_of(CPU, Request("auto"), None, None) == plan.TURNS
     assert plan.most_of(CPU, Request("auto"), 2, None) == 2 * plan.TURNS
+
+
+def test_a_task_on_a_gpu_has_as_many_lanes_as_rings_fit(tmp_path):
+    """Of a sweep that is trained with warp, on a machine that has no GPU; 30 runs on two GPUs, and memory for 6 rings."""
+    push = mjx_dher.preset("gpu", "push", engine="warp")
+    trials = grid.trials([push], range(30))
+    ring = fleet._ring_bytes(push)
+    assert ring > 4 * push.config.replay_size * 25  # observations of 25 float32 alone
+    order = fleet.Order(Request("auto"), tmp_path, "warp", None, Options(), list, list)
+    size = fleet._Sizes(order, [GPU], [node(gpu_bytes=2 * 6 * ring)], trials)
+    assert size(GPU, trials[0]) == 5  # 15 for each, in three rounds
+    limited = fleet._Sizes(dataclasses.replace(order, lanes=4), [GPU], [node()], trials)
+    assert limited(GPU, trials[0]) == 4
 
 
 def node(host="a", **changes):
@@ -112,6 +129,7 @@ WRONG = [
     (["--ray", "local", "--ray-chunk", "100000000000000000000"], "ray_chunk must lie in"),
     (["--ray", "local", "--ray-on", "gpu", "--ray-cpus", "2"], "ray_cpus is for tasks on CPUs"),
     (["--ray", "local", "--shard", "1/2"], "shard does not go with --ray"),
+    (["--ray", "local", "--dry-run"], "dry_run does not go with --ray"),
     (["--ray", "local", "--storage", ""], "storage must be a folder, or begin with gs://"),
     (["--ray", "local", "--storage", "ftp://host/x"], "storage must be a folder, or begin with gs://"),
     (["--ray", "local", "--storage", "gs://"], "storage must name a bucket"),

@@ -11,8 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from mjx_dher import envs, spec
-from mjx_dher.cli.common import settle_compiler, try_parts
+from mjx_dher import spec
+from mjx_dher.cli.common import make_env, settle_compiler, try_parts
 from mjx_dher.cli.fleet_screen import FleetScreen
 from mjx_dher.fleet import chunks, cluster, driver, own_code, parcels, plan
 from mjx_dher.fleet.chunks import Chunk, Tell
@@ -38,11 +38,6 @@ class Order:
     options: Options
     make_trials: Callable[[str], list[RunSpec]]  # for a preset, cpu or gpu, where the user names none
     announce: Callable[[list[RunSpec]], list[RunSpec]]  # says what there is to do, and returns the trials that have not ended
-
-
-def make_env(run: RunSpec) -> Any:
-    """Makes the environment of a run."""
-    return envs.make(run.env, engine=run.engine)
 
 
 def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
@@ -71,7 +66,7 @@ def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec],
         report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
         todo = order.announce(specs)
         claims = Claims(True, report)
-        free = [run for run in todo if claims.is_free(grid.folder_of(order.out, run))]
+        free = [run for run in todo if claims.is_free(run, grid.folder_of(order.out, run))]
         signum = _train(order, tasks, kinds, free, report, console) if free else None
     return specs, todo, signum
 
@@ -157,7 +152,7 @@ def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
 
 def _env_here(run: RunSpec) -> Any:
     """Makes an environment on this machine, whose sizes are those of any engine."""
-    return envs.make(run.env, engine="native" if run.engine == "warp" else run.engine)
+    return make_env(run, "native" if run.engine == "warp" else None)
 
 
 def _looked_at(
@@ -213,4 +208,4 @@ class _Sizes:
 def _ring_bytes(run: RunSpec) -> int:
     from mjx_dher.runs import program
 
-    return program.make_loop(_env_here(run), run, [run.sampler_choice]).replay_bytes
+    return program.make_loop(_env_here(run), run, program.choices_of([run])).replay_bytes

@@ -149,7 +149,8 @@ def _check(args: SweepArgs) -> None:
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
     _parse_shard(args.shard)
-    request_of(args.fleet, args.shard)
+    if request_of(args.fleet, args.shard) is not None and args.dry_run:
+        raise ValueError("dry_run does not go with --ray: try the command without --ray")
     if args.out.exists() and not args.out.is_dir():
         raise FolderError(f"out: {args.out} is there already and is no folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / grid.CELLS).is_dir():
