@@ -38,16 +38,20 @@ LAYERS = [
     "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program viewer.panel sweeps.tables tools.doctor tools.programs",
     "runs.driver runs.critic cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
-    "viewer.sources cli.check cli.export cli.evaluate cli.render cli.transfer",
+    "fleet.plan fleet.own_code fleet.ledger fleet.parcels",
+    "viewer.sources cli.check cli.export cli.evaluate cli.render cli.transfer cli.fleet_options",
     "sweeps.sweep sweeps.plotting viewer.server",
-    "cli.view",
-    "cli.train",
+    "cli.view fleet.chunks",
+    "cli.train fleet.cluster",
+    "fleet.driver",
+    "cli.fleet_screen",
+    "cli.fleet",
     "cli.sweep sweeps.report",
     "cli.plot",
     "cli.report",
     "cli",
 ]
-EMPTY = "envs.engines.fused hopper host methods runs sweeps tools viewer"  # folders: they hold a docstring
+EMPTY = "envs.engines.fused fleet hopper host methods runs sweeps tools viewer"  # folders: they hold a docstring
 
 
 def modules():

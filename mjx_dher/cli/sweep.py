@@ -15,7 +15,9 @@ from rich.console import Console
 from mjx_dher import envs, names, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
+from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.config import Config, HParams, check_count, check_number
+from mjx_dher.fleet.plan import Request
 from mjx_dher.host import files
 from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
@@ -100,8 +102,9 @@ class SweepArgs:
     """Settings that other options override: cpu, gpu, paper, or auto, the one for this machine."""
     lanes: int | None = None
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
+    fleet: Annotated[FleetArgs, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetArgs)
     shard: str = "1/1"
-    """Part of the trials: 2/4 is the second of four. For several programs at once on one folder, each with a GPU of its own."""
+    """Part of the trials: 2/4 is the second of four, for several programs on one folder where --ray cannot be used."""
     threshold: float = 0.9
     """Success rate for the time that it takes to get there."""
     baseline: str = "future"
@@ -125,6 +128,8 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
     args = tyro.cli(SweepArgs, prog=f"{names.program()} sweep", args=argv, default=default)
     _check(args)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
+    if args.fleet.ray is not None:
+        return args, trials  # which preset is for the cluster is known once it is joined
     if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
         trials = _trials(args, preset)
     own = grid.shard(trials, *_parse_shard(args.shard))
@@ -146,6 +151,8 @@ def _check(args: SweepArgs) -> None:
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
     _parse_shard(args.shard)
+    if request_of(args.fleet, args.shard) is not None and args.dry_run:
+        raise ValueError("dry_run does not go with --ray: try the command without --ray")
     if args.out.exists() and not args.out.is_dir():
         raise FolderError(f"out: {args.out} is there already and is no folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / grid.CELLS).is_dir():
@@ -184,14 +191,49 @@ def sweep_command(argv: list[str], console: Console) -> int:
     args, trials = parse_sweep_args(argv)
     if args.dry_run:
         return _dry_run(args, trials, console)
+    request = request_of(args.fleet, args.shard)
+    if request is not None:
+        return _sweep_fleet(args, request, console)
     files.make_folder(args.out / grid.CELLS)
+    todo = _announce(args, trials, console)
+    signum = _train(args, todo, console) if todo else None
+    return _end(args, trials, todo, signum, console)
+
+
+def _sweep_fleet(args: SweepArgs, request: Request, console: Console) -> int:
+    """Trains a grid of runs on a cluster, whose machines say which preset it is where the user does not."""
+    from mjx_dher.cli import fleet
+
+    def make_trials(preset: str) -> list[RunSpec]:
+        return _trials(args, preset if args.preset == "auto" else args.preset)
+
+    with fleet.claimed(args.out):
+        order = fleet.Order(
+            request,
+            args.out,
+            args.engine,
+            args.lanes,
+            args.options,
+            make_trials,
+            lambda trials: _announce(args, trials, console),
+        )
+        trials, todo, signum = fleet.train(order, console)
+        return _end(args, trials, todo, signum, console)
+
+
+def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
+    """Prints what there is to do, and returns the trials that have not ended."""
     for text in grid.changed_files(args.out, trials):
         console.print(text, soft_wrap=True)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     done = f"; {len(trials) - len(todo)} of them are done already" if len(todo) < len(trials) else ""
     shard = "" if args.shard == "1/1" else f", shard {args.shard} of the sweep"
     console.print(f"{len(trials)} runs{shard}{done}; writing to {args.out}", soft_wrap=True)
-    signum = _train(args, todo, console) if todo else None
+    return todo
+
+
+def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], signum: int | None, console: Console) -> int:
+    """Writes the tables of what has ended, and says what is left."""
     left = [trial for trial in todo if not grid.is_done(args.out, trial)]
     if left and signum is not None:
         ended = len(trials) - len(left)

@@ -1,0 +1,275 @@
+"""What a sweep over many nodes survives, and what it costs.
+
+    python bench/fleet.py kills [--rounds 20] [--seeds 12] [--seed 0]
+    python bench/fleet.py overhead [--seconds 60]
+    python bench/fleet.py many [--trials 10000]
+
+`kills` starts a cluster of four nodes on this machine (`ray.cluster_utils.Cluster`), sweeps the point mass of docs/examples
+with the real command, and kills (SIGKILL) a worker, a node and the driver in turn, at random times; a node comes back, and a
+driver is started again with the same command. When a sweep has ended before all kills are made, another one begins. Each must
+have every trial, none twice, and the tables of the same sweep without Ray. `overhead` times the same sweep by the plain
+command and by `--ray local` with one task at a time, after what it has to compile is in the cache. `many` takes trials that do
+not train through the driver, and looks at its memory and its time per thousand trials. The extra ray is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", "JAX_PLATFORMS": "cpu"}
+
+import ray
+from ray.cluster_utils import Cluster
+from timing import print_table
+
+ROOT = Path(__file__).resolve().parent.parent
+STORE = 80 << 20  # bytes of a node's object store
+TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")  # columns that no two runs have alike
+SIZES = """
+    --preset cpu --env docs.examples.point_mass:PointMass --sampler future weighted --final-episodes 20 --num-envs 16
+    --batch-size 64 --replay-size 4000 --hidden-sizes 32 --eval-episodes 20 --threshold 0.5 --checkpoint-every 2
+""".split()  # noqa: SIM905
+LONG = [*SIZES, "--cycles-per-epoch", "20", "--updates-per-cycle", "40", "--total-steps"]
+STEPS_PER_EPOCH = 3200
+
+
+class Nodes:
+    """A cluster on this machine: a head without CPUs, and nodes with one each."""
+
+    def __init__(self, count, **options):
+        self.options = {"num_cpus": 1, "object_store_memory": STORE, **options}
+        head = {"num_cpus": 0, "object_store_memory": STORE, "include_dashboard": False}
+        self.cluster = Cluster(initialize_head=True, head_node_args=head)
+        self.nodes = [self.cluster.add_node(**self.options) for _ in range(count)]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.cluster.shutdown()
+
+    @property
+    def address(self):
+        return self.cluster.address
+
+    def kill_node(self, number):
+        """Kills all processes of a node, and starts another one."""
+        self.cluster.remove_node(self.nodes.pop(number), allow_graceful=False)
+        self.nodes.append(self.cluster.add_node(**self.options))
+
+    def workers(self):
+        """Process ids of those that train, by the title that Ray gives them, among children of this cluster's nodes."""
+        raylets = {int(line.split()[0]): int(line.split()[1]) for line in _ps("pid=,ppid=")}
+        own = {pid for pid, parent in raylets.items() if parent == os.getpid()}
+        lines = [line.split(None, 2) for line in _ps("pid=,ppid=,args=")]
+        return [int(pid) for pid, parent, title in lines if title.startswith("ray::chunk") and int(parent) in own]
+
+
+def _ps(columns):
+    return subprocess.run(["ps", "-eo", columns], capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def sweep(out, *flags, **options):
+    """Starts the real command."""
+    command = [sys.executable, str(ROOT / "train.py"), "sweep", "--out", str(out), *map(str, flags)]
+    log = out.with_suffix(".log").open("ab")
+    return subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, **options)
+
+
+def finished(process, seconds=1800):
+    """Waits for a command that must succeed."""
+    if process.wait(seconds) != 0:
+        raise SystemExit(f"the command ended with status {process.returncode}: {process.args}")
+
+
+def table(folder, name):
+    """Rows of a table, without what no two runs have alike."""
+    with (folder / name).open() as file:
+        return [{key: value for key, value in row.items() if key not in TIMES} for row in csv.DictReader(file)]
+
+
+def same_tables(one, other):
+    """Whether two sweeps have the same trials, once each, with the same curves and results."""
+    return all(table(one, name) == table(other, name) for name in ("results.csv", "finals.csv", "comparison.csv"))
+
+
+def kill(kind, nodes, driver, dice):
+    """Kills a worker or a node, or the driver; returns whether there was one to kill."""
+    if kind == "worker":
+        if workers := nodes.workers():
+            os.kill(dice.choice(workers), signal.SIGKILL)
+        return bool(workers)
+    if kind == "node":
+        nodes.kill_node(dice.randrange(len(nodes.nodes)))
+    else:
+        driver.kill()
+        driver.wait()
+    return True
+
+
+def kills(rounds, seeds, seed, epochs=12):
+    """Kills in turn until there were so many; returns a row for each sweep."""
+    dice, rows, done = random.Random(seed), [], 0
+    flags = [*LONG, epochs * STEPS_PER_EPOCH, "--seeds", seeds]
+    with tempfile.TemporaryDirectory() as folder, Nodes(4) as nodes:
+        reference = Path(folder) / "reference"
+        finished(sweep(reference, *flags))
+        while done < rounds:
+            out = Path(folder) / f"sweep{len(rows)}"
+            ray_flags = ["--ray", nodes.address, "--ray-cpus", 1, "--ray-chunk", 2, "--storage", Path(folder) / "storage"]
+            started, before, starts = time.perf_counter(), done, 1
+            driver = sweep(out, *flags, *ray_flags)
+            while driver.poll() is None:
+                wait = time.perf_counter() + dice.uniform(4, 12)
+                while time.perf_counter() < wait and driver.poll() is None:
+                    time.sleep(0.1)
+                if (
+                    driver.poll() is None
+                    and done < rounds
+                    and kill(("worker", "node", "driver")[done % 3], nodes, driver, dice)
+                ):
+                    done += 1
+                if driver.poll() not in (None, 0):  # killed, by us or with the node that it had joined
+                    driver, starts = sweep(out, *flags, *ray_flags), starts + 1
+                    if starts > rounds + 5:
+                        raise SystemExit(f"the driver ends again and again; see {out.with_suffix('.log').read_text()[-2000:]}")
+            trials = [path.parent.name for path in out.glob("cells/*/result.json")]
+            left = [path.name for path in (Path(folder) / "storage").glob("*")]
+            rows.append(
+                [
+                    f"{done - before}",
+                    f"{starts}",
+                    f"{len(trials)} of {2 * seeds}",
+                    "the same" if same_tables(reference, out) else "DIFFERENT",
+                    ", ".join(left) or "nothing",
+                    f"{time.perf_counter() - started:.0f} s",
+                ]
+            )
+            print(*rows[-1], sep="; ", flush=True)
+    return rows
+
+
+def overhead(seconds):
+    """Times of the same sweep, plain and by Ray, with one task at a time of at least so many seconds."""
+    cores = len(os.sched_getaffinity(0))
+    with tempfile.TemporaryDirectory() as folder:
+
+        def timed(name, epochs, *flags):
+            started = time.perf_counter()
+            finished(sweep(Path(folder) / name, *LONG, epochs * STEPS_PER_EPOCH, "--seeds", 8, *flags))
+            return time.perf_counter() - started
+
+        timed("cached", 1)
+        short = timed("short", 4)
+        epochs = max(4, round(4 * seconds / max(short - 8, 1.0) * 2))  # two tasks of eight runs each
+        on_ray = ["--ray", "local", "--ray-cpus", cores, "--ray-chunk", 8]
+        rows = []
+        for number in range(2):
+            plain = timed(f"plain{number}", epochs)
+            started = timed(f"empty{number}", 1, *on_ray)
+            by_ray = timed(f"ray{number}", epochs, *on_ray)
+            same = same_tables(Path(folder) / f"plain{number}", Path(folder) / f"ray{number}")
+            part = f"{by_ray / plain - 1:+.1%}"
+            rows.append([f"{plain:.1f} s", f"{by_ray:.1f} s", part, f"{started:.1f} s", "the same" if same else "DIFFERENT"])
+            print(*rows[-1], sep="; ", flush=True)
+    return rows
+
+
+def pretend(chunk, tell):
+    """The files of runs, without any training."""
+    import json
+
+    import numpy as np
+
+    from mjx_dher.fleet import parcels
+    from mjx_dher.host import files
+    from mjx_dher.runs import identity, run_folder, sinks
+
+    packed, summary = [], {"success_rate": 0.5, "reset_success_rate": 0.0, "return_mean": -1.0, "episodes": 10}
+    for spec in chunk.specs:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            run = identity.identity(spec, "native", identity.sources(spec))
+            run_folder.create(folder, spec, "native", {})
+            log = sinks.CsvSink(folder / "metrics.csv", 0, identity.digest(run))
+            for epoch in range(1, 11):
+                log.write({"epoch": epoch, "env_steps": epoch * 100, "updates": epoch, "wall_seconds": 0.1, **summary})
+            log.close()
+            weights = np.zeros(20_000, np.float32)
+            np.savez(folder / "policy.npz", weights=weights, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
+            content = {"status": "finished", "reason": "", "epochs": 10, "lanes": 1, "digest": identity.digest(run), **summary}
+            files.write_json(folder / "result.json", content)
+            packed.append(parcels.pack(folder))
+    return packed
+
+
+def many(trials, blocks=10):
+    """Time and memory of the driver by block of trials."""
+    from mjx_dher import presets
+    from mjx_dher.fleet import cluster, driver, plan
+    from mjx_dher.fleet.ledger import Ledger
+    from mjx_dher.runs.options import Options
+    from mjx_dher.sweeps import grid
+
+    rows, marks = [], []
+
+    def show(state):
+        if state.ended >= trials / blocks * len(marks):
+            resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+            marks.append((state.ended, time.perf_counter(), time.process_time(), resident))
+            print(f"{state.ended} trials, {resident:.0f} MB", flush=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        specs = grid.trials([presets.preset("cpu", "reach")], range(trials))
+        request = plan.Request("local", "cpu", cpus=1)
+        with cluster.joined(request, None) as tasks:
+            kinds = plan.kinds_of(request, list(tasks.resources().values()), "auto")
+            size = lambda kind, run: plan.most_of(kind, request, None, None)  # noqa: E731
+            job = driver.Job(Path(folder), Options(), None, None, kinds, size, pretend, print, show, lambda: False)
+            lost = driver.run(tasks, job, Ledger(Path(folder), specs))
+        whole = sum(grid.is_done(Path(folder), run) for run in specs)
+    for before, now in itertools.pairwise(marks):
+        count = now[0] - before[0]
+        wall, cpu = ((now[i] - before[i]) / count * 1000 for i in (1, 2))
+        rows.append([f"{before[0]} to {now[0]}", f"{wall:.1f} ms", f"{cpu:.2f} ms", f"{now[3]:.0f} MB"])
+    print(f"{whole} of {trials} trials are there; lost: {lost or 'none'}")
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("part", choices=("kills", "overhead", "many"))
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--trials", type=int, default=10_000)
+    args = parser.parse_args()
+    load = os.getloadavg()[0]
+    if args.part == "kills":
+        head = ["kills", "starts of the driver", "trials", "tables", "left in the storage", "time"]
+        rows = kills(args.rounds, args.seeds, args.seed)
+    elif args.part == "overhead":
+        head = ["plain", "ray", "more", "of which the start, and an epoch each", "tables"]
+        rows = overhead(args.seconds)
+    else:
+        head = ["trials", "wall time a trial", "the driver's CPU time", "its memory"]
+        rows = many(args.trials)
+    print_table(head, rows)
+    print(
+        f"load of the machine: {load:.1f} before, {os.getloadavg()[0]:.1f} after; {os.cpu_count()} cores; ray {ray.__version__}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""The real command on a real cluster of Ray: nodes are processes of this machine."""
+
+import importlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import pytest
+from conftest import ROOT
+
+pytestmark = pytest.mark.slow
+SMALL = """
+    --preset cpu --env docs.examples.point_mass:PointMass --num-envs 8 --cycles-per-epoch 3 --updates-per-cycle 4
+    --batch-size 32 --total-steps 960 --replay-size 400 --hidden-sizes 16 --eval-episodes 20 --final-episodes 20 --threshold 0.2
+""".split()  # noqa: SIM905
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    """bench/fleet.py, whose clusters and kills these are."""
+    pytest.importorskip("ray")
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    for name in ("RAY_USAGE_STATS_ENABLED", "RAY_AUTH_MODE", "JAX_PLATFORMS"):  # that it sets
+        monkeypatch.setenv(name, "")
+    return importlib.reload(importlib.import_module("fleet"))
+
+
+def refused(bench, out, *flags, seconds=60):
+    """What the command says that must be refused within so many seconds, with nothing trained and nothing left."""
+    started = time.monotonic()
+    command = [sys.executable, "train.py", "sweep", *SMALL, "--seeds", "2", "--out", str(out), *map(str, flags)]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode == 2, ended.stdout + ended.stderr
+    assert time.monotonic() - started < seconds
+    assert "Traceback" not in ended.stderr
+    assert not out.exists()
+    return ended.stderr
+
+
+def test_twenty_four_trials_on_four_nodes_have_the_tables_of_one_program(bench, tmp_path):
+    flags = [*SMALL, "--sampler", "future", "weighted", "--seeds", 12]
+    bench.finished(bench.sweep(tmp_path / "plain", *flags))
+    with bench.Nodes(4) as nodes:
+        bench.finished(bench.sweep(tmp_path / "fleet", *flags, "--ray", nodes.address, "--ray-chunk", 3))
+        assert nodes.workers() == []
+    assert len(bench.table(tmp_path / "fleet", "finals.csv")) == 24
+    assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
+    assert "ray: 4 nodes: 4 tasks at once with 1 CPU each; 24 runs to train" in (tmp_path / "fleet.log").read_text()
+    assert not (tmp_path / "fleet" / "fleet.json").exists()
+
+
+def test_kills_of_a_worker_a_node_and_the_driver_cost_no_trial(bench):
+    rows = bench.kills(rounds=3, seeds=3, seed=1)
+    assert sum(int(row[0]) for row in rows) == 3
+    for row in rows:
+        assert row[2:5] == ["6 of 6", "the same", "nothing"]
+
+
+def test_without_a_storage_the_task_is_trained_again(bench, tmp_path):
+    flags = [*bench.LONG, 8 * bench.STEPS_PER_EPOCH, "--seeds", 2]
+    bench.finished(bench.sweep(tmp_path / "plain", *flags))
+    with bench.Nodes(2) as nodes:
+        driver = bench.sweep(tmp_path / "fleet", *flags, "--ray", nodes.address, "--ray-chunk", 2)
+        deadline = time.monotonic() + 120
+        while not nodes.workers() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        time.sleep(8)
+        assert bench.kill("worker", nodes, driver, bench.random.Random(0))
+        bench.finished(driver)
+    assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
+
+
+def test_a_signal_ends_a_fleet_in_order_and_the_same_command_goes_on(bench, tmp_path):
+    flags = [*bench.LONG, 40 * bench.STEPS_PER_EPOCH, "--seeds", 1, "--ray", "local", "--ray-cpus", 1]
+    driver = bench.sweep(tmp_path / "sweep", *flags)
+    log = tmp_path / "sweep.log"
+    deadline = time.monotonic() + 180
+    while "train on 1 host " not in log.read_text() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    driver.send_signal(signal.SIGTERM)
+    assert driver.wait(120) == 128 + signal.SIGTERM
+    assert "stopping when this epoch has ended" in log.read_text()
+    assert list((tmp_path / "sweep" / "unfinished").glob("fleet-*/*/*.tar"))
+    bench.finished(bench.sweep(tmp_path / "sweep", *flags))
+    assert "going on from" in log.read_text()
+    assert not (tmp_path / "sweep" / "unfinished").exists()
+
+
+def test_nodes_with_another_version_or_storage_of_their_own_are_refused(bench, tmp_path):
+    for name in ("mjx_dher", "envs"):
+        shutil.copytree(ROOT / name, tmp_path / "old" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    start = tmp_path / "old" / "mjx_dher" / "__init__.py"
+    start.write_text(start.read_text().replace('__version__ = "', '__version__ = "0.0.'))
+    with bench.Nodes(1) as nodes:
+        told = refused(bench, tmp_path / "a", "--ray", nodes.address, "--storage", "/proc/nothing")
+        assert "storage: /proc/nothing cannot be written to" in told
+        told = refused(bench, tmp_path / "b", "--ray", nodes.address, "--ray-on", "gpu")
+        assert "no node of the cluster has a GPU for a task; its nodes have" in told
+        nodes.options["env_vars"] = {"PYTHONPATH": str(tmp_path / "old")}
+        nodes.kill_node(0)
+        told = refused(bench, tmp_path / "c", "--ray", nodes.address)
+        assert "has mjx-dher 0.0." in told
+        assert "install the same version on every node" in told
+
+
+def test_an_address_where_something_else_answers_is_refused_within_seconds(bench, tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        told = refused(bench, tmp_path / "a", "--ray", f"127.0.0.1:{server.getsockname()[1]}", seconds=40)
+    assert "ray: there is no cluster whose head is 127.0.0.1" in told
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # where auto looks first
+    assert "ray: there is no cluster of which this machine is a part" in refused(bench, tmp_path / "b", "--ray", "auto")
