@@ -166,7 +166,7 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
     what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix products compiled,
     with many tilings each, to be timed against those of cuBLAS, which has its own ready.
     """
-    options: dict[str, str | bool | int] = {}
+    options: dict[str, Any] = {}
     if plain and jax.default_backend() == "cpu":
         options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     if jax.default_backend() == "gpu":
