@@ -112,9 +112,7 @@ class RunSpec:
         """Description of the compiled program that the run can share: all that its lanes must agree in."""
         alike = next((own[0] for own in map(list, _PRIORITIES_OF_LANES) if self.priority in own), self.priority)
         shared = dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0)
-        return dataclasses.replace(
-            shared, weight_normalization="mean", priority=alike, generator="reset", hparams=HParams()
-        )
+        return dataclasses.replace(shared, weight_normalization="mean", priority=alike, generator="reset", hparams=HParams())
 
 
 _PRIORITIES_OF_LANES = (EPISODE_PRIORITIES, TRANSITION_PRIORITIES)
