@@ -119,7 +119,7 @@ BAD = [
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
     (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, paper; got 'papr' (did you mean 'paper'?)"]),
     (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax, or module:attribute; got 'cubic'"]),
-    (["--metric", "speed"], ["metric must be one of position, or module:attribute; got 'speed'"]),
+    (["--metric", "speed"], ["metric must be one of position", ", or module:attribute; got 'speed'"]),
     (["--num-envs", "0"], ["num_envs must lie in [1, 1000000]; got 0"]),
     (["--num-envs", "-3"], ["num_envs must lie in [1, 1000000]; got -3"]),
     (["--batch-size", "2000001"], ["batch_size must not exceed replay_size (1000000); got 2000001"]),

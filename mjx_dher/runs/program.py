@@ -34,7 +34,7 @@ EvaluateFn = Callable[[TrainState, PRNGKey], Outcome]
 class Choices(NamedTuple):
     """What lanes of one program may differ in beside numbers: each list once, in the order of the runs."""
 
-    samplers: list[tuple[str, str, str]]  # arguments of samplers.make
+    samplers: list[tuple[str, str, str, str]]  # arguments of samplers.make
     priorities: list[str]
     generators: list[str]
 
@@ -44,7 +44,7 @@ class Choices(NamedTuple):
         return self.samplers.index(sampler), self.priorities.index(priority), self.generators.index(generator)
 
 
-def _parts(spec: RunSpec) -> tuple[tuple[str, str, str], str, str]:
+def _parts(spec: RunSpec) -> tuple[tuple[str, str, str, str], str, str]:
     return spec.sampler_choice, spec.priority, spec.generator
 
 
