@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_o
 from mjx_dher.names import check_name
 
 INT32_MAX = 2**31 - 1  # counters on the device are int32
+MAX_DEVICES = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +174,39 @@ def num_epochs(config: Config, episode_length: int) -> int:
 def num_updates(config: Config, episode_length: int) -> int:
     """Returns the updates of the learner in a whole run."""
     return num_epochs(config, episode_length) * config.cycles_per_epoch * config.updates_per_cycle
+
+
+def check_devices(devices: Any) -> None:
+    """Raises ValueError unless `devices` is a number of devices, or "all"; whether they are there, JAX knows."""
+    if devices != "all":
+        is_number = isinstance(devices, int) and not isinstance(devices, bool)
+        if not is_number or not 1 <= devices <= MAX_DEVICES:
+            raise ValueError(f"devices must be an integer in [1, {MAX_DEVICES}], or all; got {devices!r}")
+
+
+def check_parts(config: Config, episode_length: int, parts: int) -> None:
+    """Refuses sizes that cannot be divided among the devices that share one run.
+
+    Raises:
+      ValueError: names every field at fault, its value and the nearest that can be.
+    """
+    episodes = episodes_capacity(config, episode_length)
+    problems = []
+    for field, count, unit in (
+        ("num_envs", config.num_envs, 1),
+        ("batch_size", config.batch_size, 1),
+        ("replay_size", episodes, episode_length),
+    ):
+        if count % parts:
+            nearest = sorted({parts * max(1, count // parts), parts * (count // parts + 1)})
+            allowed = " or ".join(str(unit * number) for number in nearest)
+            kind = "a multiple of" if unit == 1 else f"whole episodes ({unit} steps), a multiple of"
+            problems.append(
+                f"{field} must be {kind} {parts}, the devices that share a run; got {getattr(config, field)}, the nearest"
+                f" {'is' if len(nearest) == 1 else 'are'} {allowed}"
+            )
+    if problems:
+        raise ValueError("\n".join(problems))
 
 
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from flax import struct
 
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array
 
 
@@ -22,17 +23,21 @@ def init(size: int) -> NormalizerState:
     return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
 
 
-def update(state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None) -> NormalizerState:
+def update(
+    state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None, split: Split = ALONE
+) -> NormalizerState:
     """Returns the moments with `values` [..., D] added, after clipping them to +- `clip`.
 
-    `valid` broadcasts against [..., 1] and says which of them to add, whatever the others hold; all, where None.
+    `valid` broadcasts against [..., 1] and says which of them to add, whatever the others hold; all, where None. Of a run in
+    parts, the values of all parts are added, and all have the same moments.
     """
     mask = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
     mask = mask.reshape(-1, 1)
     values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
-    number = jnp.sum(mask).astype(jnp.float32)
-    batch_mean = jnp.sum(jnp.where(mask, values, 0.0), axis=0) / jnp.maximum(number, 1.0)
-    batch_var = jnp.sum(jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0), axis=0) / jnp.maximum(number, 1.0)
+    number = split.sum(jnp.sum(mask)).astype(jnp.float32)
+    batch_mean = split.sum(jnp.sum(jnp.where(mask, values, 0.0), axis=0)) / jnp.maximum(number, 1.0)
+    squares = jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0)
+    batch_var = split.sum(jnp.sum(squares, axis=0)) / jnp.maximum(number, 1.0)
     count = state.count + number
     share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean

@@ -35,7 +35,7 @@ def rollout(
     Args:
       env: an unbatched environment.
       policy: called with one step of `inputs` and the observations of all environments.
-      key: of the first states.
+      key: of the first states; or [N], one for each.
       num_envs: episodes, N.
       inputs: further arguments of the policy, such as noise, or keys for one that draws; leaves lead with [T]. None for none.
       goals: gives the goals to play for, which `env.with_goal` sets; those of the reset where None.
@@ -50,7 +50,8 @@ def rollout(
     check_env_parts(env)
     check_size("num_envs", num_envs)
     _check_inputs(inputs, env.episode_length)
-    first = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    keys = key if key.ndim else jax.random.split(key, num_envs)
+    first = jax.vmap(env.reset)(keys)
     check_first(first, (num_envs,))
     if goals is not None:
         first = _with_goals(env, first, goals(first.obs))

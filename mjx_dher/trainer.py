@@ -26,6 +26,7 @@ from mjx_dher.relabel import draw_batches, relabel_counted
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import env_sizes, episode_template, rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, check_env_parts
 from mjx_dher.updates import update_round
 from mjx_dher.view import View
@@ -52,7 +53,8 @@ class Train(NamedTuple):
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
     learner: Learner
-    replay_bytes: int  # memory of one run's ring
+    replay_bytes: int  # memory of one run's ring on a device
+    split: Split = ALONE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,12 +68,13 @@ class Loop:
     generator: Generator
     learner: Learner
     template: Episode  # shapes and dtypes of an episode
+    split: Split = ALONE
     max_transitions_per_draw: int = MAX_TRANSITIONS_PER_DRAW
 
     @property
     def num_episodes(self) -> int:
-        """Episodes that the ring holds, E."""
-        return config_lib.episodes_capacity(self.config, self.env.episode_length)
+        """Episodes that the ring holds, E: that of a part, of a run in parts."""
+        return self.split.share(config_lib.episodes_capacity(self.config, self.env.episode_length))
 
     @property
     def uses_values(self) -> bool:
@@ -102,7 +105,8 @@ class Loop:
     def rounds_per_draw(self) -> int:
         """Rounds whose batches are drawn at once: as many as `max_transitions_per_draw` allows, at least one."""
         rounds = self.config.updates_per_cycle // self.updates_per_round
-        return _largest_divisor(rounds, self.max_transitions_per_draw // (self.updates_per_round * self.config.batch_size))
+        batch_size = self.split.share(self.config.batch_size)
+        return _largest_divisor(rounds, self.max_transitions_per_draw // (self.updates_per_round * batch_size))
 
 
 def make_train(
@@ -113,6 +117,7 @@ def make_train(
     priority: Priority | PriorityFn | None = None,
     generator: Generator | GenerateFn | None = None,
     learner: Learner | None = None,
+    split: Split = ALONE,
 ) -> Train:
     """Makes the training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
 
@@ -131,20 +136,24 @@ def make_train(
       priority: of episodes or transitions, for `hparams.priority_fraction` of each batch; `eventful` where None.
       generator: of the goals that training episodes are played for; those of the reset where None.
       learner: DDPG where None, made of `config`.
+      split: of a run in parts on several devices, whose `init` and `epoch` are then called inside `jax.shard_map`.
 
     Raises:
       ValueError: a Config that cannot run, here or at all, an observation that is not one vector, or an argument of another
         kind. `epoch` raises it where a part gives arrays of the wrong shape, as soon as it is traced.
     """
     _check_arguments(env, config, learner)
+    config_lib.check_parts(config, env.episode_length, split.number)
+    learner = learners.make("ddpg", config, env_sizes(env)) if learner is None else learner
     loop = Loop(
         env=env,
         config=config,
         sampler=samplers.make("future" if sampler is None else sampler),
         priority=priorities.whole(priorities.make("eventful" if priority is None else priority)),
         generator=generators.make("reset" if generator is None else generator),
-        learner=learners.make("ddpg", config, env_sizes(env)) if learner is None else learner,
+        learner=learner if split.number == 1 else learners.split_over(learner, split),
         template=episode_template(env),
+        split=split,
     )
     if problem := config_lib.delay_problem(config, loop.policy_delay):
         raise ValueError(problem)
@@ -156,6 +165,7 @@ def make_train(
         epoch=functools.partial(_epoch, loop),
         learner=loop.learner,
         replay_bytes=replay.nbytes(loop.template, loop.num_episodes),
+        split=split,
     )
 
 
@@ -184,7 +194,7 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     state, cycles = jax.lax.scan(lambda state, _: _cycle(loop, state), state, length=loop.config.cycles_per_epoch)
     key, eval_key = jax.random.split(state.key)
     discarded = jnp.sum(cycles.pop("discarded_episodes"))
-    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes)
+    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes, loop.split)
     means = jax.tree.map(jnp.mean, cycles)
     faults = {name: jnp.maximum(means[name], share) for name, share in evaluate.faults(outcome).items()}
     metrics = evaluate.summary(outcome) | means
@@ -196,7 +206,7 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
 def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     """Rolls out, adds to the ring, updates the normalizers, learns."""
-    env, config, hparams = loop.env, loop.config, state.hparams
+    env, config, hparams, split = loop.env, loop.config, state.hparams, loop.split
     key, rollout_key, noise_key, normalizer_key, learn_key = jax.random.split(state.key, 5)
 
     def policy(noise: Any, obs: GoalObs) -> Array:
@@ -206,22 +216,24 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     learners.check_noise(noise, env.episode_length, config.num_envs)
     progress = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / loop.num_updates
     goals = _goals(loop, state, progress)
-    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, goals)
+    first, num_envs = split.keys(rollout_key, config.num_envs), split.share(config.num_envs)
+    episodes, outcome = rollout(env, policy, first, num_envs, split.own(noise, axis=1), goals)
     weights = priorities.weights(loop.priority, episodes, env.compute_reward, hparams)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
     before = _view(loop, state.learner, hparams, progress)
-    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
+    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, split.key(normalizer_key))
     annealed = anneal(hparams, progress)
     view = _view(loop, learner, annealed, progress)
     ring = priorities.renewed(loop.priority, ring, view)
-    learned, losses = _learn(loop, learner, ring, view, learn_key)
-    # As long as the ring is empty, nothing is learned.
-    learner = jax.tree.map(lambda new, old: jnp.where(replay.can_sample(ring), new, old), learned, learner)
+    learned, losses = _learn(loop, learner, ring, view, split.key(learn_key))
+    # As long as the ring, or that of a part, is empty, nothing is learned.
+    learner = jax.tree.map(lambda new, old: jnp.where(split.all(replay.can_sample(ring)), new, old), learned, learner)
+    outcome = split.gather(outcome)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring),
+        "priority_mean": split.mean(jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring)),
         **evaluate.faults(outcome),
         **relabelled,
         **losses,
@@ -240,7 +252,7 @@ def _goals(loop: Loop, state: TrainState, progress: Array) -> Callable[[GoalObs]
     if loop.generator is generators.reset:
         return None
     view = _view(loop, state.learner, state.hparams, progress)
-    key = jax.random.fold_in(state.key, GENERATE)
+    key = loop.split.key(jax.random.fold_in(state.key, GENERATE))
     return lambda obs: generators.goals_of(loop.generator, key, obs, state.replay, view)
 
 
@@ -256,7 +268,8 @@ def _update_normalizers(
     batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, view.compute_reward, hparams, relabel_key, score)
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
     learners.check_kept("update_normalizers", learner, updated)
-    return updated, {**_relabel_metrics(sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
+    metrics = _relabel_metrics(sample.desired_goal, batch.desired_goal, loop.split)
+    return updated, {**metrics, "no_goal_share": loop.split.mean(no_goal_share)}
 
 
 def _learn(loop: Loop, learner: PyTree, ring: ReplayState, view: View, key: PRNGKey) -> tuple[PyTree, Metrics]:
@@ -267,7 +280,7 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, view: View, key: PRNG
     config, hparams = loop.config, view.hparams
     cumulative = replay.cumulative_priority(ring)
     score = scores.of_episodes(loop.sampler.score, ring.episodes, view)
-    shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
+    shape = (loop.rounds_per_draw, loop.updates_per_round, loop.split.share(config.batch_size))
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
         numbers = hparams, cumulative, config.n_step, score
@@ -276,16 +289,16 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, view: View, key: PRNG
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))
     learner, losses = jax.lax.scan(draw_and_update, learner, keys)
-    return learner, jax.tree.map(jnp.mean, losses)
+    return learner, loop.split.mean(jax.tree.map(jnp.mean, losses))
 
 
-def _relabel_metrics(goal: Array, hindsight: Array) -> Metrics:
+def _relabel_metrics(goal: Array, hindsight: Array, split: Split = ALONE) -> Metrics:
     """Returns the share of goals [B, G] that were replaced, and the mean distance of those that took their place."""
     distance = jnp.linalg.norm(hindsight - goal, axis=-1)
     replaced = (distance > 0).astype(jnp.float32)
     return {
-        "relabelled_share": jnp.mean(replaced),
-        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1.0),
+        "relabelled_share": split.mean(jnp.mean(replaced)),
+        "relabel_distance": split.sum(jnp.sum(distance)) / jnp.maximum(split.sum(jnp.sum(replaced)), 1.0),
     }
 
 
@@ -294,9 +307,20 @@ def _largest_divisor(number: int, limit: int) -> int:
     return next(divisor for divisor in range(max(1, min(number, limit)), 0, -1) if number % divisor == 0)
 
 
-def evaluate_state(env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int) -> evaluate.Outcome:
-    """Plays the learner's policy without exploration; returns the outcomes [num_episodes]."""
-    return evaluate.evaluate(env, lambda obs: learner.act(state.learner, obs, state.hparams), key, num_episodes)
+def evaluate_state(
+    env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int, split: Split = ALONE
+) -> evaluate.Outcome:
+    """Plays the learner's policy without exploration; returns the outcomes [num_episodes], of all parts."""
+
+    def act(obs: GoalObs) -> Array:
+        return learner.act(state.learner, obs, state.hparams)
+
+    if split.number == 1:
+        return evaluate.evaluate(env, act, key, num_episodes)
+    share = -(-num_episodes // split.number)
+    keys = jax.random.split(key, num_episodes)[jnp.arange(split.number * share) % num_episodes]  # some are played twice
+    outcomes = split.gather(evaluate.evaluate(env, act, split.own(keys), share))
+    return jax.tree.map(lambda x: x[:num_episodes], outcomes)
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:

@@ -25,14 +25,14 @@ def compile_once(monkeypatch):
     """What one test has compiled the next one need not: a compiled program has no state."""
     compile_runs = program.compile_runs
 
-    def cached(env, specs, max_lanes, final_episodes, report):
+    def cached(env, specs, max_lanes, final_episodes, report, devices=()):
         choices = str(program.choices_of(specs))
         lanes = min(len(specs), max_lanes or len(specs))
         lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))
-        key = (type(env), specs[0].program, choices, lanes, final_episodes, memory.available_bytes)
+        key = (type(env), specs[0].program, choices, lanes, final_episodes, memory.available_bytes, devices)
         if key not in _compiled:
             lines = []
-            _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append), lines)
+            _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices), lines)
         compiled, lines = _compiled[key]
         for line in lines:
             report(line)

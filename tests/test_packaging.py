@@ -15,7 +15,8 @@ import mjx_dher
 
 # All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
 LAYERS = [
-    "types names stats cli.commands cli.output tools.page host.files host.memory host.private_api host.subprocesses",
+    "types names stats host.line cli.commands tools.page",
+    "cli.output host.files host.memory host.private_api host.subprocesses split runs.team",
     "policies hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
     "envs.kinematics envs.engines.base",
     "envs.engines.host_call",
@@ -29,15 +30,16 @@ LAYERS = [
     "envs.engines.fused.kernel",
     "envs.engines.fused.simulation",
     "envs.engines.warp",
-    "relabel learners learners.common learners.critics runs.run_folder envs.engines",
+    "relabel learners learners.common learners.critics runs.run_folder runs.regroup runs.mesh envs.engines",
     "viewer.page viewer.scene viewer.player",
     "updates testing.trial learners.stored learners.actors runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
     "trainer learners.ddpg learners.actor_critic runs.options runs.results",
+    "runs.placed",
     "testing.learner testing.views runs.loop runs.load learners.td3 learners.sac learners.redq learners.tqc",
     "envs.push envs.pick_and_place envs.slide envs.reach",
     "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
     "testing runs.program viewer.panel sweeps.tables tools.doctor tools.programs",
-    "runs.driver runs.critic cli.common cli.settings sweeps.comparison gym cli.doctor cli.listing cli.completion",
+    "runs.driver runs.critic cli.common cli.settings cli.hosts sweeps.comparison gym cli.doctor cli.listing cli.completion",
     "fleet.plan fleet.own_code fleet.ledger fleet.parcels",
     "viewer.sources cli.check cli.export cli.evaluate cli.render cli.transfer cli.fleet_options",
     "sweeps.sweep sweeps.plotting viewer.server",

@@ -148,7 +148,8 @@ class WarpEngine:
     def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation:
         key = (str(device), num_envs)
         if key not in self._simulations:
-            self._simulations[key] = self._made(num_envs)
+            with wp.ScopedDevice(device):  # several GPUs call from one process
+                self._simulations[key] = self._made(num_envs)
         return self._simulations[key]
 
 

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -23,6 +23,7 @@ from mjx_dher.runs import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, own_parts, to_arguments, to_texts
 
 CURVE_WIDTH = 24  # characters of the live curve
+Devices = int | Literal["all"]  # of the option --devices
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
 
 # Flags that other libraries have, and earlier ones of this one, with the names here.

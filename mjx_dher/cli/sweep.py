@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -14,13 +15,15 @@ from rich.console import Console
 
 from mjx_dher import envs, names, presets, spec
 from mjx_dher.cli import settings
-from mjx_dher.cli.common import Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
+from mjx_dher.cli.common import Devices, Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
-from mjx_dher.config import Config, HParams, check_count, check_number
+from mjx_dher.cli.hosts import Hosts, joined, refuse_with_ray
+from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
 from mjx_dher.fleet.plan import Request
 from mjx_dher.host import files
 from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
+from mjx_dher.runs import identity
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import Engine, RunSpec
@@ -102,6 +105,9 @@ class SweepArgs:
     """Settings that other options override: cpu, gpu, paper, or auto, the one for this machine."""
     lanes: int | None = None
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
+    hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
+    devices: Devices = 1
+    """Devices to train on, or all: runs side by side are shared out among them; where they are more, several share each run."""
     fleet: Annotated[FleetArgs, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetArgs)
     shard: str = "1/1"
     """Part of the trials: 2/4 is the second of four, for several programs on one folder where --ray cannot be used."""
@@ -147,6 +153,8 @@ def _check(args: SweepArgs) -> None:
     check_number("first_seed", args.first_seed, "[0, 4294967295]")
     if args.lanes is not None:
         check_count("lanes", args.lanes)
+    check_devices(args.devices)
+    args.hosts.place(os.environ)
     args.options.check()
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
@@ -191,13 +199,26 @@ def sweep_command(argv: list[str], console: Console) -> int:
     args, trials = parse_sweep_args(argv)
     if args.dry_run:
         return _dry_run(args, trials, console)
-    request = request_of(args.fleet, args.shard)
-    if request is not None:
+    if (request := request_of(args.fleet, args.shard)) is not None:
+        refuse_with_ray(args.hosts, args.devices)
         return _sweep_fleet(args, request, console)
-    files.make_folder(args.out / grid.CELLS)
-    todo = _announce(args, trials, console)
-    signum = _train(args, todo, console) if todo else None
-    return _end(args, trials, todo, signum, console)
+    settle_compiler(args.engine)
+    described = {name: value for name, value in dataclasses.asdict(args).items() if name not in ("hosts", "out")}
+    with joined(args.hosts, {**described, "trials": [*map(identity.trial_name, trials)]}, console) as (team, own_console):
+        return _sweep(args, trials, own_console, team)
+
+
+def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console, team: Any) -> int:
+    """Trains a grid of runs in this process, or in the processes of a `Team`, of which the first one writes."""
+    places = {trial: place for place, trial in enumerate(trials)}
+
+    def begin() -> list[int]:
+        files.make_folder(args.out / grid.CELLS)
+        return [places[trial] for trial in _announce(args, trials, console)]
+
+    todo = [trials[place] for place in team.share(begin)]
+    signum = _train(args, todo, console, team) if todo else None
+    return int(team.share(lambda: _end(args, trials, todo, signum, console)))
 
 
 def _sweep_fleet(args: SweepArgs, request: Request, console: Console) -> int:
@@ -274,11 +295,10 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     return 0
 
 
-def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None:
+def _train(args: SweepArgs, todo: list[RunSpec], console: Console, team: Any) -> int | None:
     """Trains what is left; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
 
-    settle_compiler(args.engine)
     prepare()
     for _, group in itertools.groupby(todo, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
@@ -293,6 +313,8 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
                 make_env,
                 options=args.options,
                 lanes=args.lanes,
+                devices=args.devices,
+                team=team,
                 should_stop=lambda: stop.asked is not None,
                 report=lambda text: console.print(text, soft_wrap=True),
                 on_epoch=screen.show,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import inspect
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +17,7 @@ from rich.console import Console
 from mjx_dher import envs, names, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import (
+    Devices,
     Screen,
     check_engine,
     make_env,
@@ -24,7 +27,9 @@ from mjx_dher.cli.common import (
     try_parts,
     warn_of_tau,
 )
+from mjx_dher.cli.hosts import Hosts, check_out, claim, joined
 from mjx_dher.cli.view import PORT, Beside, Page
+from mjx_dher.config import check_devices
 from mjx_dher.host import files
 from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
@@ -65,6 +70,9 @@ class TrainArgs:
     """Show in the browser how the run learns: the policy after each epoch, at play. Needs the extra view."""
     view_port: int = PORT
     """Port of that page; 0: any that is free."""
+    hosts: Hosts = dataclasses.field(default_factory=Hosts)
+    devices: Devices = 1
+    """Devices that share the run, GPUs where there are any, or all: equal parts of its environments, ring and batches."""
     options: Options = dataclasses.field(default_factory=Options)
 
 
@@ -80,6 +88,9 @@ class ResumeArgs:
     """Run folder."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
+    hosts: Annotated[Hosts, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Hosts)
+    devices: Devices | None = None
+    """Devices that share the run, or all; as many as it was started with unless given."""
     total_steps: int | None = None
     """Environment steps of the whole run, those that were made included; as the run was started with unless given."""
     final_episodes: int | None = None
@@ -108,13 +119,16 @@ def train_command(argv: list[str], console: Console) -> int:
     if args.dry_run:
         return _dry_run(args, console)
     port = page.check(Page().host, args.view_port) if args.view else None
-    with run_folder.claim_new(args.out, args.spec) as folder:
-        settle_compiler(args.spec.engine)
+    settle_compiler(args.spec.engine)
+    own = {"seed": args.spec.seed, "sources": identity.sources(args.spec), "devices": args.devices}
+    described = {**identity.settings(args.spec), **dataclasses.asdict(args.options), **own}
+    with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
+        folder = Path(team.share(lambda: str(claim(stack, args.out, args.spec, goes_on=team.size > 1))))
         prepare()
         env = make_env(args.spec)
-        try_parts(env, [args.spec], console)
-        with Beside(folder, port, console) as beside:
-            return _train(env, args.spec, folder, args.options, args.curve, console, beside.after_epoch)
+        try_parts(env, [args.spec], screen)
+        beside = stack.enter_context(Beside(folder, port if team.leads else None, screen))
+        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, team, beside.after_epoch)
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
@@ -138,13 +152,20 @@ def resume_command(argv: list[str], console: Console) -> int:
     refuse_foreign_flags(argv)
     args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
     check_engine(args.engine)
+    if args.devices is not None:
+        check_devices(args.devices)
+    args.hosts.place(os.environ)
     content = run_folder.read_content(args.run)
-    with files.lock(args.run):
-        run, options = _to_resume(args, content, console)
-        settle_compiler(args.engine or content["physics"])
+    settle_compiler(args.engine or content["physics"])
+    described = {name: str(value) for name, value in vars(args).items() if name != "hosts"} | {"digest": content.get("digest")}
+    with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
+        team.share(lambda: stack.enter_context(files.lock(args.run)))
+        run, options = _to_resume(args, content, screen)
         prepare()
         ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
-        return _train(make_env(run, args.engine or ran), run, args.run, options, args.curve, console)
+        devices = content.get("devices", 1) if args.devices is None else args.devices
+        env = make_env(run, args.engine or ran)
+        return _train(env, run, args.run, options, args.curve, screen, devices, team)
 
 
 def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
@@ -240,7 +261,8 @@ def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
         TrainArgs, prog=names.program(), description=head, args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,)
     )
     problems = []
-    for check in (lambda: spec.validate(args.spec, envs.list_envs()), args.options.check):
+    settled = (args.options.check, lambda: check_devices(args.devices), lambda: check_out(args.hosts, args.out))
+    for check in (lambda: spec.validate(args.spec, envs.list_envs()), *settled):
         try:
             check()
         except ValueError as error:
@@ -257,6 +279,8 @@ def _train(
     options: Options,
     curve: bool,
     console: Console,
+    devices: Devices,
+    team: Any,
     after_epoch: Callable[[], None] = lambda: None,
 ) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
@@ -266,6 +290,7 @@ def _train(
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
     before = [row["success_rate"] for row in sinks.read_rows(folder / run_folder.METRICS_FILE)]
     stop, screen = Stop(console, folder), Screen(console, [run], before)
+    curve = curve and team.leads
 
     def on_epoch(specs: Any, progress: Any) -> None:
         screen.show(specs, progress)
@@ -281,6 +306,8 @@ def _train(
                 [run],
                 [folder],
                 options=options,
+                devices=devices,
+                team=team,
                 should_stop=lambda: stop.asked is not None,
                 report=lambda text: console.print(text, soft_wrap=True),
                 on_epoch=on_epoch,

@@ -134,9 +134,10 @@ def _calls() -> tuple[Any, Any]:
     from mjx_dher.host.warp_setup import prepare, wp
 
     prepare()
-    device = wp.get_device()
+    devices = {wp.get_device(), *(wp.device_from_jax(each) for each in jax.local_devices() if each.platform == "gpu")}
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        for loading in [pool.submit(kernel.module.load, device, THREADS) for kernel in (critic_pass, actor_pass)]:
+        modules = [(kernel.module, device) for kernel in (critic_pass, actor_pass) for device in devices]
+        for loading in [pool.submit(module.load, device, THREADS) for module, device in modules]:
             loading.result()
     make = functools.partial(wp.jax_kernel, block_dim=THREADS, module_preload_mode=wp.JaxModulePreloadMode.NONE)
     return make(critic_pass, num_outputs=11), make(actor_pass, num_outputs=12)

@@ -105,7 +105,14 @@ def array_checkpointer() -> Any:
     Why: the process keeps some memory of every checkpoint in orbax's other format, OCDBT (docs/reliability.md).
     Needed by: orbax-checkpoint 0.12.8. No upstream issue known for the memory.
     """
+    import jax
     import orbax.checkpoint
 
     logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax warns at every checkpoint in the older format
-    return orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False))
+    alone: dict[str, Any] = {}
+    if jax.process_count() > 1:  # the process that writes does so alone; orbax would have all of them wait for one another
+        own = jax.process_index()
+        options = orbax.checkpoint.options.MultiprocessingOptions(primary_host=own, active_processes={own})
+        alone = {"multiprocessing_options": options}
+    handler = orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False, **alone)
+    return orbax.checkpoint.Checkpointer(handler, **alone)

@@ -12,6 +12,7 @@ from mjx_dher import names, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.networks import NetworksFn
 from mjx_dher.spec import LEARNERS
+from mjx_dher.split import Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
 from mjx_dher.view import Values
 
@@ -32,7 +33,9 @@ class Learner(Protocol):
     updates all but the last are then made by `update_critic`. It has `uses_discount`, True, where it takes the `discount` of a
     batch, as returns of several steps need. It may have `value(state, obs, action, hparams)`, the estimated return [...] of
     actions [..., A] and then following the policy, at observations [..., D] and goals [..., G]: priorities, distances and goal
-    generators that ask for the learner's values need it.
+    generators that ask for the learner's values need it. It has `split_over`, a method that takes a `split.Split` and returns
+    a learner, where one run of it can be on several devices: that learner's `update` averages gradients by `Split.mean`, and
+    its `update_normalizers` takes in the values of all parts.
     """
 
     def init(self, key: PRNGKey) -> PyTree:
@@ -128,6 +131,22 @@ def values_of(learner: Any, state: PyTree, hparams: HParams) -> Values:
         return result
 
     return Values(lambda observation, goal: learner.act(state, obs_of(observation, goal), hparams), value)
+
+
+def split_over(learner: Any, split: Split) -> Learner:
+    """Returns the learner of a run in parts.
+
+    Raises:
+      ValueError: it has no `split_over`, so that its parts would learn apart.
+    """
+    if not callable(getattr(learner, "split_over", None)):
+        raise ValueError(
+            f"devices: one run of learner {type(learner).__name__} cannot be on {split.number} devices, because it has no"
+            " split_over (see mjx_dher.learners.Learner); runs side by side can"
+        )
+    made: Learner = learner.split_over(split)
+    check_methods(type(learner).__name__, made)
+    return made
 
 
 def policy_delay(learner: Any) -> int:

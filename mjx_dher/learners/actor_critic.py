@@ -26,6 +26,7 @@ from mjx_dher.learners.critics import Critics
 from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, check_outputs
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 
@@ -53,6 +54,7 @@ class ActorCritic:
     actor: ActorKind
     critics: Critics
     policy_delay: int = 1  # steps of the critics for one of the actor
+    split: Split = ALONE
     uses_discount: ClassVar[bool] = True
 
     def init(self, key: PRNGKey) -> ActorCriticState:
@@ -76,7 +78,15 @@ class ActorCritic:
     def _lagging(self, params: Params) -> Params:
         return params if self.actor.has_target else Params(actor=(), critic=params.critic)
 
-    update_normalizers = staticmethod(common.update_normalizers)
+    def split_over(self, split: Split) -> ActorCritic:
+        """Returns the learner of a run in parts: gradients and the normalizers' moments are those of all of them."""
+        return dataclasses.replace(self, split=split, actor=self.actor.split_over(split))
+
+    def update_normalizers(
+        self, state: ActorCriticState, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
+    ) -> ActorCriticState:
+        """Takes new observations and goals into the normalizers."""
+        return common.update_normalizers(state, observation, goal, hparams, valid, self.split)
 
     def act(self, state: ActorCriticState, obs: GoalObs, hparams: HParams) -> Array:
         """Returns the deterministic policy's actions [..., A] in [-1, 1]."""
@@ -114,7 +124,7 @@ class ActorCritic:
         target_key, actor_key = jax.random.split(key)
         atoms = self.target(state, batch, hparams, target_key)
         (loss, q_mean), gradient = jax.value_and_grad(self._critic_loss, has_aux=True)(state.params.critic, batch, atoms)
-        direction, critic_moments = common.adam(hparams).update(gradient, state.critic_moments)
+        direction, critic_moments = common.adam(hparams).update(self.split.mean(gradient), state.critic_moments)
         critic = jax.tree.map(lambda p, d: p - hparams.critic_lr * d, state.params.critic, direction)
         metrics = {"critic_loss": loss, "q_mean": q_mean}
         state = dataclasses.replace(
@@ -155,7 +165,7 @@ class ActorCritic:
             return self.actor.loss(self.learning.actor, actor, *inputs, judge, key, hparams)
 
         (loss, more), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params.actor)
-        direction, moments = common.adam(hparams).update(gradient, state.actor_moments)
+        direction, moments = common.adam(hparams).update(self.split.mean(gradient), state.actor_moments)
         actor = jax.tree.map(lambda p, d: p - hparams.actor_lr * d, state.params.actor, direction)
         state = dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor), actor_moments=moments)
         return state, {**metrics, "actor_loss": loss, **more}

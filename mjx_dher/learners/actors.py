@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from mjx_dher.config import HParams
 from mjx_dher.learners import common
 from mjx_dher.networks import Actor, GaussianActor
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Metrics, PRNGKey, PyTree, Sizes
 
 Judge = Callable[[Array], Array]
@@ -30,6 +31,9 @@ class ActorKind(Protocol):
 
     @property
     def has_target(self) -> bool: ...  # whether the critics' targets take their actions from a slower copy of it
+
+    def split_over(self, split: Split) -> ActorKind:
+        """Returns the actor of a run in parts: it draws for the rows of all parts, and takes its own."""
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
         """Makes parameters."""
@@ -63,6 +67,11 @@ class Deterministic:
 
     is_gaussian: bool = False
     has_target: bool = True
+    split: Split = ALONE
+
+    def split_over(self, split: Split) -> Deterministic:
+        """Returns the actor of a run in parts."""
+        return dataclasses.replace(self, split=split)
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
         """Makes parameters."""
@@ -86,7 +95,7 @@ class Deterministic:
         """Returns smoothed actions [B, A] (Fujimoto et al. 2018, equation 14), whose values stay as they are."""
         action = self.act(network, params, observation, goal)
         bound = hparams.target_noise_clip
-        smoothing = jnp.clip(hparams.target_noise * jax.random.normal(key, action.shape, action.dtype), -bound, bound)
+        smoothing = jnp.clip(hparams.target_noise * self.split.normal(key, action.shape, action.dtype), -bound, bound)
         return jnp.clip(action + smoothing, -1.0, 1.0), jnp.zeros(action.shape[0], action.dtype)
 
     def loss(
@@ -112,6 +121,11 @@ class Gaussian:
 
     is_gaussian: bool = True
     has_target: bool = False
+    split: Split = ALONE
+
+    def split_over(self, split: Split) -> Gaussian:
+        """Returns the actor of a run in parts."""
+        return dataclasses.replace(self, split=split)
 
     def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
         """Makes parameters."""
@@ -138,7 +152,7 @@ class Gaussian:
         self, network: Any, params: PyTree, observation: Array, goal: Array, key: PRNGKey, hparams: HParams
     ) -> tuple[Array, Array]:
         """Returns draws of the policy [B, A], and alpha log pi [B] (Haarnoja et al. 2018, equation 3)."""
-        action, log_prob = draw(network, params, observation, goal, key)
+        action, log_prob = draw(network, params, observation, goal, key, self.split)
         return action, _alpha(params, hparams) * log_prob
 
     def loss(
@@ -148,7 +162,7 @@ class Gaussian:
 
         Haarnoja et al. 2018 ("Algorithms and Applications"), equations 7 and 18; `action_l2` as in other learners.
         """
-        action, log_prob = draw(network, params, observation, goal, key)
+        action, log_prob = draw(network, params, observation, goal, key, self.split)
         alpha = _alpha(params, hparams)
         still = jax.lax.stop_gradient
         policy_loss = jnp.mean(still(alpha) * log_prob - judge(action)) + hparams.action_l2 * jnp.mean(jnp.square(action))
@@ -166,13 +180,15 @@ class Gaussian:
         return layers
 
 
-def draw(network: Any, params: PyTree, observation: Array, goal: Array, key: PRNGKey) -> tuple[Array, Array]:
+def draw(
+    network: Any, params: PyTree, observation: Array, goal: Array, key: PRNGKey, split: Split = ALONE
+) -> tuple[Array, Array]:
     """Draws actions tanh(u), u ~ N(mean, std), [B, A]; returns them and the logarithms of their densities [B].
 
     log pi = log N(u) - sum log(1 - tanh(u)^2) (Haarnoja et al. 2018, equation 21), and 1 - tanh(u)^2 = 4 / (e^u + e^-u)^2.
     """
     mean, log_std = _moments(network, params, observation, goal)
-    standard = jax.random.normal(key, mean.shape, mean.dtype)
+    standard = split.normal(key, mean.shape, mean.dtype)
     u = mean + jnp.exp(log_std) * standard
     log_normal = -0.5 * jnp.square(standard) - log_std - 0.5 * math.log(2.0 * math.pi)
     log_slope = 2.0 * (math.log(2.0) - u - jax.nn.softplus(-2.0 * u))

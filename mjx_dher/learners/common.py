@@ -13,6 +13,7 @@ from flax import struct
 from mjx_dher import normalizer
 from mjx_dher.config import HParams
 from mjx_dher.normalizer import NormalizerState
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Batch, GoalObs, PRNGKey, PyTree
 
 
@@ -69,17 +70,19 @@ def add_noise(noise: Noise, action: Array) -> Array:
     return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
 
 
-def update_normalizers(state: State, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None) -> State:
+def update_normalizers(
+    state: State, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None, split: Split = ALONE
+) -> State:
     """Returns the state after its normalizers have taken in observations [..., D] and goals [..., G].
 
     `valid`, where given, is [N] and says which of the observations [N, ..., D] to take in; the goals are taken in if any of
-    it is true.
+    it is true. Of a run in parts, those of all parts are taken in.
     """
     mask = None if valid is None else valid.reshape(-1, *(1,) * (observation.ndim - 2))
     return dataclasses.replace(
         state,
-        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip, mask),
-        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip, None if valid is None else jnp.any(valid)),
+        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip, mask, split),
+        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip, None if valid is None else jnp.any(valid), split),
     )
 
 

@@ -18,6 +18,7 @@ from mjx_dher.learners.common import Losses, Params
 from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, check_outputs
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.policy import Policy, from_mlp
+from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 
@@ -80,6 +81,7 @@ class DDPG:
     networks: Networks  # float32; these play
     learning: Networks  # of the learner's dtype, with the same parameters; these learn
     compute_gradients: GradientFn = compute_gradients  # what kernels may replace
+    split: Split = ALONE
     uses_discount: ClassVar[bool] = True
 
     def init(self, key: PRNGKey) -> DDPGState:
@@ -99,7 +101,15 @@ class DDPG:
             num_updates=jnp.zeros((), jnp.int32),
         )
 
-    update_normalizers = staticmethod(common.update_normalizers)
+    def split_over(self, split: Split) -> DDPG:
+        """Returns the learner of a run in parts: gradients and the normalizers' moments are those of all of them."""
+        return dataclasses.replace(self, split=split)
+
+    def update_normalizers(
+        self, state: DDPGState, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
+    ) -> DDPGState:
+        """Takes new observations and goals into the normalizers."""
+        return common.update_normalizers(state, observation, goal, hparams, valid, self.split)
 
     def act(self, state: DDPGState, obs: GoalObs, hparams: HParams) -> Array:
         """Returns the policy's actions [..., A] in [-1, 1], without exploration."""
@@ -122,7 +132,7 @@ class DDPG:
         params = state.params
         normalized = common.normalize_batch(state, batch, hparams)
         grads, losses = self.compute_gradients(self.learning, params, state.target, normalized, hparams)
-        direction, opt_state = common.adam(hparams).update(grads, state.opt_state)
+        direction, opt_state = common.adam(hparams).update(self.split.mean(grads), state.opt_state)
         params = Params(
             actor=jax.tree.map(lambda p, d: p - hparams.actor_lr * d, params.actor, direction.actor),
             critic=jax.tree.map(lambda p, d: p - hparams.critic_lr * d, params.critic, direction.critic),

@@ -21,6 +21,7 @@ import numpy as np
 from mjx_dher.host import files, memory, private_api
 from mjx_dher.host.files import FolderError
 from mjx_dher.runs.identity import sha256_of
+from mjx_dher.runs.regroup import regroup
 from mjx_dher.runs.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
 
 SCHEMA = 2
@@ -117,22 +118,30 @@ def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
 def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     """Returns the newest checkpoint of the run in `folder` that is whole.
 
+    `read` and `place` do the same in two steps.
+
     Args:
       folder: of the run.
-      template: the state's structure; leaves have shape and dtype (`jax.ShapeDtypeStruct`).
+      template: the state's structure; leaves have shape and dtype, and on several devices a sharding (`jax.ShapeDtypeStruct`).
       lines: up to which epoch metrics.csv of each run goes; later checkpoints are not used.
 
     Raises:
       FolderError: there is none.
       CheckpointError: says why each that is there cannot be used.
     """
+    restored = read(folder, template, lines)
+    return restored._replace(state=place(restored.state, template))
+
+
+def read(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
+    """Returns what `restore` returns, but the leaves of the state as a list of NumPy arrays; raises what `restore` raises."""
     refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
         try:
             failed = _check_lines(path, lines)
-            manifest, state = _load(path, template)
+            manifest, arrays = _load(path, template)
             runs = manifest.get("runs", [])
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, runs, refused, failed)
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], arrays, runs, refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
@@ -148,7 +157,7 @@ def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]
     return failed
 
 
-def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
+def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
     manifest = _read_manifest(path)
     for name, digest in manifest["files"].items():
         try:
@@ -168,7 +177,8 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], Any]:
     shapes = _to_shapes(template)
     if manifest["schema"] == 1:
         arrays = _upgraded(arrays, shapes)
-    return manifest, _from_arrays(_fit(path, arrays, shapes), template)
+    arrays = regroup(arrays, shapes, len(manifest.get("runs", [])))
+    return manifest, _fit(path, arrays, shapes)
 
 
 def _upgraded(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
@@ -247,11 +257,20 @@ def _to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
     return {name: shape_of(leaf) for name, leaf in _named(template).items()}
 
 
-def _from_arrays(arrays: list[np.ndarray], template: Any) -> Any:
+def without_keys(state: Any) -> Any:
+    """Returns a state with the data of keys in place of the keys: `save` writes the same for it."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+
+
+def place(arrays: Sequence[np.ndarray], template: Any) -> Any:
+    """Returns the state whose leaves `read` gave, where `template` says: on its shardings, or else the default device."""
     leaves, treedef = jax.tree.flatten(template)
 
     def put(array: np.ndarray, leaf: Any) -> Any:
-        value = jnp.array(array)  # a copy: the next epoch takes over its memory
+        if getattr(leaf, "sharding", None) is None:
+            value = jnp.array(array)  # a copy: the next epoch takes over its memory
+        else:
+            value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
         return jax.random.wrap_key_data(value) if _is_key(leaf) else value
 
     return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])

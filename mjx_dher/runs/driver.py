@@ -14,14 +14,13 @@ from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from mjx_dher import config as config_lib
 from mjx_dher import spec as spec_lib
 from mjx_dher.host import files
 from mjx_dher.learners.stored import StoredPolicy
-from mjx_dher.runs import health, identity, loop, play, run_folder, sinks
+from mjx_dher.runs import health, identity, loop, mesh, play, run_folder, sinks
 from mjx_dher.runs import program as program_lib
 from mjx_dher.runs.claims import Claims, Run, named
 from mjx_dher.runs.lane_checkpoints import LaneCheckpoints
@@ -30,6 +29,7 @@ from mjx_dher.runs.options import Options
 from mjx_dher.runs.program import Program
 from mjx_dher.runs.run_folder import FAILED, FINISHED
 from mjx_dher.runs.sinks import Sink
+from mjx_dher.runs.team import ALONE, Team
 from mjx_dher.spec import RunSpec
 from mjx_dher.types import Env
 
@@ -62,6 +62,8 @@ class _Session:
     make_sinks: Callable[[RunSpec, Path], Sequence[Sink]]
     shared: Path
     sweep: bool
+    devices: int
+    team: Team
 
 
 def train_runs(
@@ -71,6 +73,8 @@ def train_runs(
     *,
     options: Options | None = None,
     lanes: int | None = None,
+    devices: int | str = 1,
+    team: Team = ALONE,
     shared: Path | None = None,
     sweep: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
@@ -89,6 +93,8 @@ def train_runs(
       folders: run folders, one each; they are made where they do not exist.
       options: evaluation, checkpoints, logs; the defaults where None.
       lanes: runs side by side, at most; by default one on a CPU, whose cores one run fills, and elsewhere what memory holds.
+      devices: to train on, or "all"; runs side by side are shared out among them, and fewer runs than devices are in parts.
+      team: processes that train together, each of which calls this alike; the first one writes.
       shared: folder for the checkpoints of runs side by side; "unfinished" beside the first run's folder where None.
       sweep: whether runs that have ended, or that another program is at work on, are left out, and runs whose checkpoints
         cannot be used begin anew, instead of raising.
@@ -101,29 +107,31 @@ def train_runs(
       A Result each; fewer than `specs` where training was stopped before their turn, or runs were left out.
 
     Raises:
-      ValueError: a run that cannot be trained, memory that does not suffice for one alone, or `stop_at` or `keep_end` for
-        several runs.
+      ValueError: a run that cannot be trained, memory or devices that do not suffice for it, sizes that the devices do not
+        divide, or `stop_at` or `keep_end` for several runs.
       FolderError: a run that has ended, that another program is at work on, or whose folder cannot be written to.
     """
     options = options or Options()
-    options.check()
-    _check_runs(env, specs, folders)
-    if sweep or len(specs) > 1:
-        options.check_many()
-    if lanes is None and jax.default_backend() == "cpu":
-        lanes = 1
+    _check_runs(env, specs, folders, options, sweep)
+    placed_on = mesh.find(devices)
     shared = folders[0].parent / "unfinished" if shared is None else shared
-    session = _Session(env, options, should_stop, report, on_epoch, make_sinks, shared, sweep)
+    most, number = mesh.most_lanes(lanes, placed_on), max(1, len(placed_on))
+    asked = lambda: team.any(should_stop())  # noqa: E731
+    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, number, team)
     claims = Claims(sweep, report)
-    waiting = [run for run in zip(specs, folders) if claims.is_free(*run)]
+    free = team.share(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
+    waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
     if not waiting:
         return []
-    program = program_lib.compile_runs(env, [spec for spec, _ in waiting], lanes, options.final_episodes, report)
+    program = program_lib.compile_runs(env, [spec for spec, _ in waiting], most, options.final_episodes, report, placed_on)
     return _train_in_turn(session, program, claims, waiting)
 
 
-def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path]) -> None:
-    """Raises ValueError for runs that cannot be trained, or not by one program."""
+def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], options: Options, sweep: bool) -> None:
+    """Raises ValueError for options that cannot be used, and for runs that cannot be trained, or not by one program."""
+    options.check()
+    if sweep or len(specs) > 1:
+        options.check_many()
     for spec in specs:
         spec_lib.validate(spec, (spec.env,), env.episode_length)
     if len({spec.program for spec in specs}) != 1 or len({folder.absolute() for folder in folders}) != len(specs):
@@ -135,7 +143,7 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
     results: list[Result] = []
     while waiting and not (results and session.should_stop()):
         with contextlib.ExitStack() as stack:
-            claimed, waiting = claims.claim(stack, waiting, program.lanes)
+            claimed, waiting = _claim(session, claims, stack, waiting, program.lanes)
             if not claimed:
                 break
             specs, folders = zip(*claimed)
@@ -144,25 +152,36 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
     return results
 
 
+def _claim(
+    session: _Session, claims: Claims, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int
+) -> tuple[list[Run], list[Run]]:
+    """Returns the runs that `claims` has claimed for the first process, and those that wait."""
+    places = {run[1]: place for place, run in enumerate(waiting)}
+    decide = lambda: [[places[folder] for _, folder in runs] for runs in claims.claim(stack, waiting, lanes)]  # noqa: E731
+    claimed, left = session.team.share(decide)
+    return [waiting[place] for place in claimed], [waiting[place] for place in left]
+
+
 def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folders: Sequence[Path]) -> list[Result]:
     """Trains runs side by side, from their start or their checkpoint, to their end or until a stop is asked for."""
-    options = session.options
+    options, team = session.options, session.team
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
     runs = [identity.identity(spec, physics, identity.sources(spec)) for spec in specs]
-    checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs)
+    checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs, team)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams))
     _refuse_ended(session.env, specs[0], start)
-    for folder in folders:  # before anything that a result tells of is touched
+    for folder in folders if team.leads else ():  # before anything that a result tells of is touched
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
     watch = Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
-        logs = [_open(stack, session, program.lanes, *run) for run in zip(ended, specs, folders, runs)]
-        success = [row["success_rate"] for row in sinks.read_rows(folders[0] / sinks.METRICS_FILE)]  # of one run, see stop_at
-        for progress in loop.run(session.env, specs[0].config, program.compiled, start):
+        own = zip(ended, specs, folders, runs) if team.leads else ()
+        logs = [_open(stack, session, program.lanes, *run) for run in own]
+        success = team.share(lambda: _success_rates(folders[0]))  # of one run, see stop_at
+        for progress in loop.run(session.env, specs[0].config, program.compiled, start, team.fetch):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
             _log(rows, logs, watch.failed)
@@ -170,7 +189,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
             if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs) or options.is_reached(success):
                 break
             if program.lanes == 1:
-                _save_policy(program, jax.device_get(progress.state.learner), specs[0], folders[0], runs[0])
+                _save_policy(program, team.collect(progress.state.learner), specs[0], folders[0], runs[0])
             session.on_epoch(specs, progress)
             if session.should_stop():
                 session.report(f"saved {checkpoints.save(progress)}")
@@ -186,6 +205,10 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         checkpoints.clear(options.keep_end)
     session.on_epoch(specs, progress)
     return results
+
+
+def _success_rates(folder: Path) -> list[float]:
+    return [row["success_rate"] for row in sinks.read_rows(folder / sinks.METRICS_FILE)]
 
 
 def _refuse_ended(env: Env, spec: RunSpec, start: Start) -> None:
@@ -213,7 +236,8 @@ def _open(
     """
     digest = identity.digest(run)
     if ended == 0 or run_folder.read_content(folder).get("digest", digest) != digest:
-        run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), "lanes": lanes})
+        placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
+        run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)
     opened = [*sinks.open_sinks(folder, session.options.log, ended, steps, digest), *own]
@@ -268,7 +292,12 @@ def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], faile
 
 
 def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:
-    """Writes the policy of a run's learner, given as NumPy arrays; as the learner's state where NumPy cannot compute it."""
+    """Writes the policy of a run's learner, given as NumPy arrays; as the learner's state where NumPy cannot compute it.
+
+    The learner is None in processes that do not write.
+    """
+    if learner is None:
+        return
     policy = program.learner.export(learner, spec.hparams)
     stored = StoredPolicy(program.learner, learner, spec.hparams, program.sizes) if policy is None else policy
     stored.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
@@ -285,10 +314,12 @@ def _finish(
 ) -> list[Result]:
     """Writes what runs leave that have ended: policies and results. result.json comes last: with it a run is done."""
     outcome: Any = None
-    learners = jax.device_get(progress.state.learner)
+    team = session.team
+    learners = team.collect(progress.state.learner)
     if len(failed) < len(specs):
         keys, _ = program_lib.stack(specs, program.choices, program.lanes)
-        outcome = program_lib.evaluate(session.env, program, progress.state, keys, session.options.final_episodes)
+        episodes = session.options.final_episodes
+        outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes, team.fetch)
     results = []
     for lane, (spec, folder) in enumerate(zip(specs, folders)):
         epoch, reason = failed.get(lane, (progress.epoch, ""))
@@ -302,10 +333,12 @@ def _finish(
             "digest": identity.digest(runs[lane]),
         }
         if not reason:
-            _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
-            files.flush(folder / run_folder.POLICY_FILE)
             content |= play.summarize(*(x[lane] for x in outcome))
-        sinks.flush(folder)
-        files.write_json(folder / run_folder.RESULT_FILE, content)
+        if team.leads:
+            if not reason:
+                _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
+                files.flush(folder / run_folder.POLICY_FILE)
+            sinks.flush(folder)
+            files.write_json(folder / run_folder.RESULT_FILE, content)
         results.append(Result(folder, str(content["status"]), epoch, progress.num_epochs, content))
     return results

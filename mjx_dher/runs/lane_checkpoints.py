@@ -18,6 +18,7 @@ from mjx_dher.host.files import FolderError
 from mjx_dher.runs import checkpoint, identity, run_folder, sinks
 from mjx_dher.runs.checkpoint import Restored
 from mjx_dher.runs.loop import Progress, Start
+from mjx_dher.runs.team import ALONE, Team
 from mjx_dher.trainer import TrainState
 
 NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
@@ -34,6 +35,7 @@ class LaneCheckpoints:
     restart: bool  # begin anew where no checkpoint can be used, rather than raise
     report: Callable[[str], None]
     runs: Sequence[dict[str, Any]]  # `identity.identity` of each
+    team: Team = ALONE  # its first process reads and writes
     refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
     failed: dict[int, tuple[int, str]] = dataclasses.field(
         default_factory=dict
@@ -46,8 +48,11 @@ class LaneCheckpoints:
 
     @property
     def folder(self) -> Path:
-        """Folder that holds `checkpoints/`."""
+        """Folder that holds `checkpoints/`: one that these runs, side by side, have had before, with any number of lanes."""
         shared = self.shared / identity.sha256_of([self.lanes, *self.names])[:10]
+        if not shared.exists():
+            others = (path.parent for path in sorted(self.shared.glob(f"*/{NAMES_FILE}")) if _names(path) == self.names)
+            shared = next(others, shared)
         return shared if self.lanes > 1 or shared.exists() else self.folders[0]
 
     def restore(self, init: Callable[[], TrainState]) -> Start:
@@ -57,19 +62,19 @@ class LaneCheckpoints:
           FolderError: no checkpoint can be used, unless `restart`.
         """
         state = init()
-        if not run_folder.checkpoints(self.folder):
+        if not self.team.share(lambda: len(run_folder.checkpoints(self.folder))):
             return Start(state)
-        template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+        template = jax.tree.map(self._shape_of, state)
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
         del state  # there may be no memory for two
         try:
-            restored = checkpoint.restore(self.folder, template, [*map(sinks.whole_epochs, self.folders)])
+            restored = self._read(template)
             self._compare(restored)
         except FolderError as error:
             if not self.restart:
                 raise
             self.report(f"{error}; training these runs from their start")
-            self.refused.extend(run_folder.checkpoints(self.folder))
+            self.refused.extend(run_folder.checkpoints(self.folder) if self.team.leads else [])
             return Start(init())
         for path, why in restored.refused.items():
             self.report(f"not used: {why}")
@@ -78,6 +83,31 @@ class LaneCheckpoints:
         self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
         # A lane's number for its sampler depends on which others are left.
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
+
+    def _read(self, template: TrainState) -> Restored:
+        """Returns the checkpoint that the first process reads; raises FolderError in all processes."""
+        arrays: list[Any] = []
+
+        def decide() -> list[Any]:
+            try:
+                restored = checkpoint.read(self.folder, template, [*map(sinks.whole_epochs, self.folders)])
+            except FolderError as error:
+                return [str(error)]
+            arrays.extend(restored.state)
+            path, epoch, wall_seconds, _, runs, refused, failed = restored
+            return [str(path), epoch, wall_seconds, runs, {str(path): why for path, why in refused.items()}, [*failed.items()]]
+
+        path, *told = self.team.share(decide)
+        if not told:
+            raise FolderError(path)
+        epoch, wall_seconds, runs, refused, failed = told
+        state = checkpoint.place(self.team.share_arrays(arrays), template)
+        paths = {Path(name): why for name, why in refused.items()}
+        return Restored(Path(path), epoch, wall_seconds, state, runs, paths, {lane: tuple(how) for lane, how in failed})
+
+    def _shape_of(self, leaf: Any) -> jax.ShapeDtypeStruct:
+        sharding = leaf.sharding if len(leaf.sharding.device_set) > 1 else None
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
     def _compare(self, restored: Restored) -> None:
         """Reports settings that have changed since the checkpoint was made and may; raises FolderError for others."""
@@ -95,6 +125,11 @@ class LaneCheckpoints:
         Raises:
           CheckpointError: it cannot be written.
         """
+        state = progress.state
+        if self.team.size > 1:
+            state = self.team.collect(checkpoint.without_keys(state))
+            if not self.team.leads:
+                return self.shared
         folder = self.folder
         if folder not in self.folders:
             files.make_folder(folder)
@@ -102,7 +137,7 @@ class LaneCheckpoints:
         for run in self.folders:
             sinks.flush(run)  # a checkpoint is of no use without the lines before it
         told: dict[str, Any] = {"runs": self.runs, "refused": tuple(self.refused), "failed": self.failed}
-        path = checkpoint.save(folder, progress.state, progress.epoch, progress.wall_seconds, self.keep, **told)
+        path = checkpoint.save(folder, state, progress.epoch, progress.wall_seconds, self.keep, **told)
         self.refused.clear()
         return path
 
@@ -118,6 +153,8 @@ class LaneCheckpoints:
 
         With `keep_end` the newest stays that is in the run's own folder.
         """
+        if not self.team.leads:
+            return
         own = self.folders[0] / run_folder.CHECKPOINTS
         for path in run_folder.checkpoints(self.folders[0])[1:] if keep_end else ():
             shutil.rmtree(path, ignore_errors=True)

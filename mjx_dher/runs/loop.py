@@ -15,6 +15,8 @@ from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.host import memory
 from mjx_dher.rollout import check_steps
+from mjx_dher.runs import mesh, placed
+from mjx_dher.runs.mesh import ONE, Layout
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
 from mjx_dher.types import Array, Env, Metrics, PRNGKey
 
@@ -50,7 +52,7 @@ class Compiled(NamedTuple):
 
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics, Array]]  # the last as `Progress.finite`
-    nbytes: int  # memory that an epoch takes, all told, as the compiler planned it; 0 where it does not tell
+    nbytes: int  # memory that an epoch takes on a device, as the compiler planned it; 0 where it does not tell
 
 
 def train(
@@ -60,6 +62,7 @@ def train(
     seed: int = 0,
     on_compile: Callable[[float | None], None] = lambda seconds: None,
     start: Start | None = None,
+    devices: int | str = 1,
     **parts: Any,
 ) -> Iterator[Progress]:
     """Trains one run without a folder, yielding after every epoch. Stop by not asking for more.
@@ -73,31 +76,36 @@ def train(
       seed: random seed.
       on_compile: called with None when compilation begins and with its seconds when it has ended.
       start: point to go on from, as `checkpoint.restore` gives it; a new run where None.
+      devices: that share the run, or "all": each has an equal share of environments, ring and batches.
       **parts: sampler, priority and learner, as `make_train` takes them.
 
     Raises:
-      ValueError: a Config or HParams that cannot run, memory that does not suffice, or what `env.check` raises, where the
-        environment has one, before the first epoch or after any.
+      ValueError: a Config or HParams that cannot run, memory that does not suffice, devices that are not there, or what
+        `env.check` raises, where the environment has one, before the first epoch or after any.
     """
     hparams = HParams() if hparams is None else hparams
     config_lib.validate(config, hparams, env.episode_length)
-    program = make_train(env, config, **parts)
+    layout = mesh.arrange(mesh.find(devices), 1)
+    program = make_train(env, config, split=layout.split, **parts)
     key = jax.random.key(seed)
-    check_memory(program, config)
+    check_memory(program, config, layout.sharers)
     on_compile(None)
     started = time.perf_counter()
-    compiled = compile_program(program, key, hparams, config_lib.num_updates(config, env.episode_length))
-    check_program(compiled, config)
+    compiled = compile_program(program, key, hparams, config_lib.num_updates(config, env.episode_length), layout)
+    check_program(compiled, config, layout.sharers)
     check_steps(env)
     on_compile(time.perf_counter() - started)
     for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
         yield progress._replace(metrics={name: to_float(value) for name, value in progress.metrics.items()})
 
 
-def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:
+def run(
+    env: Env, config: Config, compiled: Compiled, start: Start, fetch: Callable[[Any], Any] = jax.device_get
+) -> Iterator[Progress]:
     """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays.
 
-    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way.
+    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way. `fetch` gives
+    arrays as NumPy's.
 
     Raises:
       ValueError: what `env.check` raises, where the environment has one, after an epoch.
@@ -111,8 +119,9 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
             running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
             while not running.done():
                 concurrent.futures.wait([running], timeout=0.1)
-            state, metrics, finite = running.result()
+            state, *told = running.result()
             check_steps(env)
+            metrics, finite = fetch(told)
             now = time.perf_counter()
             yield Progress(
                 epoch=number,
@@ -121,31 +130,37 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
                 updates=number * config.cycles_per_epoch * config.updates_per_cycle,
                 wall_seconds=now - started,
                 epoch_seconds=now - previous,
-                metrics=jax.device_get(metrics),
+                metrics=metrics,
                 state=state,
                 finite=np.asarray(finite),
             )
             previous = time.perf_counter()
 
 
-def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0) -> Compiled:
+def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0, layout: Layout = ONE) -> Compiled:
     """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
 
-    Their values do not matter. The compiler takes more trouble for a run of many `updates`.
+    Their values do not matter. The compiler takes more trouble for a run of many `updates`. `layout` says on which devices.
     """
 
     def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:
         state, metrics = program.epoch(state)
         return state, metrics, is_finite(state.learner)
 
-    search = updates * (key.shape[0] if key.ndim else 1) >= WORTH_A_SEARCH
+    search = updates * (key.shape[0] if key.ndim else 1) // layout.lanes >= WORTH_A_SEARCH
     init, epoch = (jax.vmap(program.init), jax.vmap(epoch_and_check)) if key.ndim else (program.init, epoch_and_check)
-    hparams = as_arrays(hparams)
-    state = jax.eval_shape(init, key, hparams)
-    lowered_init = jax.jit(init).lower(key, hparams)
+    arguments: tuple[Any, Any] = key, as_arrays(hparams)
+    if layout.devices:
+        init, epoch = placed.place_init(layout, init, bool(key.ndim)), placed.place_epoch(layout, epoch, bool(key.ndim))
+        arguments = placed.to_host(*arguments)
+        state = init.eval_shape(*arguments)
+    else:
+        state = jax.eval_shape(init, *arguments)
+        init, epoch = jax.jit(init), jax.jit(epoch, donate_argnums=0)
+    lowered_init = init.lower(*arguments)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         compiling = pool.submit(compile_lowered, lowered_init)
-        lowered = jax.jit(epoch, donate_argnums=0).lower(state)
+        lowered = epoch.lower(state)
         compiled = compile_lowered(lowered, search)
         compiled_init = compiling.result()
     sizes = compiled.memory_analysis()
@@ -155,7 +170,11 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
             sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
         )
     memory.release()
-    return Compiled(init=lambda key, hparams: compiled_init(key, as_arrays(hparams)), epoch=compiled, nbytes=nbytes)
+
+    def start(key: PRNGKey, hparams: HParams) -> TrainState:
+        return compiled_init(*(placed.to_host(key, as_arrays(hparams)) if layout.devices else (key, as_arrays(hparams))))
+
+    return Compiled(init=start, epoch=compiled, nbytes=nbytes)
 
 
 def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
@@ -181,8 +200,8 @@ def state_template(program: Train) -> TrainState:
     return jax.eval_shape(program.init, jax.random.key(0), as_arrays(HParams()))
 
 
-def check_memory(program: Train, config: Config) -> None:
-    """Refuses a replay ring, or networks, that cannot fit, before anything is compiled.
+def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
+    """Refuses a replay ring, or networks, that cannot fit, before anything is compiled; so many devices share the memory.
 
     Raises:
       ValueError: says what is needed, what is free and, for the ring, which replay_size would fit.
@@ -191,27 +210,29 @@ def check_memory(program: Train, config: Config) -> None:
     if available is None:
         return
     free = f"but only {memory.format_bytes(available)} of memory is free"
-    if program.replay_bytes > available:
-        fitting = int(config.replay_size * available / program.replay_bytes)
-        needed = memory.format_bytes(program.replay_bytes)
+    ring = sharers * program.replay_bytes
+    if ring > available:
+        fitting = int(config.replay_size * available / ring)
+        needed = memory.format_bytes(ring)
         raise ValueError(f"replay_size {config.replay_size} needs {needed}, {free}; at most {fitting} transitions fit")
     shapes = jax.tree.leaves(jax.eval_shape(program.learner.init, jax.random.key(0)))
-    nbytes = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
+    nbytes = sharers * sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
     if nbytes > available:
         raise ValueError(f"hidden_sizes {config.hidden_sizes}: the learner needs {memory.format_bytes(nbytes)}, {free}")
 
 
-def check_program(compiled: Compiled, config: Config) -> None:
-    """Refuses a program that cannot fit, by the compiler's figure, before it runs.
+def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
+    """Refuses a program that cannot fit, by the compiler's figure, before it runs; so many devices share the memory.
 
     Raises:
       ValueError: says what is needed, what is free and which settings decide it.
     """
     available = memory.available_bytes()
-    if available is not None and compiled.nbytes > available:
+    nbytes = sharers * compiled.nbytes
+    if available is not None and nbytes > available:
         settings = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes")
         raise ValueError(
-            f"an epoch needs {memory.format_bytes(compiled.nbytes)}, but only {memory.format_bytes(available)} of memory"
+            f"an epoch needs {memory.format_bytes(nbytes)}, but only {memory.format_bytes(available)} of memory"
             f" is free; what decides it: {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
         )
 

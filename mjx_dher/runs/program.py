@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import dataclasses
 import functools
 import math
 import time
@@ -20,15 +21,17 @@ from mjx_dher.config import HParams
 from mjx_dher.host import memory
 from mjx_dher.learners import Learner
 from mjx_dher.rollout import Outcome, check_steps
-from mjx_dher.runs import loop, play, run_folder
+from mjx_dher.runs import loop, mesh, placed, play, run_folder
 from mjx_dher.runs.loop import Compiled
+from mjx_dher.runs.mesh import ONE, Layout
 from mjx_dher.spec import RunSpec
+from mjx_dher.split import ALONE, Split
 from mjx_dher.trainer import Train, TrainState
 from mjx_dher.types import Env, PRNGKey, Sizes
 
 # HParams, and which of a program's samplers, priorities and generators a lane uses; see `one_of` of each.
 Lane = collections.namedtuple("Lane", (*HParams._fields, "choice", "priority_choice", "generator_choice"))  # type: ignore[misc]
-EvaluateFn = Callable[[TrainState, PRNGKey], Outcome]
+EvaluateFn = Callable[[TrainState, Any], Outcome]
 
 
 class Choices(NamedTuple):
@@ -57,6 +60,7 @@ class Program(NamedTuple):
     """A compiled program for runs side by side."""
 
     lanes: int
+    layout: Layout
     choices: Choices
     learner: Learner
     sizes: Sizes
@@ -64,61 +68,84 @@ class Program(NamedTuple):
     evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
 
 
-def make_loop(env: Env, spec: RunSpec, choices: Choices) -> Train:
-    """Makes the training loop of runs that share a program, with the parts that they name."""
+def make_loop(env: Env, spec: RunSpec, choices: Choices, split: Split = ALONE) -> Train:
+    """Makes the training loop of runs that share a program, with the parts that they name; each run may be split itself."""
+    of_a_part = dataclasses.replace(spec.config, batch_size=split.share(spec.config.batch_size))
     return trainer.make_train(
         env,
         spec.config,
         sampler=samplers.one_of([samplers.make(*choice) for choice in choices.samplers]),
         priority=priorities.one_of([priorities.make(name) for name in choices.priorities]),
         generator=generators.one_of([generators.make(name) for name in choices.generators]),
-        learner=learners.make(spec.learner, spec.config, trainer.env_sizes(env), spec.networks),
+        learner=learners.make(spec.learner, of_a_part, trainer.env_sizes(env), spec.networks),
+        split=split,
     )
 
 
 def compile_runs(
-    env: Env, specs: Sequence[RunSpec], max_lanes: int | None, final_episodes: int, report: Callable[[str], None]
+    env: Env,
+    specs: Sequence[RunSpec],
+    max_lanes: int | None,
+    final_episodes: int,
+    report: Callable[[str], None],
+    devices: Sequence[Any] = (),
 ) -> Program:
     """Compiles for as many lanes as there may be and memory holds, by the compiler's figure.
 
     The last evaluation may still be compiling, in a thread, while the runs are trained.
 
     Raises:
-      ValueError: memory does not suffice for one run.
+      ValueError: memory does not suffice for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
-    train = make_loop(env, spec, choices)
-    loop.check_memory(train, spec.config)
-    lanes = min(len(specs), max_lanes or len(specs))
+    most = min(len(specs), max_lanes or len(specs))
+    layout = mesh.arrange(devices, most)
+    train = make_loop(env, spec, choices, layout.split)
+    loop.check_memory(train, spec.config, layout.sharers)
+    lanes = math.ceil(most / layout.lanes)  # of a device, as are the bytes
     available = memory.available_bytes()
     if available is not None:  # the rings alone must fit before the compiler is asked
+        available //= layout.sharers
         lanes = max(1, min(lanes, int(available / train.replay_bytes)))
     while True:
-        lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))  # chunks of equal size
-        keys, hparams = stack(specs, choices, lanes)
-        compiled = _compile(env, spec, train, keys, hparams, _title(env, specs, train, lanes), report)
+        chunks = math.ceil(len(specs) / (lanes * layout.lanes))
+        lanes = math.ceil(len(specs) / (chunks * layout.lanes))  # chunks of equal size
+        keys, hparams = stack(specs, choices, lanes * layout.lanes)
+        title = _title(env, specs, train, lanes * layout.lanes, layout)
+        compiled = _compile(env, spec, train, keys, hparams, title, report, layout)
         if available is None or compiled.nbytes <= available or lanes == 1:
-            loop.check_program(compiled, spec.config)
+            loop.check_program(compiled, spec.config, layout.sharers)
             beside = available is not None and compiled.nbytes <= available / 2
-            evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside)
-            return Program(lanes, choices, train.learner, trainer.env_sizes(env), compiled, evaluate)
+            evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside, layout)
+            return Program(lanes * layout.lanes, layout, choices, train.learner, trainer.env_sizes(env), compiled, evaluate)
         lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
 
 
-def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int) -> str:
+def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout: Layout) -> str:
+    apart = f"{layout.lanes} of them apart" if layout.lanes > 1 else ""
+    parts = f"{layout.parts} for each run" if layout.parts > 1 else ""
+    number = f"{len(layout.devices)} devices ({', '.join(filter(None, (apart, parts)))}) of " if layout.devices else ""
     together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
     return (
         f"{'one run' if len(specs) == 1 else together}; physics {run_folder.engine_name(env)}, learner on"
-        f" {jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
+        f" {number}{jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
     )
 
 
 def _compile(
-    env: Env, spec: RunSpec, train: Train, keys: PRNGKey, hparams: Any, title: str, report: Callable[[str], None]
+    env: Env,
+    spec: RunSpec,
+    train: Train,
+    keys: PRNGKey,
+    hparams: Any,
+    title: str,
+    report: Callable[[str], None],
+    layout: Layout,
 ) -> Compiled:
     report(f"{spec.env}: compiling for {title} ...")
     started = time.perf_counter()
-    compiled = loop.compile_program(train, keys, hparams, config_lib.num_updates(spec.config, env.episode_length))
+    updates = config_lib.num_updates(spec.config, env.episode_length)
+    compiled = loop.compile_program(train, keys, hparams, updates, layout)
     check_steps(env)
     seconds = time.perf_counter() - started
     report(f"{spec.env}: compiled in {seconds:.1f} s; {memory.format_bytes(compiled.nbytes)} of memory")
@@ -126,7 +153,7 @@ def _compile(
 
 
 def _compile_evaluation(
-    env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool
+    env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
 ) -> concurrent.futures.Future[EvaluateFn]:
     """Compiles the last evaluation, which is not needed before the runs have ended: `beside` their training, in a thread.
 
@@ -135,10 +162,18 @@ def _compile_evaluation(
     episodes = min(final_episodes, play.CHUNK)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
-        return trainer.evaluate_state(env, train.learner, state, key, episodes)
+        return trainer.evaluate_state(env, train.learner, state, key, episodes, train.split)
 
     init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
-    lowered = jax.jit(evaluate_all).lower(jax.eval_shape(init, keys, hparams), keys)
+    arguments: tuple[Any, Any] = keys, hparams
+    if layout.devices:
+        batched = bool(keys.ndim)
+        init, evaluate_all = placed.place_init(layout, init, batched), placed.place_evaluate(layout, evaluate_all, batched)
+        arguments = placed.to_host(keys, hparams)
+        state = init.eval_shape(*arguments)
+    else:
+        state, evaluate_all = jax.eval_shape(init, keys, hparams), jax.jit(evaluate_all)
+    lowered = evaluate_all.lower(state, arguments[0])
     pool = concurrent.futures.ThreadPoolExecutor(1)
     compiling = pool.submit(loop.compile_lowered, lowered, plain=True)
     pool.shutdown(wait=not beside)
@@ -162,16 +197,25 @@ def lane_of(tree: Any, lane: int, lanes: int) -> Any:
     return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
 
 
-def evaluate(env: Env, program: Program, state: TrainState, keys: PRNGKey, episodes: int) -> Outcome:
+def evaluate(
+    env: Env,
+    program: Program,
+    state: TrainState,
+    keys: PRNGKey,
+    episodes: int,
+    fetch: Callable[[Any], Any] = jax.device_get,
+) -> Outcome:
     """Plays the last evaluation of each lane; returns the outcomes [lanes, episodes] as NumPy arrays.
 
-    `keys` are those of the runs; the i-th `play.CHUNK` episodes of a run follow `fold_in(key, i)`, i from 1.
+    `fetch` gives arrays as NumPy's. `keys` are those of the runs; the i-th `play.CHUNK` episodes of a run follow
+    `fold_in(key, i)`, i from 1.
     """
     play_chunk = program.evaluate.result()
     outcomes = []
     for number in range(1, 1 + math.ceil(episodes / play.CHUNK)):
         fold_in = functools.partial(jax.random.fold_in, data=number)
-        outcome = jax.device_get(play_chunk(state, jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)))
+        own = jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)
+        outcome = fetch(play_chunk(state, placed.to_host(own)[0] if program.layout.devices else own))
         outcomes.append(jax.tree.map(np.atleast_2d, outcome))
     check_steps(env)
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :episodes], *outcomes)

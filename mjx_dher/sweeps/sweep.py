@@ -13,6 +13,7 @@ from pathlib import Path
 from mjx_dher.runs.driver import Result, train_runs
 from mjx_dher.runs.loop import Progress
 from mjx_dher.runs.options import Options
+from mjx_dher.runs.team import ALONE, Team
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.types import Env
@@ -27,6 +28,8 @@ def run(
     *,
     options: Options,
     lanes: int | None = None,
+    devices: int | str = 1,
+    team: Team = ALONE,
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
@@ -39,6 +42,8 @@ def run(
       make_env: makes the environment of a trial.
       options: evaluation, checkpoints, logs.
       lanes: runs side by side, at most.
+      devices: to train on, or "all", as for `train_runs`.
+      team: processes that train together, each of which calls this alike; the first one writes.
       should_stop: asked after every epoch; True ends the sweep, with a checkpoint.
       report: called with a line about each program and checkpoint.
       on_epoch: called after every epoch of those side by side.
@@ -52,7 +57,7 @@ def run(
     """
     results: list[Result] = []
     for _, group in itertools.groupby(specs, key=lambda spec: spec.program):
-        if results and should_stop():
+        if results and team.any(should_stop()):
             break
         trials = list(group)
         results += train_runs(
@@ -61,6 +66,8 @@ def run(
             [grid.folder_of(folder, spec) for spec in trials],
             options=options,
             lanes=lanes,
+            devices=devices,
+            team=team,
             shared=folder / UNFINISHED,
             sweep=True,
             should_stop=should_stop,

@@ -1,0 +1,295 @@
+"""Runs on four devices: tests/test_devices.py calls pytest with this file in a process where a CPU stands for four."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec
+from test_trainer import SMALL
+
+from mjx_dher import HParams, Options, RunSpec, envs, learners, make_train, normalizer, trainer
+from mjx_dher.runs import checkpoint, driver, loop, mesh, placed, sinks
+from mjx_dher.split import ALONE, Split
+from mjx_dher.types import Batch, Sizes
+from probes import Explodes, PointMass
+
+ENV = PointMass()
+# Two epochs of 240 steps; rings of 40 episodes.
+CONFIG = dataclasses.replace(SMALL, num_envs=8, batch_size=32, replay_size=400, hidden_sizes=(16,), total_steps=480)
+SIZES = Sizes(observation=3, goal=2, action=2)
+DEVICES = (1, 2, 4)
+
+
+def in_parts(number, function, in_specs, out_specs):
+    """`function` of a Split, on so many devices."""
+    if number == 1:
+        return jax.jit(functools.partial(function, ALONE))
+    layout = mesh.arrange(mesh.find(number), 1)
+    local = functools.partial(function, layout.split)
+    return jax.jit(jax.shard_map(local, mesh=layout.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False))
+
+
+WHOLE, PARTED = PartitionSpec(), PartitionSpec(mesh.DATA)
+
+
+def make_batch(size=64):
+    keys = jax.random.split(jax.random.key(5), 5)
+    return Batch(
+        observation=jax.random.normal(keys[0], (size, 3)),
+        next_observation=jax.random.normal(keys[1], (size, 3)),
+        desired_goal=jax.random.normal(keys[2], (size, 2)),
+        action=jax.random.uniform(keys[3], (size, 2), minval=-1, maxval=1),
+        reward=-jax.random.bernoulli(keys[4], 0.5, (size,)).astype(jnp.float32),
+    )
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3", "redq", "tqc", "dtqc")]
+
+
+@pytest.mark.parametrize("name", ["ddpg", "sac", *SLOW])
+def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
+    """By Adam's moments after one update, a tenth and a thousandth of the gradient and its square."""
+    learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SIZES)
+    state = learner.init(jax.random.key(0))
+
+    def update(split, state, batch):
+        own = learner if split.number == 1 else learners.split_over(learner, split)
+        state, metrics = own.update(state, batch, trainer.as_arrays(HParams()))
+        return state, split.mean(metrics)
+
+    states = [in_parts(n, update, (WHOLE, PARTED), (WHOLE, WHOLE))(state, make_batch()) for n in DEVICES]
+    moments = [[getattr(s, field) for field in vars(s) if field.endswith(("moments", "opt_state"))] for s, _ in states]
+    assert max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(moments[0])) > 1e-3
+    for other, (_, metrics) in zip(moments[1:], states[1:]):
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7), other, moments[0])
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), metrics, states[0][1])
+
+
+def test_parts_that_do_not_average_learn_something_else():
+    """So that the test above can fail."""
+    learner = learners.make("ddpg", CONFIG, SIZES)
+    state = learner.init(jax.random.key(0))
+    update = lambda split, state, batch: learner.update(state, batch, trainer.as_arrays(HParams()))[0]  # noqa: E731
+    one, two = (in_parts(n, update, (WHOLE, PARTED), WHOLE)(state, make_batch()) for n in (1, 2))
+    difference = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), one.opt_state, two.opt_state)
+    assert max(jax.tree.leaves(difference)) > 1e-4
+
+
+def test_moments_of_the_normalizers_are_those_of_all_parts():
+    """Also where valid values lie in some parts only."""
+    values = 3.0 + jax.random.normal(jax.random.key(0), (16, 5, 2))
+    valid = (jnp.arange(16) % 3 > 0) & (jnp.arange(16) < 12)  # none in the last of four parts
+    before = normalizer.update(normalizer.init(2), values[:3] - 1.0, 200.0)
+
+    def update(split, state, values, valid):
+        return normalizer.update(state, values, 200.0, valid[:, None], split)
+
+    kept = np.concatenate([np.asarray(values[:3] - 1.0).reshape(-1, 2), np.asarray(values[valid]).reshape(-1, 2)])
+    for number in DEVICES:
+        after = in_parts(number, update, (WHOLE, PARTED, PARTED), WHOLE)(before, values, valid)
+        assert float(after.count) == len(kept)
+        np.testing.assert_allclose(after.mean, kept.mean(0), rtol=1e-5)
+        np.testing.assert_allclose(after.var, kept.var(0), rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", [2, 4])
+def test_the_first_episodes_and_evaluations_are_those_of_one_device(devices):
+    """First states and noise do not depend on the devices, nor do the episodes that are discarded."""
+    env, config = Explodes(jnp.nan), dataclasses.replace(CONFIG, cycles_per_epoch=1, eval_episodes=10)
+    hparams = HParams(actor_lr=0.0, random_eps=1.0)  # the policy, and so what is played, does not change
+    one, several = (next(loop.train(env, config, hparams, devices=n)) for n in (1, devices))
+    for name in ("train_success_rate", "train_return_mean", "success_rate", "reset_success_rate", "return_mean"):
+        assert one.metrics[name] == pytest.approx(several.metrics[name], rel=1e-6, nan_ok=True), name
+    assert one.metrics["discarded_episodes"] == several.metrics["discarded_episodes"] > 0
+    valid = 8 - one.metrics["discarded_episodes"]
+    sizes = np.asarray(several.state.replay.size)
+    assert sizes.shape == (devices,)
+    assert sizes.sum() == valid == one.state.replay.size
+    episodes = [np.asarray(x.state.replay.episodes.action).reshape(40, -1) for x in (one, several)]
+    held = [{row.tobytes() for row in rows if row.any()} for rows in episodes]
+    assert held[0] == held[1]
+    np.testing.assert_allclose(one.state.learner.observation_norm.mean, several.state.learner.observation_norm.mean, rtol=1e-5)
+
+
+def specs_of(number):
+    spec = RunSpec(env="point_mass", config=CONFIG)
+    return [dataclasses.replace(spec, seed=seed) for seed in range(number)]
+
+
+def train(folder, number=1, epoch=None, env=ENV, **options):
+    """Trains runs; stops after `epoch`. Returns what their files say, times left out, and their last learners."""
+    seen, states = [], []
+
+    def on_epoch(specs, progress):
+        seen.append(progress.epoch)
+        states.append(jax.device_get(progress.state.learner))
+
+    driver.train_runs(
+        env,
+        specs_of(number),
+        [folder / str(seed) for seed in range(number)],
+        options=Options(final_episodes=15, checkpoint_every=0),
+        on_epoch=on_epoch,
+        should_stop=lambda: seen[-1] == epoch,
+        sweep=number > 1,
+        **options,
+    )
+    times = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
+    rows = [sinks.read_rows(folder / str(seed) / "metrics.csv") for seed in range(number)]
+    return [[{k: v for k, v in row.items() if k not in times} for row in run] for run in rows], states[-1]
+
+
+def assert_same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_lanes_on_two_devices_are_those_of_one_to_the_bit(tmp_path):
+    rows, learner = train(tmp_path / "one", 4, lanes=4)
+    rows_of_two, learner_of_two = train(tmp_path / "two", 4, lanes=4, devices=2)
+    assert rows == rows_of_two
+    assert_same(learner, learner_of_two)
+
+
+@pytest.mark.slow
+def test_lanes_are_filled_up_to_what_the_devices_divide(tmp_path):
+    """Three runs on four devices; as one by one."""
+    rows, _ = train(tmp_path / "one", 3, lanes=1)
+    rows_of_four, _ = train(tmp_path / "four", 3, devices="all")
+    assert len(rows) == 3
+    for run, other in zip(rows, rows_of_four):
+        for row, row_of_four in zip(run, other):
+            assert row == pytest.approx(row_of_four, rel=1e-3, nan_ok=True)
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_any_number_of_devices(tmp_path):
+    """On as many as it had, as if it had never stopped, to the bit."""
+    rows, learner = train(tmp_path / "whole", devices=2)
+    train(tmp_path / "cut", epoch=1, devices=2)
+    folder = tmp_path / "cut" / "0"
+    states = {}
+    for number in DEVICES:
+        layout = mesh.arrange(mesh.find(number), 1)
+        program = make_train(ENV, CONFIG, split=layout.split)
+        template = loop.state_template(program)
+        if number > 1:
+            init = placed.place_init(layout, program.init, False)
+            template = init.eval_shape(*placed.to_host(jax.random.key(0), trainer.as_arrays(HParams())))
+        states[number] = checkpoint.restore(folder, template).state
+    assert int(states[1].replay.size) == 24
+    assert np.asarray(states[4].replay.size).tolist() == [6] * 4
+    rings = [np.asarray(states[number].replay.episodes.action).reshape(40, -1) for number in DEVICES]
+    held = [sorted(row.tobytes() for row in ring if row.any()) for ring in rings]
+    assert held[0] == held[1] == held[2]
+    assert len(held[0]) == 24
+    rows_again, learner_again = train(tmp_path / "cut", devices=2)
+    assert rows == rows_again
+    assert_same(learner, learner_again)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1), (2, 4)])
+def test_a_run_that_goes_on_elsewhere_trains(tmp_path, before, after):
+    train(tmp_path, epoch=1, devices=before)
+    rows, _ = train(tmp_path, devices=after)
+    assert [row["epoch"] for row in rows[0]] == [1, 2]
+    assert not (tmp_path / "0" / "checkpoints").exists()
+
+
+@pytest.mark.slow
+def test_lanes_go_on_with_another_number_of_devices(tmp_path):
+    """Three lanes on one device, then on four, which are filled up by one; and back."""
+    rows, _ = train(tmp_path / "whole", 3, lanes=3)
+    for before, after in (({"lanes": 3}, {"devices": 4}), ({"devices": 4}, {"lanes": 3})):
+        folder = tmp_path / "-".join(before)
+        train(folder, 3, epoch=1, **before)
+        again, _ = train(folder, 3, **after)
+        for run, other in zip(rows, again):
+            assert [row["epoch"] for row in other] == [1, 2]
+            assert run[1] == pytest.approx(other[1], rel=1e-3, nan_ok=True)
+        assert not (folder / "unfinished").exists()
+
+
+def refuse(match, tmp_path, number=1, env=ENV, config=CONFIG, **options):
+    specs = [dataclasses.replace(spec, config=config) for spec in specs_of(number)]
+    folders = [tmp_path / str(seed) for seed in range(number)]
+    with pytest.raises(ValueError, match=match):
+        driver.train_runs(env, specs, folders, **options)
+    assert not tmp_path.exists() or not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("devices", [5, 10**20, 0, -1, True, 1.5, "", "two", None, float("nan")])
+def test_devices_that_are_not_there_are_refused(tmp_path, devices):
+    match = r"devices must lie in \[1, 4\].* or be all; got 5" if devices == 5 else r"devices must be an integer in \[1, "
+    refuse(match, tmp_path / "runs", devices=devices)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "nearest"),
+    [("num_envs", 6, "4 or 8"), ("batch_size", 33, "32 or 36"), ("replay_size", 410, "400 or 440")],
+)
+def test_sizes_that_devices_do_not_divide_are_refused(tmp_path, field, value, nearest):
+    config = dataclasses.replace(CONFIG, **{field: value})
+    refuse(
+        f"{field} must be .*multiple of 4.*; got {value}, the nearest are {nearest}",
+        tmp_path / "runs",
+        config=config,
+        devices=4,
+    )
+    with pytest.raises(ValueError, match=f"{field} must be"):
+        next(loop.train(ENV, config, devices=4))
+
+
+def test_lanes_that_devices_do_not_divide_are_refused(tmp_path):
+    refuse("lanes must be a multiple of 4, the devices, or 1, 2; got 3", tmp_path / "runs", number=6, lanes=3, devices=4)
+
+
+def test_a_learner_that_cannot_be_split_is_refused():
+    class Own:
+        def __init__(self, learner):
+            for method in vars(learners.Learner):
+                if not method.startswith("_"):
+                    setattr(self, method, getattr(learner, method))
+
+    own = Own(learners.make("ddpg", CONFIG, trainer.env_sizes(ENV)))
+    with pytest.raises(ValueError, match="one run of learner Own cannot be on 2 devices, because it has no split_over"):
+        next(loop.train(ENV, CONFIG, learner=own, devices=2))
+
+
+def test_layouts():
+    devices = tuple(jax.devices())
+    found = {runs: mesh.arrange(devices, runs) for runs in (1, 2, 3, 4, 40)}
+    assert {runs: (layout.lanes, layout.parts) for runs, layout in found.items()} == {
+        1: (1, 4),
+        2: (2, 2),
+        3: (4, 1),
+        4: (4, 1),
+        40: (4, 1),
+    }
+    assert mesh.arrange((), 3) is mesh.ONE
+    assert mesh.ONE.split is ALONE
+    assert found[1].split == Split("data", 4)
+    assert found[1].sharers == 4  # of the memory of one CPU
+    assert mesh.find(1) == ()
+    assert len(mesh.find("all")) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_engines_on_several_devices(engine):
+    """The callback of `native` is called by all devices at once, each with its share of the environments."""
+    env = envs.make("reach", engine=engine)
+    config = dataclasses.replace(CONFIG, replay_size=50 * 80, total_steps=2 * 3 * 8 * 50, eval_episodes=6)
+    one, several = (list(loop.train(env, config, devices=n)) for n in (1, 4))
+    assert one[0].metrics["reset_success_rate"] == several[0].metrics["reset_success_rate"]
+    assert len(several) == 2
+    assert several[-1].metrics["discarded_episodes"] == 0.0
+    assert bool(several[-1].finite)
+    # The first cycle's episodes are the same ones: the policies that play them are.
+    np.testing.assert_allclose(
+        several[0].state.replay.episodes.observation[0, :5], one[0].state.replay.episodes.observation[0, :5], atol=1e-4
+    )
