@@ -17,7 +17,7 @@ from mjx_dher.runs.loop import state_template
 from mjx_dher.scores import LearnedMetric
 from mjx_dher.spec import GENERATORS, METRICS, PRIORITIES, SAMPLERS
 from mjx_dher.testing import PartError
-from mjx_dher.viewer import View
+from mjx_dher.view import View
 from point_mass import PointMass
 
 ENV = PointMass()

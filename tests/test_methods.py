@@ -14,7 +14,7 @@ from mjx_dher.config import HParams
 from mjx_dher.methods import episodes, goals, metrics, transitions
 from mjx_dher.replay import Sample
 from mjx_dher.types import Batch, Episode
-from mjx_dher.viewer import Values, View
+from mjx_dher.view import Values, View
 from probes import Clock
 
 HP = HParams()

@@ -1,4 +1,4 @@
-"""Environments, samplers, metrics, priorities, learners and networks of one's own, named as module:attribute."""
+"""Environments, samplers, metrics, priorities, generators, learners and networks of one's own, as module:attribute."""
 
 import csv
 import dataclasses
@@ -20,7 +20,7 @@ TINY = """
     --hidden-sizes 8 --eval-episodes 2 --final-episodes 4
 """.split()  # noqa: SIM905
 OWN = ["--env", "my_tasks:MyTask", "--sampler", "my_tasks:soon", *TINY]
-PARTS = ("metric", "priority", "learner", "networks")
+PARTS = ("metric", "priority", "generator", "learner", "networks")
 OWN_PARTS = [*OWN, "--sampler", "weighted", *(word for part in PARTS for word in (f"--{part}", f"my_tasks:{part}"))]
 MY_TASKS = """
 import dataclasses, os, signal
@@ -49,6 +49,10 @@ def metric(achieved, desired):
 def priority(episode, compute_reward, hparams):
     traced.add("priority")
     return jnp.full((), 0.25)
+
+def generator(key, obs, ring, view):
+    traced.add("generator")
+    return obs["desired_goal"]
 
 class Actor(nn.Module):
     @nn.compact
