@@ -216,7 +216,7 @@ def pretend(chunk, tell):
 def many(trials, blocks=10):
     """Time and memory of the driver by block of trials."""
     from mjx_dher import presets
-    from mjx_dher.fleet import cluster, driver, plan
+    from mjx_dher.fleet import chunks, cluster, driver, plan
     from mjx_dher.fleet.ledger import Ledger
     from mjx_dher.runs.options import Options
     from mjx_dher.sweeps import grid
@@ -235,7 +235,9 @@ def many(trials, blocks=10):
         with cluster.joined(request, None) as tasks:
             kinds = plan.kinds_of(request, list(tasks.resources().values()), "auto")
             size = lambda kind, run: plan.most_of(kind, request, None, None)  # noqa: E731
-            job = driver.Job(Path(folder), Options(), None, None, kinds, size, pretend, print, show, lambda: False)
+            job = driver.Job(
+                Path(folder), Options(), None, None, chunks.files_digest(), kinds, size, pretend, print, show, lambda: False
+            )
             lost = driver.run(tasks, job, Ledger(Path(folder), specs))
         whole = sum(grid.is_done(Path(folder), run) for run in specs)
     for before, now in itertools.pairwise(marks):

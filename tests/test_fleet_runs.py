@@ -173,7 +173,7 @@ def test_runs_of_a_task_share_a_program(tmp_path):
 
 
 def chunk_of(trials, storage=None):
-    return Chunk("c", "s", tuple(trials), OPTIONS, 1, None, None if storage is None else str(storage))
+    return Chunk("c", "s", tuple(trials), OPTIONS, 1, None, None if storage is None else str(storage), "")
 
 
 def make_point_mass(run):
@@ -267,6 +267,7 @@ def job_of(folder, states, stop=lambda: False):
         OPTIONS,
         1,
         str(folder / "storage"),
+        "",
         [Kind("cpu", 0, 1)],
         lambda kind, spec: 2,
         lambda chunk, tell: chunks.train(chunk, make_point_mass, tell),

@@ -91,6 +91,7 @@ def _train(
             order.options,
             order.lanes,
             storage,
+            chunks.files_digest(),
             kinds,
             _Sizes(order, kinds, nodes, todo),
             train_chunk,

@@ -7,6 +7,7 @@ storage, each new checkpoint is copied there with all that belongs to it, beside
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib.util
 import os
@@ -49,6 +50,7 @@ class Chunk(NamedTuple):
     lanes: int | None  # runs side by side, at most
     cores: int | None  # that it computes on, where they are fewer than the node's
     storage: str | None
+    files: str  # digest of the driver's files of the package
 
 
 class Told(NamedTuple):
@@ -236,10 +238,11 @@ class Mirror(threading.Thread):
 def versions() -> dict[str, str]:
     """Returns the versions that decide what a run computes; `files` is a digest of the package's own files."""
     libraries = {name: metadata.version(name) for name in ("jax", "jaxlib", "mujoco", "numpy")}
-    return {"mjx_dher": __version__, "files": _files_digest(), "python": platform.python_version(), **libraries}
+    return {"mjx_dher": __version__, "files": files_digest(), "python": platform.python_version(), **libraries}
 
 
-def _files_digest() -> str:
+@functools.cache
+def files_digest() -> str:
     """Returns ten digits that stand for all files of the package that decide what it computes."""
     package = Path(files.__file__).parents[1]
     spec = importlib.util.find_spec("mjx_dher.envs")  # in the package, or beside it in a checkout

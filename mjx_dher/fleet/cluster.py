@@ -18,7 +18,7 @@ from mjx_dher.host import subprocesses
 from mjx_dher.spec import RunSpec
 
 RETRIES = 5  # of a chunk whose worker or node was lost
-SECONDS_TO_ANSWER = 10.0  # that a cluster has
+SECONDS_TO_ANSWER = 20.0  # that a cluster has
 SECONDS_TO_LOOK = 60.0  # that nodes have to tell what they are
 STORE_BYTES = 200 << 20  # of the object store of a cluster that is started here; what does not fit goes to the disk
 # Parts of the folder with own code that no node needs, as .gitignore names them. The package is each node's own.
@@ -254,6 +254,9 @@ def _run(chunk: Chunk, work: Work, board: Any) -> tuple[Any, ...]:
         except ray.exceptions.RayError:  # nobody listens; the training goes on
             return False
 
+    if chunk.files != chunks.files_digest():  # a node that has come since the driver looked
+        host, own = socket.gethostname(), chunks.files_digest()
+        raise ValueError(f"ray: node {host} has files of mjx-dher with the digest {own}, and the driver {chunk.files}")
     if chunk.cores is not None:
         chunks.pin(chunk.cores)
     return (socket.gethostname(), *work(chunk, tell))

@@ -66,6 +66,7 @@ class Job:
     options: Options
     lanes: int | None
     storage: str | None
+    files: str  # digest of the package's
     kinds: Sequence[Kind]
     size: Callable[[Kind, RunSpec], int]  # runs of a task
     work: Work
@@ -123,7 +124,7 @@ def _hand_out(tasks: Tasks, job: Job, ledger: Ledger, flying: Sequence[Flying], 
         while ledger.waits and out < room[kind] + 2:
             number, specs = ledger.take(functools.partial(job.size, kind))
             cores = kind.cpus if not kind.gpus else None
-            chunk = Chunk(number, ledger.sweep, specs, job.options, job.lanes, cores, job.storage)
+            chunk = Chunk(number, ledger.sweep, specs, job.options, job.lanes, cores, job.storage, job.files)
             new.append(tasks.submit(chunk, kind, job.work))
             out += 1
     return new
