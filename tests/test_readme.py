@@ -9,7 +9,7 @@ from mjx_dher import stats
 
 README = (ROOT / "README.md").read_text()
 # What commands and engines are made of; some of it has a place among the API pages, too.
-INNER = "cli host hopper envs.engines.fused envs.engines.warp learners.stored runs sweeps testing tools names"
+INNER = "cli host hopper envs.engines.fused envs.engines.warp learners.stored runs sweeps testing tools names viewer"
 
 
 def test_the_components_example_runs(capsys):
