@@ -8,7 +8,7 @@ import json
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import names, policies
 
 # By kind, each name and what it is, in a line. A test holds the names to the tables in spec.py, presets.py and envs.
 KINDS: dict[str, dict[str, str]] = {
@@ -78,6 +78,10 @@ KINDS: dict[str, dict[str, str]] = {
         "mlp": "hidden layers with ReLU",
         "layer_norm": "mlp with layer normalization in the critics",
     },
+    "policies": {
+        name: f"of the package: success {policies.facts(policies.FOLDER / name)['here']['success_rate']:.3f}"
+        for name in policies.names()
+    },
 }
 # The option that takes a name of each kind; those with "module:attribute" take a part of the user's own, too.
 OPTIONS = {
@@ -91,14 +95,15 @@ OPTIONS = {
     "generators": "--generator",
     "learners": "--learner",
     "networks": "--networks",
+    "policies": "in place of RUN",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class ListArgs:
-    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, generators, learners and networks.
+    """Name all tasks, engines, presets, samplers, kernels, metrics, priorities, generators, learners, networks and policies.
 
-    All but engines and presets can be your own, too, as module:attribute (docs/tutorial.md).
+    All but engines, presets and policies can be your own, too, as module:attribute (docs/tutorial.md).
     """
 
     kinds: tyro.conf.Positional[tuple[str, ...]] = ()
