@@ -11,7 +11,7 @@ import pytest
 from conftest import EXAMPLES, ROOT
 
 import mjx_dher
-from mjx_dher import RunSpec, cli, envs, presets, spec
+from mjx_dher import RunSpec, cli, envs, policies, presets, spec
 from mjx_dher.cli import completion, listing
 from mjx_dher.cli import train as cli_train
 from mjx_dher.cli.commands import COMMANDS
@@ -59,6 +59,7 @@ def test_list_names_all_that_there_is(capsys):
         "generators": spec.GENERATORS,
         "learners": spec.LEARNERS,
         "networks": spec.NETWORKS,
+        "policies": policies.names(),
     }
     assert {kind: set(lines) for kind, lines in listing.KINDS.items()} == {kind: set(names) for kind, names in tables.items()}
     assert set(listing.OPTIONS) == set(tables)

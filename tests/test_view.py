@@ -164,6 +164,7 @@ BAD = [
     (["pusch"], ["did you mean 'push'?"]),
     (["--env", "sldie"], ["env must be one of", "did you mean 'slide'?"]),
     (["push", "--engine", "wrap"], ["engine", "'wrap'"]),
+    (["push", "--env-kwargs", "x"], ["env_kwargs must be NAME=VALUE each"]),
     (["push", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
     (["push", "--port", "70000"], ["port must lie in [0, 65535]"]),
     (["push", "--host", "192.0.2.1"], ["host '192.0.2.1' is no address of this machine"]),

@@ -11,7 +11,7 @@ import pytest
 from mjx_dher import Options, RunSpec, envs, policies
 from mjx_dher.config import Config
 from mjx_dher.host.files import FolderError
-from mjx_dher.runs import critic, driver
+from mjx_dher.runs import critic, driver, run_folder
 from mjx_dher.viewer import scene, sources
 
 TINY = Config(
@@ -155,6 +155,15 @@ def test_a_run_that_goes_on_is_followed(stopped, tmp_path):
 def test_why_there_is_no_critic_is_told():
     assert sources.Cast(of_package("reach"), reach()).critic == "No critic: the policies of the package come without one."
     assert sources.Cast(sources.by_random("reach"), reach()).critic == "Random actions have no critic."
+
+
+def test_an_environment_has_the_arguments_of_its_run_or_those_given(stopped, tmp_path):
+    folder, run = tmp_path / "run", dataclasses.replace(stopped[1], env_kwargs=("episode_length=20", "reward_type=dense"))
+    run_folder.create(folder, run, "native", {})
+    (folder / "policy.npz").write_bytes(b"")
+    assert sources.of_run("mine", folder).env_kwargs == run.env_kwargs
+    assert sources.of_run("mine", folder, None, ("episode_length=30",)).env_kwargs == ("episode_length=30", "reward_type=dense")
+    assert sources.of_run("mine", folder, "push", ("episode_length=30",)).env_kwargs == ("episode_length=30",)
 
 
 def test_a_policy_of_another_environment_is_refused():

@@ -8,7 +8,7 @@ import json
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import names, policies
 
 # By kind, each name and what it is, in a line. A test holds the names to the tables in spec.py, presets.py and envs.
 KINDS: dict[str, dict[str, str]] = {
@@ -87,6 +87,10 @@ KINDS: dict[str, dict[str, str]] = {
         "layer_norm": "mlp with layer normalization in the critics",
         "fan_in": "mlp with first weights and biases as PyTorch's",
     },
+    "policies": {
+        name: f"of the package: success {policies.facts(policies.FOLDER / name)['here']['success_rate']:.3f}"
+        for name in policies.names()
+    },
 }
 # The option that takes a name of each kind; those with "module:attribute" take a part of the user's own, too.
 OPTIONS = {
@@ -101,14 +105,15 @@ OPTIONS = {
     "generators": "--generator",
     "learners": "--learner",
     "networks": "--networks",
+    "policies": "in place of RUN",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class ListArgs:
-    """Name all tasks, engines, presets and parts (samplers, kernels, learners and so on), in a line each.
+    """Name all tasks, engines, presets, parts (samplers, kernels, learners and so on) and policies, in a line each.
 
-    All but engines and presets can be your own, too, as module:attribute (docs/tutorial.md).
+    All but engines, presets and policies can be your own, too, as module:attribute (docs/tutorial.md).
     """
 
     kinds: tyro.conf.Positional[tuple[str, ...]] = ()
