@@ -65,6 +65,12 @@ def test_what_a_sampler_does_not_read_makes_no_trials_of_its_own():
     }
 
 
+def test_what_can_share_a_program_is_together():
+    runs = [spec_of(sampler=sampler, learner=learner) for sampler in ("future", "weighted") for learner in ("ddpg", "td3")]
+    assert [[run.learner for run in group] for group in grid.by_program(runs)] == [["ddpg", "ddpg"], ["td3", "td3"]]
+    assert [run.sampler for run in grid.by_program(runs)[1]] == ["future", "weighted"]
+
+
 def test_readings_are_lanes_of_one_program_and_a_scale_counts_where_it_is_read():
     specs = [
         spec_of(sampler=sampler, weight_normalization=normalization, hparams=HParams(weight_scale=scale))

@@ -80,7 +80,7 @@ def _train(
     console: Console,
 ) -> int | None:
     """Trains runs that no other program has; returns the signal that asked for a stop, or None."""
-    ledger = Ledger(order.out, todo)
+    ledger = Ledger(order.out, [run for together in grid.by_program(todo) for run in together])
     storage = plan.storage_of(order.request, order.out)
     nodes = _looked_at(tasks, kinds, own_code.with_own_parts(todo), storage, ledger.sweep, report)
     report(f"ray: {plan.describe(nodes, kinds)}; {len(todo)} runs to train")

@@ -278,10 +278,9 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     console.print(f"{len(trials)} runs, {len(trials) - len(todo)} of them done already")
     settle_compiler(args.engine)
     check_platform()
-    turns = [program for program, _ in itertools.groupby(todo, key=lambda run: run.program)]
-    programs = list(dict.fromkeys(turns))
-    for program in programs:
-        group = [run for run in todo if run.program == program]
+    groups = grid.by_program(todo)
+    for group in groups:
+        program = group[0].program
         env = make_env(program)
         for run in group:
             spec.validate(run, envs.list_envs(), env.episode_length)
@@ -290,8 +289,7 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         for line in (settings.amount(program.config, env.episode_length, len(group)), *settings.memory_lines(env, group)):
             console.print(f"  {line}", soft_wrap=True)
     lanes = args.lanes or "one on a CPU, on a GPU as many as memory holds"
-    amount = f"{len(programs)} programs, in {len(turns)} turns"
-    console.print(f"{amount}; runs side by side: {lanes}; nothing was written", soft_wrap=True)
+    console.print(f"programs: {len(groups)}; runs side by side: {lanes}; nothing was written", soft_wrap=True)
     return 0
 
 

@@ -46,6 +46,14 @@ def _with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
     return dataclasses.replace(spec, config=config, hparams=hparams, **parts)
 
 
+def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
+    """Returns the trials that can share a program together, in the order in which the first of each program comes."""
+    groups: dict[RunSpec, list[RunSpec]] = {}
+    for spec in specs:
+        groups.setdefault(spec.program, []).append(spec)
+    return list(groups.values())
+
+
 def shard(specs: Sequence[RunSpec], index: int, count: int) -> list[RunSpec]:
     """Returns the `index`-th (from 1) of `count` near-equal shards, split within each environment.
 

@@ -6,7 +6,6 @@ short, or made larger, trains what is missing; runs that were side by side when 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -34,7 +33,7 @@ def run(
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
 ) -> list[Result]:
-    """Trains trials into the folder of a sweep. Neighbours that can share a program do.
+    """Trains trials into the folder of a sweep. Those that can share a program do, wherever they stand.
 
     Args:
       folder: of the sweep; it is made where it does not exist.
@@ -56,10 +55,9 @@ def run(
       ValueError: as `train_runs`.
     """
     results: list[Result] = []
-    for _, group in itertools.groupby(specs, key=lambda spec: spec.program):
+    for trials in grid.by_program(specs):
         if results and team.any(should_stop()):
             break
-        trials = list(group)
         results += train_runs(
             make_env(trials[0]),
             trials,
