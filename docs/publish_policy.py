@@ -74,9 +74,8 @@ def card(folder: Path) -> str:
         "versions": ", ".join(f"{name} {versions[name]}" for name in ("jax", "mujoco", "numpy", "python")),
         "published": facts["date"],
     }
-    settings = {**_fields(run.config), **_fields(run.hparams)}
-    settings = {name: x for name, x in settings.items() if spec.reads(run.sampler, run.learner, name)}
-    numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, tuple) else _text(x)}" for name, x in settings.items())
+    settings = {**content["config"], **content["hparams"]}  # those that there were when it was trained
+    numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, list) else _text(x)}" for name, x in settings.items())
     return "\n".join(
         (
             f"# The policy `{folder.name}`",
@@ -172,14 +171,21 @@ def main(argv: Sequence[str]) -> None:
     from mjx_dher.tools import originals
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--machine", required=True, help='that it was trained on, as a reader is told: "2 cores of ..."')
-    parser.add_argument("--commit", required=True, help="that it was trained with")
+    parser.add_argument("run", type=Path, nargs="?")
+    parser.add_argument("--cards", action="store_true", help="write the cards of all policies of the package anew, and end")
+    parser.add_argument("--machine", help='that it was trained on, as a reader is told: "2 cores of ..."')
+    parser.add_argument("--commit", help="that it was trained with")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--python", type=Path, default=originals.interpreter(originals.default_environment()))
     parser.add_argument("--anyway", action="store_true", help="also where the policy that is there is better")
     args = parser.parse_args(argv)
+    if args.cards:
+        for name in policies.names():
+            (policies.FOLDER / name / policies.CARD).write_text(card(policies.FOLDER / name))
+        return
+    if None in (args.run, args.machine, args.commit):
+        raise ValueError("a run, --machine and --commit are needed")
     run = run_folder.read_spec(args.run)
     check(args.run, run)
     facts = {"machine": args.machine, "commit": args.commit, "date": datetime.date.today().isoformat()}
