@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import queue
+import signal
 import socket
 import struct
 import sys
@@ -18,6 +20,14 @@ SILENCE = 30.0  # s without any, after which the other process counts as gone
 GONE = 75  # exit status of a process whose team is gone: worth another try (EX_TEMPFAIL)
 MOST = 1 << 20  # bytes of a message's JSON
 _HEAD = struct.Struct("!IQ")  # sizes of JSON and bytes
+
+
+@ctypes.CFUNCTYPE(None, ctypes.c_int)
+def _on_abort(number: int) -> None:
+    """Leaves it to a line to end this process, which JAX aborts when the first one is gone; ends it where none does."""
+    time.sleep(GRACE)
+    os.write(2, b"error: JAX has ended this process, as it does when another one is gone\n")
+    os._exit(GONE)
 
 
 class LineError(OSError):
@@ -78,6 +88,8 @@ class Line:
     def watch(self) -> None:
         """Begins to listen, and to give signs of life, in threads."""
         self._watched = True
+        if os.name == "posix":  # a handler of C: one of Python would have to wait for the thread that aborts
+            ctypes.CDLL(None).signal(signal.SIGABRT, _on_abort)
         self._socket.settimeout(SILENCE)
         threading.Thread(target=self._listen, daemon=True).start()
         threading.Thread(target=self._beat, daemon=True).start()
