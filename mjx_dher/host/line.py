@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import queue
+import signal
 import socket
 import struct
 import sys
@@ -15,9 +17,18 @@ from typing import Any
 BEAT = 5.0  # s between signs of life
 GRACE = 3.0  # s for this process to end in order where the other one has told why it ends
 SILENCE = 30.0  # s without any, after which the other process counts as gone
+GOES_ON = "; this one ends, too, and the same command goes on from the last checkpoint\n"
 GONE = 75  # exit status of a process whose team is gone: worth another try (EX_TEMPFAIL)
 MOST = 1 << 20  # bytes of a message's JSON
 _HEAD = struct.Struct("!IQ")  # sizes of JSON and bytes
+
+
+@ctypes.CFUNCTYPE(None, ctypes.c_int)
+def _on_abort(number: int) -> None:
+    """Leaves it to a line to end this process, which JAX aborts when the first one is gone; ends it where none does."""
+    time.sleep(GRACE)
+    os.write(2, f"error: process 0 is gone (JAX has lost it){GOES_ON}".encode())
+    os._exit(GONE)
 
 
 class LineError(OSError):
@@ -78,6 +89,10 @@ class Line:
     def watch(self) -> None:
         """Begins to listen, and to give signs of life, in threads."""
         self._watched = True
+        if (
+            os.name == "posix" and self.greeting.get("number") == 0
+        ):  # a handler of C: one of Python would have to wait for the thread that aborts
+            ctypes.CDLL(None).signal(signal.SIGABRT, _on_abort)
         self._socket.settimeout(SILENCE)
         threading.Thread(target=self._listen, daemon=True).start()
         threading.Thread(target=self._beat, daemon=True).start()
@@ -138,6 +153,5 @@ class Line:
                 stream.flush()
             except (OSError, ValueError):
                 continue
-        text = f"error: process {self.greeting.get('number')} {what}; this one ends, too, and the same command goes on from the"
-        os.write(2, f"{text} last checkpoint\n".encode())
+        os.write(2, f"error: process {self.greeting.get('number')} {what}{GOES_ON}".encode())
         os._exit(GONE)
