@@ -77,4 +77,4 @@ def test_ci_runs_the_tests_and_if_asked_the_slow_ones(args, runs, tmp_path):
 @pytest.mark.parametrize("args", [["--al"], ["--all", "--all"], [""]])
 def test_ci_refuses_what_it_does_not_know(args):
     done = subprocess.run([CI, *args], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (2, "usage: .ci/run [--all]\n")
+    assert (done.returncode, done.stderr) == (2, "usage: .ci/run [--all | --docs [FOLDER]]\n")

@@ -215,7 +215,7 @@ def _rows(trials):
 
 def test_a_run_that_diverged_counts_as_a_failure_from_then_on():
     curve = {"epoch": [1, 2, 3], "env_steps": [1, 2, 3], "wall_seconds": [1.0, 2.0, 3.0], "success_rate": [0.5, 0.6, 0.7]}
-    settings = {"env": "e", "sampler": "future", "gamma": 0.9}
+    settings = {"env": "e", "sampler": "future", "learner": "ddpg", "weight_normalization": "mean", "gamma": 0.9}
     whole = {"settings": settings, "seed": 0, "status": "finished", "curve": curve, "lanes": 1, "folder": "a"}
     whole["final"] = {"success_rate": 0.8, "reset_success_rate": 0.1}
     cut = {name: values[:1] for name, values in curve.items()}

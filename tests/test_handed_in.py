@@ -319,7 +319,7 @@ def test_a_kernel_s_weights_and_a_priority_of_0_are_told():
 
 
 def test_what_is_to_be_left_out_is_left_out():
-    takes_all = lambda self, state, obs, goal, hparams, valid: DDPG.update_normalizers(state, obs, goal, hparams)  # noqa: E731
+    takes_all = lambda self, state, obs, goal, hparams, valid: DDPG.update_normalizers(self, state, obs, goal, hparams)  # noqa: E731
 
     def make(config, sizes, networks):
         made = ddpg.make(config, sizes, networks)

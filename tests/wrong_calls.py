@@ -97,7 +97,7 @@ def calls(folder: Path, run: Path, stopped: Path, sweep: Path) -> list[list[str]
         found += [
             [*train, "--out", path],
             ["sweep", *TINY, "--seeds", "1", "--out", path],
-            *([command, path] for command in ("resume", "eval", "transfer", "plot")),
+            *([command, path] for command in ("resume", "eval", "transfer", "plot", "report")),
             ["export", path, "--format", "onnx"],
             ["render", path, "--out", out + ".png"],
             ["export", str(run), "--format", "onnx", "--out", path],
@@ -112,15 +112,17 @@ def calls(folder: Path, run: Path, stopped: Path, sweep: Path) -> list[list[str]
         "--env",
         "--sampler",
         "--weight-kernel",
+        "--weight-normalization",
         "--metric",
         "--priority",
+        "--generator",
         "--learner",
         "--networks",
         "--engine",
         "--log",
     ):
         found += [[*train, "--out", out, flag, name] for name in NAMES]
-    for flag in ("--seeds", "--first-seed", "--lanes", "--threshold", "--shard", "--sweep.gamma", "--sweep.her-k"):
+    for flag in ("--seeds", "--first-seed", "--lanes", "--devices", "--threshold", "--shard", "--sweep.gamma", "--sweep.her-k"):
         found += [["sweep", *TINY, "--out", out, flag, number] for number in NUMBERS[:4]]
     for command in (["eval", str(run)], ["transfer", str(run)], ["render", str(run), "--out", out + ".png"]):
         found += [[*command, "--episodes", number] for number in NUMBERS[:5]]
@@ -128,7 +130,6 @@ def calls(folder: Path, run: Path, stopped: Path, sweep: Path) -> list[list[str]
     found += [
         *([flag, "1"] for flag in ("--learning-rate", "--tau", "--discount", "--no-such-flag")),
         ["resume", str(run)],
-        ["plot", str(run)],
         ["plot", str(sweep), "--formats", "bmp"],
         ["export", str(run), "--format", "pickle"],
         ["render", "--out", out + ".png"],

@@ -41,6 +41,8 @@ EXTRAS = {  # extra: packages that only it installs
     "export": ("onnx", "safetensors"),
     "tensorboard": ("tensorboardX", "tensorboard"),
     "wandb": ("wandb",),
+    "view": ("viser",),
+    "ray": ("ray",),
     "docs": ("sphinx", "furo", "myst-nb"),
 }
 EXTRA_OF = {package: extra for extra, packages in EXTRAS.items() for package in packages}
