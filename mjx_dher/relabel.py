@@ -100,7 +100,8 @@ def draw_batches(
         sample, batch = priorities.chosen(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, view)
     if n_step > 1:
         batch = look_ahead(state, sample, batch, compute_reward, hparams.gamma, n_step)
-    batch = dataclasses.replace(batch, reward=batch.reward * hindsight_factor(sample, batch, hparams))
+    factor = hindsight_factor(sample, batch, hparams)
+    batch = dataclasses.replace(batch, reward=batch.reward.astype(factor.dtype) * factor)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
 
 
@@ -111,7 +112,8 @@ def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
     factor below 1 makes them so; all returns stay in [-1/(1-gamma), 0].
     """
     replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
-    return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, batch.reward.dtype), jnp.ones_like(batch.reward))
+    dtype = jnp.promote_types(batch.reward.dtype, jnp.float32)  # rewards may be whole numbers, the factor is none
+    return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, dtype), jnp.ones(replaced.shape, dtype))
 
 
 def look_ahead(
@@ -127,6 +129,7 @@ def look_ahead(
     ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]
     achieved = sample.episode_goals[jnp.arange(sample.step.shape[0]), jnp.minimum(ahead, last)]
     rewards = jax.vmap(compute_reward, in_axes=(0, None))(achieved, batch.desired_goal)
+    rewards = rewards.astype(jnp.promote_types(rewards.dtype, jnp.float32))
     going_on = jnp.cumprod((rewards < 0) & (ahead < last), axis=0)  # after the i-th step
     counted = jnp.concatenate([jnp.ones_like(going_on[:1]), going_on[:-1]])
     num_steps = jnp.sum(counted, axis=0)

@@ -50,8 +50,7 @@ def rollout(
     check_env_parts(env)
     check_size("num_envs", num_envs)
     _check_inputs(inputs, env.episode_length)
-    keys = key if key.ndim else jax.random.split(key, num_envs)
-    first = jax.vmap(env.reset)(keys)
+    first = jax.vmap(env.reset)(_keys(key, num_envs))
     check_first(first, (num_envs,))
     if goals is not None:
         first = _with_goals(env, first, goals(first.obs))
@@ -102,6 +101,12 @@ def _with_goals(env: Any, first: Any, goals: Array) -> Any:
     changed = jax.vmap(env.with_goal)(first, goals)
     _check_same_shapes(first, changed, "with_goal")
     return changed
+
+
+def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
+    """Returns `num_envs` keys, of one key or as they are given; a key that `jax.random.PRNGKey` made is two numbers."""
+    one = 0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1
+    return key if key.ndim > one else jax.random.split(key, num_envs)
 
 
 def check_first(state: Any, leading: tuple[int, ...]) -> None:

@@ -31,7 +31,8 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     rate, spread = successes / trials, z * z / trials
     middle = (rate + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(rate * (1 - rate) / trials + spread / 4 / trials)
-    return max(0.0, middle - half), min(1.0, middle + half)
+    # Without a success the lower bound is 0, and the upper one 1 without a failure; rounding would leave a little of either.
+    return max(0.0, middle - half) if successes else 0.0, min(1.0, middle + half) if successes < trials else 1.0
 
 
 def difference_interval(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.fleet.cluster import Flying, Outcome
 from mjx_dher.fleet.ledger import Ledger
 from mjx_dher.fleet.plan import Kind
-from mjx_dher.host.files import FolderError
+from mjx_dher.host.files import BusyError, FolderError
 from mjx_dher.runs import results
 from mjx_dher.sweeps import grid, tables
 from probes import PointMass, held
@@ -153,6 +153,31 @@ def test_tasks_that_had_not_ended_are_handed_out_first_as_they_were(tmp_path):
         (tmp_path / "fleet.json").write_text(damaged)
         with pytest.raises(FolderError, match=r"fleet.json is damaged .*remove it"):
             Ledger(tmp_path, trials)
+
+
+def test_a_task_of_which_runs_have_ended_keeps_the_digest_that_its_copies_have(tmp_path):
+    trials = make_grid(("future", "weighted"), (0, 1))
+    chunk, specs = Ledger(tmp_path, trials).take(lambda spec: 4)
+    assert specs == tuple(trials)
+    for left in (trials[1:], trials[2:]):  # two starts in which a run ended each
+        again = Ledger(tmp_path, left)
+        assert again.waits == len(left)
+        assert again.take(lambda spec: 1) == (chunk, tuple(left))
+    again.ended(chunk)
+    assert Ledger(tmp_path, []).waits == 0
+
+
+def test_a_run_that_another_program_trains_is_left_to_it(tmp_path, monkeypatch):
+    def busy(folder, parcel):
+        raise BusyError(f"{folder} is being trained by another program")
+
+    (trial,) = make_grid(("future",), (0,))
+    told = []
+    job = dataclasses.replace(job_of(tmp_path, []), report=told.append)
+    monkeypatch.setattr(parcels, "deliver", busy)
+    assert not driver._deliver(job, trial, b"what came back")
+    assert "was not written" in told[0]
+    assert "another program" in told[0]
 
 
 def test_a_folder_goes_again_only_where_nothing_is_left_to_go_on_with(tmp_path):

@@ -39,6 +39,14 @@ def first_of(env=ENV, number=5):
     return jax.vmap(env.reset)(jax.random.split(jax.random.key(0), number))
 
 
+def test_a_rollout_takes_keys_of_either_kind():
+    actions = jnp.zeros((ENV.episode_length, 5, 2))
+    typed, numbers = (
+        rollout(ENV, lambda action, obs: action, key, 5, actions)[0] for key in (jax.random.key(0), jax.random.PRNGKey(0))
+    )
+    np.testing.assert_array_equal(typed.observation, numbers.observation)
+
+
 def test_a_rollout_is_played_for_the_goals_that_are_given():
     actions = jnp.zeros((ENV.episode_length, 5, 2))
     episodes, outcome = rollout(

@@ -79,6 +79,13 @@ def test_a_95_percent_interval_covers_the_truth_19_times_in_20():
 CURVES = [[0.1, 0.5, 0.9, 0.8, 1.0], [0.0, 0.0, 0.2, 0.9, 0.7], [0.0, 0.1, 0.1, 0.1, 0.2]]
 
 
+@pytest.mark.parametrize("trials", [1, 10, 13, 100, 500, 1000])
+def test_a_bound_is_exact_where_all_or_none_succeed(trials):
+    """Rounding would leave a little, below which a success rate of 0 then lies."""
+    assert stats.wilson_interval(0, trials)[0] == 0.0
+    assert stats.wilson_interval(trials, trials)[1] == 1.0
+
+
 def test_first_reach_and_those_that_never_do():
     reached = stats.first_reach([10, 20, 30, 40, 50], CURVES, 0.9)
     np.testing.assert_array_equal(reached, [30, 40, np.inf])

@@ -13,6 +13,7 @@ from mjx_dher.fleet.chunks import Chunk, Told
 from mjx_dher.fleet.cluster import Flying, Outcome, Work
 from mjx_dher.fleet.ledger import Ledger
 from mjx_dher.fleet.plan import Kind
+from mjx_dher.host.files import BusyError
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
@@ -131,10 +132,16 @@ def _hand_out(tasks: Tasks, job: Job, ledger: Ledger, flying: Sequence[Flying], 
 
 
 def _deliver(job: Job, spec: RunSpec, parcel: bytes) -> bool:
-    """Writes a run that has come back; returns whether it has ended."""
-    if parcel:
-        parcels.deliver(grid.folder_of(job.folder, spec), parcel)
-    return bool(parcel)
+    """Writes a run that has come back; returns whether it has ended and is written."""
+    if not parcel:
+        return False
+    folder = grid.folder_of(job.folder, spec)
+    try:
+        parcels.deliver(folder, parcel)
+    except BusyError as error:  # a program without Ray trains it: the other runs are not to suffer for that
+        job.report(f"{folder}: what came back was not written: {error}")
+        return False
+    return True
 
 
 def _forget(ledger: Ledger, chunk: Chunk) -> None:

@@ -32,17 +32,19 @@ class Ledger:
         waiting = {identity.trial_name(spec): spec for spec in specs}
         self.sweep, chunks = _read(self._path)
         self._out: dict[str, list[str]] = {}
-        self._earlier: deque[tuple[RunSpec, ...]] = deque()
-        for chunk in chunks:
-            left = [waiting.pop(name) for name in chunk if name in waiting]
-            if left:
-                self._earlier.append(tuple(left))
+        self._earlier: deque[tuple[str, tuple[RunSpec, ...]]] = deque()
+        self._names: dict[str, list[str]] = {}  # of earlier tasks, with the runs that have ended
+        for chunk, names in chunks.items():
+            left = [waiting.pop(name) for name in names if name in waiting]
+            if left:  # under the digest that it had: its copies in the storage go by that
+                self._earlier.append((chunk, tuple(left)))
+                self._names[chunk] = names
         self._waiting = deque(waiting.values())
 
     @property
     def waits(self) -> int:
         """Number of runs that wait."""
-        return len(self._waiting) + sum(map(len, self._earlier))
+        return len(self._waiting) + sum(len(specs) for _, specs in self._earlier)
 
     def take(self, size: Callable[[RunSpec], int]) -> tuple[str, tuple[RunSpec, ...]]:
         """Takes the next runs that share a program; returns their digest and them. At least one must wait.
@@ -51,15 +53,16 @@ class Ledger:
           size: how many of runs like this one a task takes.
         """
         if self._earlier:
-            specs = self._earlier.popleft()
+            chunk, specs = self._earlier.popleft()
+            names = self._names.pop(chunk)
         else:
             own = [self._waiting.popleft()]
             most, program = size(own[0]), own[0].program
             while self._waiting and len(own) < most and self._waiting[0].program == program:
                 own.append(self._waiting.popleft())
             specs = tuple(own)
-        names = [identity.trial_name(spec) for spec in specs]
-        chunk = identity.sha256_of(names)[:16]
+            names = [identity.trial_name(spec) for spec in specs]
+            chunk = identity.sha256_of(names)[:16]
         self._out[chunk] = names
         self._write()
         return chunk, specs
@@ -71,26 +74,25 @@ class Ledger:
 
     def _write(self) -> None:
         """Writes the notes: the tasks that are out, and those of before that wait for their turn."""
-        waiting = [[identity.trial_name(spec) for spec in specs] for specs in self._earlier]
-        files.write_json(self._path, {"schema": 1, "id": self.sweep, "chunks": [*self._out.values(), *waiting]})
+        files.write_json(self._path, {"schema": 1, "id": self.sweep, "chunks": {**self._out, **self._names}})
 
     def close(self) -> None:
         """Removes the notes: every run has ended."""
         self._path.unlink(missing_ok=True)
 
 
-def _read(path: Path) -> tuple[str, list[list[str]]]:
-    """Returns the notes of an earlier start, or new ones.
+def _read(path: Path) -> tuple[str, dict[str, list[str]]]:
+    """Returns the sweep's id, and the runs of each task by its digest: those of an earlier start, or new ones.
 
     Raises:
       FolderError: they are damaged.
     """
     try:
         content = json.loads(path.read_text())
-        chunks = [[str(name) for name in chunk] for chunk in content["chunks"]]
+        chunks = {str(chunk): [str(name) for name in names] for chunk, names in content["chunks"].items()}
         return str(content["id"]), chunks
     except FileNotFoundError:
-        return uuid.uuid4().hex[:12], []
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return uuid.uuid4().hex[:12], {}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         hint = "remove it, and the sweep goes on with the runs that have not ended"
         raise FolderError(f"{path} is damaged ({error}); {hint}") from error

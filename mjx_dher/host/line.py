@@ -20,6 +20,7 @@ SILENCE = 30.0  # s without any, after which the other process counts as gone
 GOES_ON = "; this one ends, too, and the same command goes on from the last checkpoint\n"
 GONE = 75  # exit status of a process whose team is gone: worth another try (EX_TEMPFAIL)
 MOST = 1 << 20  # bytes of a message's JSON
+PIECE = 1 << 22  # bytes that are sent in a call
 _HEAD = struct.Struct("!IQ")  # sizes of JSON and bytes
 
 
@@ -73,7 +74,8 @@ class Line:
         try:
             with self._sending:
                 self._socket.sendall(_HEAD.pack(len(text), len(data)) + text)
-                self._socket.sendall(data)
+                for start in range(0, len(data), PIECE):  # the socket's time limit is for each call
+                    self._socket.sendall(memoryview(data)[start : start + PIECE])
         except OSError as error:
             self._lost(error)
 

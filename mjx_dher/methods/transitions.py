@@ -82,7 +82,7 @@ def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: 
         return jax.random.randint(key, (1,), 0, size)
     if number != 2:
         raise ValueError(f"pick_diverse draws one or two of a group; it was asked for {number}")
-    determinants = 1.0 - jnp.exp(-squared_distances(batch.desired_goal) / DIVERSE_WIDTH**2)
+    determinants = -jnp.expm1(-squared_distances(batch.desired_goal) / DIVERSE_WIDTH**2)
     apart = jnp.triu(jnp.ones((size, size), bool), 1)
     # Where all goals are the same, any pair is as good as another.
     log_weights = jnp.where(apart, jnp.log(jnp.maximum(determinants, 1e-12)), -jnp.inf).reshape(-1)

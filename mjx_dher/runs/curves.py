@@ -116,7 +116,7 @@ def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
         axis.axhline(float(np.nanmean(at_reset)), color="0.6", linewidth=0.8, linestyle=":", label="at the reset")
     if "success_rate" in curve.result and len(steps):
         rate = curve.result["success_rate"]
-        around = [[rate - curve.result["success_low"]], [curve.result["success_high"] - rate]]
+        around = np.maximum([[rate - curve.result["success_low"]], [curve.result["success_high"] - rate]], 0.0)  # of rounding
         label = f"end, {curve.result['episodes']} episodes: {rate:.3f}"
         axis.errorbar(steps[-1], rate, around, color="#D55E00", marker="D", markersize=4, capsize=3, label=label)
     axis.set_title("success rate", fontsize=10)
