@@ -179,6 +179,16 @@ def test_what_the_first_process_decides_holds_in_all(monkeypatch):
                 np.testing.assert_array_equal(array, expected)
                 assert array.dtype == expected.dtype
 
+        assert in_all(teams, lambda t: t.agree("lanes", 4)) == [None] * 3
+
+        def differ(t):
+            try:
+                t.agree("lanes", 4 - t.number)
+            except ValueError as error:
+                return str(error)
+
+        assert all(text.startswith("lanes: the first process has 4, this one") for text in in_all(teams, differ))
+
         def fails():
             raise ValueError("no")
 

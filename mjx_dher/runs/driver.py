@@ -124,6 +124,7 @@ def train_runs(
     if not waiting:
         return []
     program = program_lib.compile_runs(env, [spec for spec, _ in waiting], most, options.final_episodes, report, placed_on)
+    team.agree("lanes", program.lanes)
     return _train_in_turn(session, program, claims, waiting)
 
 

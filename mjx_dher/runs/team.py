@@ -70,6 +70,19 @@ class Team:
         flags = [flag, *(line.receive()[0]["value"] for line in self.lines)]
         return self.share(lambda: any(flags))
 
+    def agree(self, field: str, value: int) -> None:
+        """Refuses, in all processes, a number that is not the same in each: all have to call this.
+
+        Raises:
+          ValueError: names the field, the first process's number and this one's.
+        """
+        first = self.share(lambda: value)
+        if self.any(value != first):
+            raise ValueError(
+                f"{field}: the first process has {first}, this one {value}, and all must have the same: the memory that is free"
+                f" differs; give --{field}"
+            )
+
     def share_arrays(self, arrays: Sequence[np.ndarray] | None) -> list[np.ndarray]:
         """Returns the first process's arrays: all have to call this, the others with None."""
         if self.leads:
