@@ -34,6 +34,15 @@ def test_a_function_is_called_once_for_all_batch_axes():
     assert seen == [(3,), (2, 2, 3), (3,), (3,), (3,)]
 
 
+def test_numbers_of_64_bits_are_handed_over_as_32():
+    host_call.register("test_bits", double)
+    with jax.enable_x64(True):
+        rows = jnp.asarray(ROWS, jnp.float64)
+        assert rows.dtype == jnp.float64
+        given = jax.jit(jax.vmap(lambda row: host_call.call("test_bits", (4,), row)))(rows)
+    np.testing.assert_array_equal(given, double(np.asarray(ROWS)))
+
+
 def test_programs_for_other_devices_call_the_function_itself(monkeypatch):
     host_call.register("test_elsewhere", double)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

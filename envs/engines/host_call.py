@@ -101,6 +101,7 @@ def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
     Under `vmap` it is called once, with [..., m]. A program for another device than a CPU holds the function's address.
     """
     result = jax.ShapeDtypeStruct(shape, np.float32)
+    inputs = inputs.astype(np.float32)  # which the function reads them as; JAX may compute in 64 bits
     if jax.default_backend() != "cpu":
         return jax.pure_callback(_functions[name], result, inputs, vmap_method="broadcast_all")
     return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(inputs)
