@@ -214,6 +214,7 @@ def test_a_dry_run_refuses_what_a_run_would(command, tmp_path, capsys):
     for argv, message in (
         (["--out", str(taken)], "out: "),
         (["--out", str(taken / "file" / "x")], "out: "),
+        (["--out", "/proc/x"], "out: /proc cannot be written to"),  # also where root asks, who has all permissions
         (["--out", str(tmp_path / "new"), "--replay-size", str(10**10), "--env", "reach"], "at most"),
     ):
         assert cli.main([*command, "--dry-run", *argv]) == 2

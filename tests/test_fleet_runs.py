@@ -54,9 +54,12 @@ def test_a_run_comes_back_whole_and_once(trained, tmp_path):
 def test_what_comes_back_is_not_believed_unseen(trained, tmp_path):
     folder, trials = trained
     parcel = parcels.pack(grid.folder_of(folder, trials[0]))
+    kept = tmp_path / "a" / "checkpoints" / "epoch-000001"
+    kept.mkdir(parents=True)
     for damaged in (b"", b"nonsense", parcel[:-40], parcel[:200] + b"\0" * 50 + parcel[250:]):
         with pytest.raises(FolderError, match="is damaged"):
             parcels.deliver(tmp_path / "a", damaged)
+        assert kept.exists()
         assert not (tmp_path / "a" / "result.json").exists()
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
         archive.writestr("../outside", "x")

@@ -48,7 +48,7 @@ def test_the_picture_of_the_design_is_what_its_script_draws():
 
 def test_the_picture_of_samplers_has_the_numbers_of_the_tables():
     """Its curves, averaged over epochs, are the mean successes of docs/results.md."""
-    figure = runpy.run_path(str(ROOT / "docs" / "make_sampler_figure.py"))
+    figure = runpy.run_path(str(ROOT / "docs" / "make_readme_figure.py"))
     table = (ROOT / "docs" / "results.md").read_text()
     for _, task, _, samplers in figure["PANELS"]:
         for sampler in samplers:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -85,8 +86,10 @@ def check_writable(out: Path) -> None:
       FolderError: it cannot.
     """
     parent = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not (parent.is_dir() and os.access(parent, os.W_OK)):
-        raise FolderError(f"out: {parent} cannot be written to")
+    try:
+        os.rmdir(tempfile.mkdtemp(dir=parent))  # permissions do not say it: not to root, nor of a file system that is full
+    except OSError as error:
+        raise FolderError(f"out: {parent} cannot be written to ({error.strerror})") from None
 
 
 def groups(run: RunSpec) -> Iterator[tuple[str, str]]:

@@ -54,8 +54,9 @@ def deliver(folder: Path, parcel: bytes) -> bool:
         with files.lock(folder):
             if results.is_whole(folder):
                 return False
+            content = _unpacked(folder, parcel)
             _empty(folder)
-            _unpack(folder, parcel)
+            _write_run(folder, content)
     except OSError as error:
         raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); the same command goes on") from error
     if (problem := results.problem(folder)) is not None:
@@ -73,12 +74,17 @@ def _empty(folder: Path) -> None:
             path.unlink()
 
 
-def _unpack(folder: Path, parcel: bytes) -> None:
+def _unpacked(folder: Path, parcel: bytes) -> dict[str, bytes]:
+    """Returns the files of a parcel by name."""
     try:
         with zipfile.ZipFile(io.BytesIO(parcel)) as archive:
-            content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are looked at
+            return {name: archive.read(name) for name in archive.namelist()}  # their checksums are looked at
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise FolderError(f"what came back of {folder.name} is damaged ({error})") from error
+
+
+def _write_run(folder: Path, content: dict[str, bytes]) -> None:
+    """Writes files by name, result.json last."""
     result = content.pop(run_folder.RESULT_FILE, None)
     for name, data in content.items():
         _write(folder, name, data)

@@ -1,4 +1,4 @@
-"""Writes docs/images/samplers.png, the README's first picture: `python docs/make_sampler_figure.py` (extra `plot`)."""
+"""Writes docs/images/samplers.png, the README's first picture: `python docs/make_readme_figure.py` (extra `plot`)."""
 
 from __future__ import annotations
 
