@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import html.parser
+import json
 import math
 import re
 
@@ -90,6 +91,14 @@ def test_everything_written_is_inside(tmp_path):
             assert box.x1 <= width + 1, text.get_text()
             assert box.y0 >= -1, text.get_text()
             assert box.y1 <= height + 1, text.get_text()
+
+
+def test_a_bound_that_rounding_has_moved_beyond_the_rate_is_drawn(tmp_path):
+    folder = write_run(tmp_path / "run")
+    content = json.loads((folder / "result.json").read_text())
+    content |= {"success_rate": 0.0, "success_low": 4e-19, "success_high": 0.0076}
+    files.write_json(folder / "result.json", content)
+    assert "end, 500 episodes: 0.000" in curves.draw(curves.read(folder)).axes[0].get_legend_handles_labels()[1]
 
 
 def test_the_interval_of_success_is_wilson_s(tmp_path):

@@ -168,6 +168,7 @@ def in_all(teams, function):
 
 
 def test_what_the_first_process_decides_holds_in_all(monkeypatch):
+    monkeypatch.setattr(line, "PIECE", 7)  # an array of 48 bytes is sent in seven calls
     with started(monkeypatch, (3, 1, {}), (3, 2, {}), size=3) as teams:
         assert [(t.number, t.leads) for t in teams] == [(0, True), (1, False), (2, False)]
         assert in_all(teams, lambda t: t.share(lambda: {"a": [1, "x"]})) == [{"a": [1, "x"]}] * 3
