@@ -18,6 +18,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -85,6 +86,7 @@ FIGURES: dict[str, tuple[Sweep, ...]] = {
         Sweep("eventful_slide", "slide", 50, 1, _EVENTFUL),
     ),
 }
+SWEEPS = tuple(sweep for figure in FIGURES.values() for sweep in figure)
 
 
 def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
@@ -132,30 +134,58 @@ def plan(names: Sequence[str], out: Path, toy: bool) -> str:
     return "\n".join([*lines, f"# {whole / 60:.1f} minutes of one H200, by the estimate"])
 
 
-def run(name: str, out: Path, toy: bool) -> int:
-    """Runs the sweeps of a figure, one after the other, and collects its curves; returns the status of what did not end."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {'' if toy else XLA_FLAGS}".strip()
-    for sweep in FIGURES[name]:
-        print(f"== {name}: {sweep.name}", flush=True)
-        argv = [sys.executable, str(ROOT / "train.py"), *command(sweep, out, toy)]
-        status = wait_for(subprocess.Popen(argv, env={**os.environ, "XLA_FLAGS": flags}))
-        if status:
-            print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
-            return status if status > 0 else 128 - status  # a signal, as a shell gives it
-    return 0
+def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: int) -> int:
+    """Runs sweeps, `at_once` of them side by side, and collects the curves of each that ends; returns the first bad status.
 
+    A signal to stop goes to those that run, which save what they have; those that wait do not begin.
+    """
+    waiting, running, status = list(sweeps), {}, 0
 
-def wait_for(child: subprocess.Popen) -> int:
-    """Returns the status of a sweep when it has ended. A signal to stop is the sweep's, which saves what it has."""
-    before = {
-        signal.SIGTERM: signal.signal(signal.SIGTERM, lambda number, frame: child.send_signal(number)),
-        signal.SIGINT: signal.signal(signal.SIGINT, lambda number, frame: None),  # a terminal sends it to both
-    }
+    def stop(number: int, frame: object) -> None:
+        nonlocal status
+        status = status or 128 + number  # a signal, as a shell gives it
+        if number == signal.SIGTERM:  # a terminal sends SIGINT to all of them
+            for child in running.values():
+                child.send_signal(number)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        return child.wait()
+        while running or (waiting and not status):
+            while waiting and not status and len(running) < at_once:
+                sweep = waiting.pop(0)
+                running[sweep] = start(sweep, out, toy, quiet=at_once > 1)
+            for sweep in [sweep for sweep, child in running.items() if child.poll() is not None]:
+                status = status or ended(sweep, running.pop(sweep).returncode, out, curves)
+            time.sleep(0.2)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    return status
+
+
+def start(sweep: Sweep, out: Path, toy: bool, quiet: bool) -> subprocess.Popen:
+    """Starts a sweep. Where it is quiet, what it prints goes to a file beside its folder."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {'' if toy else XLA_FLAGS}".strip()
+    argv = [sys.executable, str(ROOT / "train.py"), *command(sweep, out, toy)]
+    environment = {**os.environ, "XLA_FLAGS": flags}
+    log = out / f"{sweep.name}.log"
+    print(f"== {time.strftime('%H:%M:%S')} {sweep.name}{f', what it prints is in {log}' if quiet else ''}", flush=True)
+    if not quiet:
+        return subprocess.Popen(argv, env=environment)
+    out.mkdir(parents=True, exist_ok=True)
+    with log.open("w") as file:
+        return subprocess.Popen(argv, env=environment, stdout=file, stderr=subprocess.STDOUT)
+
+
+def ended(sweep: Sweep, status: int, out: Path, curves: Path) -> int:
+    """Collects the curves of a sweep that ended well; tells what did not; returns its status, as a shell gives it."""
+    print(f"== {time.strftime('%H:%M:%S')} {sweep.name} ended", flush=True)
+    if status:
+        print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
+        return status if status > 0 else 128 - status
+    for path in collect(out, curves):
+        print(f"wrote {path}", flush=True)
+    return 0
 
 
 def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:
@@ -192,18 +222,28 @@ def _reading(sweep: Sweep, label: str) -> str:
 
 
 def collect(out: Path, folder: Path) -> list[Path]:
-    """Writes the curves of all sweeps under `out` that have ended, a file a task; returns the files."""
-    by_task: dict[str, list[dict[str, str]]] = {}
-    for sweep in (sweep for figure in FIGURES.values() for sweep in figure):
-        if (out / sweep.name / "results.csv").is_file():
-            by_task.setdefault(sweep.task, []).extend(read_curves(out / sweep.name, sweep))
+    """Writes the curves of the sweeps under `out` that have ended into `folder`, a file a task; returns the files.
+
+    Curves that are in `folder` stay, but for those of the same sweeps: the set can be made in parts, on several machines.
+    """
+    ended = [sweep for sweep in SWEEPS if (out / sweep.name / "results.csv").is_file()]
     folder.mkdir(parents=True, exist_ok=True)
-    for task, rows in by_task.items():
-        with (folder / f"{task}_curves.csv").open("w", newline="") as file:
+    written = []
+    for task in dict.fromkeys(sweep.task for sweep in ended):
+        path = folder / f"{task}_curves.csv"
+        rows = {sweep.name: read_curves(out / sweep.name, sweep) for sweep in ended if sweep.task == task}
+        if path.is_file():
+            with path.open(newline="") as file:
+                for row in csv.DictReader(file):
+                    if row["sweep"] not in {sweep.name for sweep in ended}:
+                        rows.setdefault(row["sweep"], []).append(row)
+        with path.open("w", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
             writer.writeheader()
-            writer.writerows(rows)
-    return [folder / f"{task}_curves.csv" for task in by_task]
+            for sweep in SWEEPS:
+                writer.writerows(rows.get(sweep.name, []))
+        written.append(path)
+    return written
 
 
 def main() -> int:
@@ -212,22 +252,20 @@ def main() -> int:
     parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"{', '.join(FIGURES)} or all, which is the default")
     parser.add_argument("--out", type=Path, default=Path("sweeps/paper"), help="folder of the sweeps")
     parser.add_argument("--curves", type=Path, help="folder of the curves: docs/paper, and under --out with --toy")
+    parser.add_argument("--at-once", type=int, default=1, help="sweeps side by side: one computes while another compiles")
     parser.add_argument("--plan", action="store_true", help="print the commands and an estimate, and run nothing")
     parser.add_argument("--toy", action="store_true", help="Reach, two seeds, tiny sizes: tries the mechanics on a CPU")
     args = parser.parse_args()
     if unknown := [name for name in args.figures if name not in (*FIGURES, "all")]:
         parser.error(f"figures are {', '.join(FIGURES)} and all; got {', '.join(unknown)}")
+    if args.at_once < 1:
+        parser.error(f"--at-once is 1 or more; got {args.at_once}")
     names = list(FIGURES) if not args.figures or "all" in args.figures else list(dict.fromkeys(args.figures))
     if args.plan:
         print(plan(names, args.out, args.toy))
         return 0
-    for name in names:
-        status = run(name, args.out, args.toy)
-        if status:
-            return status
-        for path in collect(args.out, args.curves or (args.out / "curves" if args.toy else CURVES)):
-            print(f"wrote {path}", flush=True)
-    return 0
+    curves = args.curves or (args.out / "curves" if args.toy else CURVES)
+    return run([sweep for name in names for sweep in FIGURES[name]], args.out, curves, args.toy, args.at_once)
 
 
 if __name__ == "__main__":
