@@ -24,6 +24,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from mjx_dher.sweeps import comparison, tables  # noqa: E402
+
 CURVES = ROOT / "docs" / "paper"
 COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")
 XLA_FLAGS = "--xla_gpu_enable_cublaslt=true --xla_gpu_enable_triton_gemm=false"
@@ -190,8 +194,6 @@ def ended(sweep: Sweep, status: int, out: Path, curves: Path) -> int:
 
 def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:
     """Returns the rows of a sweep's curves, with settings by the names that comparison.csv gives them."""
-    from mjx_dher.sweeps import comparison, tables
-
     rows = []
     for groups in comparison.groups(tables.read(folder)).values():
         for group in groups:

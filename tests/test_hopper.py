@@ -296,3 +296,10 @@ def test_the_learner_uses_them(monkeypatch):
         jax.eval_shape(program.epoch, state_template(program))
         assert bool(asked) is uses
         asked.clear()
+
+
+def test_the_kernels_are_compiled_once_for_each_device():
+    wp = pytest.importorskip("warp")
+    found = hopper.devices()
+    assert wp.get_device() in found
+    assert len(found) == len({device.alias for device in found})

@@ -134,13 +134,20 @@ def _calls() -> tuple[Any, Any]:
     from mjx_dher.host.warp_setup import prepare, wp
 
     prepare()
-    devices = {wp.get_device(), *(wp.device_from_jax(each) for each in jax.local_devices() if each.platform == "gpu")}
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        modules = [(kernel.module, device) for kernel in (critic_pass, actor_pass) for device in devices]
+        modules = [(kernel.module, device) for kernel in (critic_pass, actor_pass) for device in devices()]
         for loading in [pool.submit(module.load, device, THREADS) for module, device in modules]:
             loading.result()
     make = functools.partial(wp.jax_kernel, block_dim=THREADS, module_preload_mode=wp.JaxModulePreloadMode.NONE)
     return make(critic_pass, num_outputs=11), make(actor_pass, num_outputs=12)
+
+
+def devices() -> list[Any]:
+    """Returns Warp's own device and those of JAX on this host, each once. They have no hash, and so no set."""
+    from mjx_dher.host.warp_setup import wp
+
+    local = [wp.device_from_jax(each) for each in jax.local_devices() if each.platform == "gpu"]
+    return list({device.alias: device for device in (wp.get_device(), *local)}.values())
 
 
 def compute_gradients(
