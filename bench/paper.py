@@ -2,6 +2,7 @@
 
     python bench/paper.py --plan              # what would run, and how long it takes by an estimate
     python bench/paper.py samplers            # one figure: its sweeps, and its curves into docs/paper
+    python bench/paper.py k_push k_slide      # some of the sweeps of a figure, by name
     python bench/paper.py all                 # the whole set
     python docs/make_results_figures.py       # tables and pictures of docs/results.md from the curves
 
@@ -19,7 +20,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -91,6 +92,7 @@ FIGURES: dict[str, tuple[Sweep, ...]] = {
     ),
 }
 SWEEPS = tuple(sweep for figure in FIGURES.values() for sweep in figure)
+BY_NAME = {sweep.name: sweep for sweep in SWEEPS}
 
 
 def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
@@ -127,15 +129,21 @@ def estimate(sweep: Sweep) -> float:
     return _AROUND + _MORE * epoch * sweep.epochs * sweep.settings * SEEDS
 
 
-def plan(names: Sequence[str], out: Path, toy: bool) -> str:
-    """Returns the commands of figures, and by an estimate how long they take."""
-    lines, whole = [], 0.0
-    for name in names:
-        seconds = sum(map(estimate, FIGURES[name]))
-        whole += seconds
-        lines.append(f"# {name}: {sum(s.settings for s in FIGURES[name])} settings, {seconds / 60:.1f} minutes by the estimate")
-        lines += ["python train.py " + " ".join(command(sweep, out, toy)) for sweep in FIGURES[name]]
-    return "\n".join([*lines, f"# {whole / 60:.1f} minutes of one H200, by the estimate"])
+def chosen(names: Iterable[str]) -> list[Sweep]:
+    """Returns the sweeps of figures, of `all` of them, and those named by themselves, each once."""
+    each = [sweep for name in names for sweep in (SWEEPS if name == "all" else FIGURES.get(name) or (BY_NAME[name],))]
+    return list(dict.fromkeys(each))
+
+
+def plan(sweeps: Sequence[Sweep], out: Path, toy: bool) -> str:
+    """Returns the commands of sweeps, and by an estimate how long they take."""
+    lines = []
+    for name, figure in FIGURES.items():
+        if ours := [sweep for sweep in figure if sweep in sweeps]:
+            minutes = sum(map(estimate, ours)) / 60
+            lines.append(f"# {name}: {sum(s.settings for s in ours)} settings, {minutes:.1f} minutes by the estimate")
+            lines += ["python train.py " + " ".join(command(sweep, out, toy)) for sweep in ours]
+    return "\n".join([*lines, f"# {sum(map(estimate, sweeps)) / 60:.1f} minutes of one H200, by the estimate"])
 
 
 def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: int) -> int:
@@ -251,23 +259,25 @@ def collect(out: Path, folder: Path) -> list[Path]:
 def main() -> int:
     """Runs or plans figures; returns 0, or the status of the first sweep that did not end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("figures", nargs="*", metavar="FIGURE", help=f"{', '.join(FIGURES)} or all, which is the default")
+    names = f"{', '.join(FIGURES)}, one of their sweeps, or all, the default"
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help=names)
     parser.add_argument("--out", type=Path, default=Path("sweeps/paper"), help="folder of the sweeps")
     parser.add_argument("--curves", type=Path, help="folder of the curves: docs/paper, and under --out with --toy")
     parser.add_argument("--at-once", type=int, default=1, help="sweeps side by side: one computes while another compiles")
     parser.add_argument("--plan", action="store_true", help="print the commands and an estimate, and run nothing")
     parser.add_argument("--toy", action="store_true", help="Reach, two seeds, tiny sizes: tries the mechanics on a CPU")
     args = parser.parse_args()
-    if unknown := [name for name in args.figures if name not in (*FIGURES, "all")]:
-        parser.error(f"figures are {', '.join(FIGURES)} and all; got {', '.join(unknown)}")
+    wanted = args.figures or ["all"]
+    if unknown := [name for name in wanted if name not in (*FIGURES, *BY_NAME, "all")]:
+        parser.error(f"figures are {', '.join(FIGURES)} and all, sweeps {', '.join(BY_NAME)}; got {', '.join(unknown)}")
     if args.at_once < 1:
         parser.error(f"--at-once is 1 or more; got {args.at_once}")
-    names = list(FIGURES) if not args.figures or "all" in args.figures else list(dict.fromkeys(args.figures))
+    sweeps = chosen(wanted)
     if args.plan:
-        print(plan(names, args.out, args.toy))
+        print(plan(sweeps, args.out, args.toy))
         return 0
     curves = args.curves or (args.out / "curves" if args.toy else CURVES)
-    return run([sweep for name in names for sweep in FIGURES[name]], args.out, curves, args.toy, args.at_once)
+    return run(sweeps, args.out, curves, args.toy, args.at_once)
 
 
 if __name__ == "__main__":

@@ -177,6 +177,16 @@ def test_a_figure_that_is_none_is_refused(capsys, monkeypatch):
     assert "got samplrs" in capsys.readouterr().err
 
 
+def test_figures_and_sweeps_go_by_name():
+    assert [sweep.name for sweep in paper.chosen(["k", "k_push", "slide"])] == [
+        "k_push",
+        "k_pick_and_place",
+        "k_slide",
+        "slide",
+    ]
+    assert paper.chosen(["k_push", "all"])[1:] == [sweep for sweep in paper.SWEEPS if sweep.name != "k_push"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_figure_goes_on_where_it_was_stopped(tmp_path, number):
