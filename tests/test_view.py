@@ -218,13 +218,17 @@ def begun(*argv, **variables):
 
 
 def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
-    process, lines = begun("demo", "--port", str(port))
+    process, lines = begun("demo", "--port", str(port), PYTHONFAULTHANDLER="1")
     assert lines[-1] == f"push is at play: http://127.0.0.1:{port} (Ctrl-C ends it)\n"
     assert process.stdout.readline() == "there is no browser here that could be opened: open that address in one\n"
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as answer:
         assert answer.status == 200
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    try:
+        out, err = process.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # with what each thread was at
+        pytest.fail(process.communicate()[1])
     assert (process.returncode, out, err) == (0, "the viewer has ended\n", "")
     assert page.check("127.0.0.1", port) == port
 

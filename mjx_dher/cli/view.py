@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -100,18 +102,39 @@ def _view(args: ViewArgs, console: Console) -> int:
     given = given or [sources.by_random(str(args.env), args.env_kwargs)]
     others = [source for source in sources.of_package() if source.label not in [label for label, _ in folders]]
     keep_compiled_programs()
+    shown = [*given, *others], _maker(args.engine), args.page.host, port, args.seed
     try:
-        with server.Viewer([*given, *others], _maker(args.engine), args.page.host, port, args.seed) as viewer:
+        with server.Viewer(*shown) as viewer, _until_ctrl_c() as stopped:
             console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)", soft_wrap=True)
             if args.page.host not in page.LOOPBACK:
                 console.print(f"whoever can reach {args.page.host} can see it, and move things", soft_wrap=True)
             if args.page.open and not page.open_browser(viewer.address):
                 console.print("there is no browser here that could be opened: open that address in one", soft_wrap=True)
             sys.stdout.flush()
-            viewer.run(lambda: PARENT in os.environ and os.environ[PARENT] != str(os.getppid()))
+            viewer.run(lambda: stopped.is_set() or (PARENT in os.environ and os.environ[PARENT] != str(os.getppid())))
+        interrupted = stopped.is_set()
     except KeyboardInterrupt:
+        interrupted = True
+    if interrupted:
         console.print("the viewer has ended")
     return 0
+
+
+@contextlib.contextmanager
+def _until_ctrl_c() -> Iterator[threading.Event]:
+    """Gives what is set by Ctrl-C. An exception instead could be raised, and lost, in a callback; a second Ctrl-C raises it."""
+    stopped = threading.Event()
+
+    def stop(number: int, frame: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt
+        stopped.set()
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield stopped
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class Beside:

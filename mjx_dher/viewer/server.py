@@ -58,7 +58,7 @@ class Viewer:
             self._server.stop()
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> None:
-        """Plays, in real time, while a browser looks; returns when told to stop, and on Ctrl-C raises KeyboardInterrupt."""
+        """Plays, in real time, while a browser looks; returns when told to stop."""
         looked = drawn = before = time.monotonic()
         while not should_stop():
             started = time.monotonic()
