@@ -167,7 +167,8 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
                 sweep = waiting.pop(0)
                 running[sweep] = start(sweep, out, toy, quiet=at_once > 1)
             for sweep in [sweep for sweep, child in running.items() if child.poll() is not None]:
-                status = status or ended(sweep, running.pop(sweep).returncode, out, curves)
+                own = ended(sweep, running.pop(sweep).returncode, out, curves)
+                status = status or own
             time.sleep(0.2)
     finally:
         for number, handler in before.items():
