@@ -27,6 +27,9 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from mjx_dher.cli.settings import check_writable  # noqa: E402
+from mjx_dher.host import files  # noqa: E402
+from mjx_dher.host.files import FolderError  # noqa: E402
 from mjx_dher.sweeps import comparison, tables  # noqa: E402
 
 CURVES = ROOT / "docs" / "paper"
@@ -171,6 +174,8 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
                 status = status or own
             time.sleep(0.2)
     finally:
+        for child in running.values():  # where an error ends this
+            child.terminate()
         for number, handler in before.items():
             signal.signal(number, handler)
     return status
@@ -196,8 +201,7 @@ def ended(sweep: Sweep, status: int, out: Path, curves: Path) -> int:
     if status:
         print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
         return status if status > 0 else 128 - status
-    for path in collect(out, curves):
-        print(f"wrote {path}", flush=True)
+    print(f"wrote {collect(sweep, out, curves)}", flush=True)
     return 0
 
 
@@ -232,29 +236,25 @@ def _reading(sweep: Sweep, label: str) -> str:
     return f"weighted, {normalization}, {kernel}"
 
 
-def collect(out: Path, folder: Path) -> list[Path]:
-    """Writes the curves of the sweeps under `out` that have ended into `folder`, a file a task; returns the files.
+def collect(sweep: Sweep, out: Path, folder: Path) -> Path:
+    """Writes the curves of a sweep under `out` into its task's file in `folder`; returns the file.
 
-    Curves that are in `folder` stay, but for those of the same sweeps: the set can be made in parts, on several machines.
+    Curves of other sweeps in it stay: the set can be made in parts, on several machines.
     """
-    ended = [sweep for sweep in SWEEPS if (out / sweep.name / "results.csv").is_file()]
+    path = folder / f"{sweep.task}_curves.csv"
+    rows = {sweep.name: read_curves(out / sweep.name, sweep)}
+    if path.is_file():
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                if row["sweep"] != sweep.name:
+                    rows.setdefault(row["sweep"], []).append(row)
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for task in dict.fromkeys(sweep.task for sweep in ended):
-        path = folder / f"{task}_curves.csv"
-        rows = {sweep.name: read_curves(out / sweep.name, sweep) for sweep in ended if sweep.task == task}
-        if path.is_file():
-            with path.open(newline="") as file:
-                for row in csv.DictReader(file):
-                    if row["sweep"] not in {sweep.name for sweep in ended}:
-                        rows.setdefault(row["sweep"], []).append(row)
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            for sweep in SWEEPS:
-                writer.writerows(rows.get(sweep.name, []))
-        written.append(path)
-    return written
+    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for name in dict.fromkeys((*BY_NAME, *rows)):
+            writer.writerows(rows.get(name, []))
+    return path
 
 
 def main() -> int:
@@ -278,6 +278,11 @@ def main() -> int:
         print(plan(sweeps, args.out, args.toy))
         return 0
     curves = args.curves or (args.out / "curves" if args.toy else CURVES)
+    try:
+        for folder in (args.out, curves):
+            check_writable(folder)
+    except FolderError as error:
+        parser.error(str(error))
     return run(sweeps, args.out, curves, args.toy, args.at_once)
 
 

@@ -88,7 +88,8 @@ def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
         corrected = stats.holm(p_values) if len(ready) == len(comparisons) else [math.nan] * len(ready)
         for c, (d, epochs), p in zip(ready, differences, corrected):
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
-            found.append([family, *cells, *(["", "open"] if math.isnan(p) else [number(p), verdict(d.low, d.high, p)])])
+            said = ["", "open"] if math.isnan(p) else [number(p), verdict(d.low, d.high, p)]
+            found.append([family, *cells, *said])
     return found
 
 

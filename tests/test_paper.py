@@ -213,11 +213,9 @@ def test_curves_of_other_sweeps_stay(tmp_path, monkeypatch):
     ran = {"samplers": "0.5", "k_push": "0.25"}
     monkeypatch.setattr(paper, "read_curves", lambda folder, sweep: [row(sweep.name, ran[sweep.name])])
     for name in ran:
-        (tmp_path / name / "machine" / name).mkdir(parents=True)
-        (tmp_path / name / "machine" / name / "results.csv").touch()
-        paper.collect(tmp_path / name / "machine", tmp_path / "curves")
+        paper.collect(paper.BY_NAME[name], tmp_path / "machine", tmp_path / "curves")
     ran["samplers"] = "1"
-    (path,) = paper.collect(tmp_path / "samplers" / "machine", tmp_path / "curves")
+    path = paper.collect(paper.BY_NAME["samplers"], tmp_path / "machine", tmp_path / "curves")
     header, *rows = path.read_text().splitlines()
     assert header == ",".join(paper.COLUMNS)
     assert rows == ["samplers,future,0,1,40000,1", "k_push,future,0,1,40000,0.25"]

@@ -102,9 +102,11 @@ def _view(args: ViewArgs, console: Console) -> int:
     given = given or [sources.by_random(str(args.env), args.env_kwargs)]
     others = [source for source in sources.of_package() if source.label not in [label for label, _ in folders]]
     keep_compiled_programs()
-    shown = [*given, *others], _maker(args.engine), args.page.host, port, args.seed
     try:
-        with server.Viewer(*shown) as viewer, _until_ctrl_c() as stopped:
+        with (
+            server.Viewer([*given, *others], _maker(args.engine), args.page.host, port, args.seed) as viewer,
+            _until_ctrl_c() as stopped,
+        ):
             console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)", soft_wrap=True)
             if args.page.host not in page.LOOPBACK:
                 console.print(f"whoever can reach {args.page.host} can see it, and move things", soft_wrap=True)
