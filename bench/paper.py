@@ -241,19 +241,20 @@ def collect(sweep: Sweep, out: Path, folder: Path) -> Path:
 
     Curves of other sweeps in it stay: the set can be made in parts, on several machines.
     """
-    path = folder / f"{sweep.task}_curves.csv"
-    rows = {sweep.name: read_curves(out / sweep.name, sweep)}
-    if path.is_file():
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                if row["sweep"] != sweep.name:
-                    rows.setdefault(row["sweep"], []).append(row)
+    path, own = folder / f"{sweep.task}_curves.csv", read_curves(out / sweep.name, sweep)
     folder.mkdir(parents=True, exist_ok=True)
-    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for name in dict.fromkeys((*BY_NAME, *rows)):
-            writer.writerows(rows.get(name, []))
+    with files.lock(folder, wait=True):  # against another program whose sweep ends now
+        rows = {sweep.name: own}
+        if path.is_file():
+            with path.open(newline="") as file:
+                for row in csv.DictReader(file):
+                    if row["sweep"] != sweep.name:
+                        rows.setdefault(row["sweep"], []).append(row)
+        with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            for name in dict.fromkeys((*BY_NAME, *rows)):
+                writer.writerows(rows.get(name, []))
     return path
 
 

@@ -1,23 +1,17 @@
 """Several processes that train together: who they are, how they find each other, and what happens when one is gone."""
 
 import contextlib
-import json
-import os
-import re
 import socket
-import subprocess
-import sys
 import threading
 import time
 
 import numpy as np
 import pytest
-from conftest import ROOT
 
 from mjx_dher.cli import main
 from mjx_dher.cli.hosts import Hosts, first_node
 from mjx_dher.host import line
-from mjx_dher.runs import sinks, team
+from mjx_dher.runs import team
 
 
 def free_port():
@@ -251,93 +245,3 @@ def test_who_calls_by_mistake_is_left_out(monkeypatch):
     assert results[0].size == 2
     second.close()
     results[0].close()
-
-
-REACH = (
-    *("--env", "reach", "--engine", "native", "--num-envs", "4", "--cycles-per-epoch", "2", "--updates-per-cycle", "8"),
-    *("--target-period", "8", "--batch-size", "32", "--replay-size", "4000", "--hidden-sizes", "32", "--eval-episodes", "6"),
-    *("--final-episodes", "20", "--checkpoint-every", "1"),
-)
-
-
-def start(folder, number, port, *arguments, processes=2):
-    command = [sys.executable, "train.py", *REACH, "--out", folder, *arguments]
-    place = ["--coordinator", f"127.0.0.1:{port}", "--num-processes", str(processes), "--process-id", str(number)]
-    return subprocess.Popen(
-        [*map(str, command), *(place if processes > 1 else ())],
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def rows_of(folder):
-    return sinks.read_rows(folder / "metrics.csv")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("victim", [0, 1])
-def test_two_processes_train_reach_and_one_is_killed(tmp_path, victim):
-    """The other ends within a minute; the same command goes on from the last checkpoint, and ends."""
-    folder, port = tmp_path / "run", free_port()
-    steps = ("--total-steps", "16000")  # 40 epochs
-    pair = [start(folder, number, port, *steps) for number in (0, 1)]
-    deadline = time.monotonic() + 500
-    while not (folder / "checkpoints").exists() or len(rows_of(folder)) < 3:
-        assert time.monotonic() < deadline
-        assert [process.poll() for process in pair] == [None, None], [process.communicate() for process in pair]
-        time.sleep(0.2)
-    pair[victim].kill()
-    killed = time.monotonic()
-    output, _ = pair[1 - victim].communicate(timeout=60)
-    assert time.monotonic() - killed < 60
-    assert pair[1 - victim].returncode == line.GONE, output
-    assert f"error: process {victim} is gone" in output
-    assert "the same command goes on from the last checkpoint" in output
-    pair[victim].communicate()
-    before = len(rows_of(folder))
-    assert 3 <= before < 40
-
-    pair = [start(folder, number, port, *steps) for number in (0, 1)]
-    first, second = (process.communicate(timeout=500)[0] for process in pair)
-    assert [process.returncode for process in pair] == [0, 0], first + second
-    epoch = int(re.search(r"going on from .* after epoch (\d+)", first)[1])
-    assert before - 2 <= epoch <= before
-    assert [row["epoch"] for row in rows_of(folder)] == list(range(1, 41))
-    result = json.loads((folder / "result.json").read_text())
-    assert result["status"] == "finished"
-    assert "epoch" not in second  # the first process alone tells
-
-
-@pytest.mark.slow
-def test_two_processes_train_as_two_devices_of_one_do(tmp_path):
-    port, steps = free_port(), ("--total-steps", "800")
-    pair = [start(tmp_path / "two", number, port, *steps) for number in (0, 1)]
-    outputs = [process.communicate(timeout=500)[0] for process in pair]
-    assert [process.returncode for process in pair] == [0, 0], outputs
-    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
-    os.environ["XLA_FLAGS"], flags = flags, os.environ.get("XLA_FLAGS", "")
-    try:
-        alone = start(tmp_path / "one", 0, port, "--devices", "2", *steps, processes=1)
-    finally:
-        os.environ["XLA_FLAGS"] = flags
-    output, _ = alone.communicate(timeout=500)
-    assert alone.returncode == 0, output
-    rows = [rows_of(tmp_path / name) for name in ("one", "two")]
-    assert len(rows[0]) == 2
-    for one, two in zip(*rows):
-        for name in ("success_rate", "return_mean", "train_return_mean", "critic_loss", "actor_norm", "relabel_distance"):
-            assert one[name] == pytest.approx(two[name], rel=1e-3), name
-
-
-@pytest.mark.slow
-def test_processes_with_other_settings_are_refused_before_anything_is_trained(tmp_path):
-    port = free_port()
-    pair = [start(tmp_path / "run", n, port, "--total-steps", "800", "--gamma", gamma) for n, gamma in ((0, 0.98), (1, 0.9))]
-    for process in pair:
-        output, _ = process.communicate(timeout=120)
-        assert process.returncode == 2, output
-        assert "all processes must be started alike: gamma is 0.98 in process 0, and 0.9 in process 1" in output
-    assert not (tmp_path / "run").exists()

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import jax
 import pytest
 from conftest import ROOT
 
@@ -81,3 +82,25 @@ def test_there_are_two_heaps_a_core():
 def test_release_gives_back_what_was_freed():
     assert kept(100_000) > 80
     assert kept(100_000, after="memory.release()") < 20
+
+
+def test_each_process_asks_a_device_of_its_own(monkeypatch):
+    """Under several processes the first of all devices is the first process's, and tells nobody else its memory."""
+    monkeypatch.setattr(jax, "local_devices", lambda: [Gpu()])
+    monkeypatch.setattr(jax, "devices", lambda: [Gpu(stats=None), Gpu()])
+    assert memory.available_bytes() == 70
+    assert memory.used_bytes() == 30
+
+
+class Gpu:
+    """A device as JAX shows it: `memory_stats` raises for that of another process."""
+
+    platform = "gpu"
+
+    def __init__(self, stats=(("bytes_limit", 100), ("bytes_in_use", 30))):
+        self.stats = stats
+
+    def memory_stats(self):
+        if self.stats is None:
+            raise RuntimeError("MemoryStats is only supported for addressable PjRt devices.")
+        return dict(self.stats)

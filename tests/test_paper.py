@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mjx_dher import config
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.runs import identity
 from mjx_dher.sweeps import comparison
+from probes import held
 
 sys.path[:0] = [str(ROOT / "docs")]
 
@@ -219,6 +221,19 @@ def test_curves_of_other_sweeps_stay(tmp_path, monkeypatch):
     header, *rows = path.read_text().splitlines()
     assert header == ",".join(paper.COLUMNS)
     assert rows == ["samplers,future,0,1,40000,1", "k_push,future,0,1,40000,0.25"]
+
+
+def test_curves_wait_for_another_program_that_writes_there(tmp_path, monkeypatch):
+    """Two programs share a set: what one collects between the other's reading and writing would be lost."""
+    monkeypatch.setattr(paper, "read_curves", lambda folder, sweep: [row(sweep.name, "0.5")])
+    with held(tmp_path):
+        collecting = threading.Thread(target=paper.collect, args=(paper.BY_NAME["k_push"], tmp_path, tmp_path))
+        collecting.start()
+        collecting.join(0.3)
+        assert collecting.is_alive()
+        assert not list(tmp_path.glob("*.csv"))
+    collecting.join(20)
+    assert (tmp_path / "push_curves.csv").read_text().splitlines()[1:] == ["k_push,future,0,1,40000,0.5"]
 
 
 def row(sweep, success):

@@ -17,7 +17,7 @@ def available_bytes() -> int | None:
     """
     import jax
 
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats()
         return stats["bytes_limit"] - stats["bytes_in_use"] if stats and "bytes_limit" in stats else None
@@ -29,7 +29,7 @@ def used_bytes() -> int | None:
     """Returns the bytes that JAX uses on the default device, or on a CPU this process (Linux only). None where unknown."""
     import jax
 
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats()
         return stats["bytes_in_use"] if stats else None
