@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bakeoff_arms import ARMS, BASELINE, GROUPS, LEARNERS, TASKS, THRESHOLDS, estimated_minutes, spec_of
+from bakeoff_arms import BAKEOFF, THRESHOLDS, Experiment
 from bakeoff_report import Row, Scores, compare, forest
 from rich.console import Console
 
@@ -29,23 +29,25 @@ from mjx_dher import envs, stats
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
-from mjx_dher.runs import identity
+from mjx_dher.runs import identity, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
 
-TABLE = "bakeoff.csv"
 TOY_TASK = "point_mass:PointMass"
 
 
-def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+def parse(
+    argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__
+) -> argparse.Namespace:
     """Returns the arguments, checked; ends the program with status 2 and a sentence for those that cannot be used."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    learners, tasks, names = experiment.learners, experiment.tasks, [arm.name for arm in experiment.arms]
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps and of the report")
-    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=LEARNERS)
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
-    parser.add_argument("--arms", nargs="+", choices=[arm.name for arm in ARMS], default=[arm.name for arm in ARMS])
+    parser.add_argument("--learners", nargs="+", choices=learners, default=learners)
+    parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)
+    parser.add_argument("--arms", nargs="+", choices=names, default=names)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--lanes", type=int, help="runs side by side, at most; as many as memory holds on a GPU, 1 on a CPU")
@@ -63,9 +65,10 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     if not args.minutes > 0:
         parser.error(f"--minutes must be more than 0; got {args.minutes}")
     if args.toy:
-        args.learners, args.tasks = ("paper",), (TOY_TASK,)
+        args.learners, args.tasks = learners[:1], (TOY_TASK,)
         sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
-    args.arms = [arm for arm in ARMS if arm.name in (BASELINE, *args.arms)]
+    args.arms = [arm for arm in experiment.arms if arm.name in (experiment.baseline, *args.arms)]
+    args.experiment = experiment
     return args
 
 
@@ -76,7 +79,7 @@ def folder_of(args: argparse.Namespace, learner: str, task: str) -> Path:
 
 def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> list[RunSpec]:
     """Returns the runs of the arms of a group, seed by seed, so that what is compared ends together."""
-    settings = [spec_of(learner, task, arm, args.toy) for arm in args.arms if arm.group == group]
+    settings = [args.experiment.spec_of(learner, task, arm, args.toy) for arm in args.arms if arm.group == group]
     for setting in settings:
         validate(setting, envs.list_envs())
     seeds = range(args.first_seed, args.first_seed + args.seeds)
@@ -88,15 +91,15 @@ def plan(args: argparse.Namespace, console: Console) -> None:
     for learner in args.learners:
         for task in args.tasks:
             folder = folder_of(args, learner, task)
-            runs = [run for group in GROUPS for run in trials_of(args, learner, task, group)]
+            runs = [run for group in args.experiment.groups for run in trials_of(args, learner, task, group)]
             done = sum(grid.is_done(folder, run) for run in runs)
             steps = runs[0].config.total_steps
             console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} of them done; learner {runs[0].learner}")
     if not args.toy:
-        minutes = estimated_minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
+        minutes = args.experiment.minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
         console.print(
             f"about {minutes:.0f} minutes of one H200, by what sweeps of `future` took there (bench/README.md,"
-            " docs/results.md); what the methods cost beyond that has not been measured"
+            " docs/results.md); what the arms cost beyond that has not been measured"
         )
 
 
@@ -107,7 +110,7 @@ def train(args: argparse.Namespace, console: Console) -> bool:
     with Stop(console, args.out) as stop:
         for learner in args.learners:
             for task in args.tasks:
-                for group in GROUPS:
+                for group in args.experiment.groups:
                     if stop.asked is not None or time.monotonic() > until:
                         return False
                     if not _train_group(args, (learner, task, group), console, stop, until):
@@ -146,20 +149,13 @@ def read(args: argparse.Namespace, learner: str, task: str) -> dict[str, Scores]
     folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
     if not any((folder / grid.CELLS).glob("*/result.json")):
         return {}
-    wanted = {str(_told(spec_of(learner, task, arm, args.toy))): arm.name for arm in ARMS}
+    wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
     by_arm: dict[str, list[dict[str, Any]]] = {}
     for trial in tables.read(folder):
-        told = {name: trial["settings"][name] for name in (*_PARTS, *_NUMBERS)}
-        if (name := wanted.get(str(told))) is not None:
+        _, spec = run_folder.read(trial["folder"])
+        if (name := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
             by_arm.setdefault(name, []).append(trial)
-    return {name: _scores(task, name, by_arm[name], threshold) for arm in ARMS if (name := arm.name) in by_arm}
-
-
-_PARTS, _NUMBERS = ("sampler", "metric", "priority", "generator"), ("priority_fraction", "hindsight_reward")
-
-
-def _told(run: RunSpec) -> dict[str, Any]:
-    return {**{name: getattr(run, name) for name in _PARTS}, **{name: float(getattr(run.hparams, name)) for name in _NUMBERS}}
+    return {name: _scores(task, name, by_arm[name], threshold) for name in wanted.values() if name in by_arm}
 
 
 def _scores(task: str, name: str, trials: list[dict[str, Any]], threshold: float) -> Scores:
@@ -170,31 +166,31 @@ def _scores(task: str, name: str, trials: list[dict[str, Any]], threshold: float
 
 
 def report(args: argparse.Namespace, console: Console) -> int:
-    """Writes bakeoff.csv and a forest plot a task of what has ended; returns the number of rows."""
+    """Writes the table and a forest plot a task of what has ended; returns the number of rows."""
     rows: list[Row] = []
     for task in args.tasks:
         for learner in args.learners:
             scores = read(args, learner, task)
-            rows += compare(learner, task, scores) if BASELINE in scores else []
+            rows += compare(learner, task, scores, args.experiment.arms) if args.experiment.baseline in scores else []
     if not rows:
-        console.print(f"{args.out}: no run of `{BASELINE}` has ended, and so nothing can be compared yet")
+        console.print(f"{args.out}: no run of `{args.experiment.baseline}` has ended, and so nothing can be compared yet")
         return 0
-    with files.atomic_write(args.out / TABLE) as partial, partial.open("w", newline="") as file:
+    with files.atomic_write(args.out / args.experiment.table) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(Row._fields)
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
-    console.print(f"wrote {args.out / TABLE}")
+    console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
         if own := [row for row in rows if row.task == task]:
             path = args.out / f"{identity.in_a_path(task)}_forest.png"
-            forest(own, path)
+            forest(own, path, args.experiment.baseline)
             console.print(f"wrote {path}")
     return len(rows)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
     """Plans, trains and reports; 0 where all is done, 3 where runs are left for the same command."""
-    args, console = parse(argv), Console(highlight=False, soft_wrap=True)
+    args, console = parse(argv, experiment, about), Console(highlight=False, soft_wrap=True)
     if args.plan:
         plan(args, console)
         return 0

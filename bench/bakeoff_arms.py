@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from mjx_dher import presets
@@ -13,9 +13,6 @@ BASELINE = "future"
 TASKS = ("push", "pick_and_place", "slide")
 LEARNERS = ("paper", "best")
 THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
-# Arms whose runs share a program. Those that ask the learner about the whole ring at each cycle, and those that draw four
-# times as many transitions, would make the others' runs dearer.
-GROUPS = ("plain", "learner", "transitions", "errors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +20,12 @@ class Arm:
     """A setting that is compared with `future`."""
 
     name: str
+    # Arms of a group share a program. Those that ask the learner about the whole ring at each cycle, and those that draw four
+    # times as many transitions, would make the others' runs dearer.
     group: str
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
+    sizes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of Config
     claim: str = ""
     source: str = ""
 
@@ -33,6 +33,28 @@ class Arm:
     def prioritized(self) -> bool:
         """Whether the arm draws by a priority."""
         return "priority" in self.parts
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What bench/bakeoff.py trains and compares."""
+
+    arms: tuple[Arm, ...]  # the first one is the baseline
+    learners: tuple[str, ...]
+    tasks: tuple[str, ...]
+    spec_of: Callable[[str, str, Arm, bool], Any]  # the RunSpec of a learner, task and arm, seed 0; the last one: as a toy
+    minutes: Callable[[tuple[str, ...], tuple[str, ...], tuple[Arm, ...], int], float]  # of one H200, by an estimate
+    table: str
+
+    @property
+    def baseline(self) -> str:
+        """The name of the arm that the others are compared with."""
+        return self.arms[0].name
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups of the arms, in order."""
+        return tuple(dict.fromkeys(arm.group for arm in self.arms))
 
 
 ARMS = (
@@ -174,3 +196,6 @@ def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: t
     sizes = [SIZES[learner, task] for learner in learners for task in tasks]
     programs = len(sizes) * len({arm.group for arm in arms})
     return (sum(size.seconds for size in sizes) * len(arms) * seeds + COMPILE_SECONDS * programs) / 60
+
+
+BAKEOFF = Experiment(ARMS, LEARNERS, TASKS, spec_of, estimated_minutes, "bakeoff.csv")

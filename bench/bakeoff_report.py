@@ -1,4 +1,4 @@
-"""The comparison of bench/bakeoff.py's arms with `future`: rows of a table, and forest plots."""
+"""The comparison of bench/bakeoff.py's arms with the first of them: rows of a table, and forest plots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from bakeoff_arms import ARMS, BASELINE, Arm
+from bakeoff_arms import Arm
 from numpy.typing import NDArray
 
 from mjx_dher import stats
@@ -28,7 +28,7 @@ class Scores(NamedTuple):
 
 
 class Row(NamedTuple):
-    """An arm of a learner and task beside `future`. Differences are paired by seed; intervals are at 95 %."""
+    """An arm of a learner and task beside the baseline. Differences are paired by seed; intervals are at 95 %."""
 
     learner: str
     task: str
@@ -42,7 +42,7 @@ class Row(NamedTuple):
     low: float
     high: float
     final_difference: float
-    better: float  # probability that a seed of the arm has more mean success than one of `future`
+    better: float  # probability that a seed of the arm has more mean success than one of the baseline
     better_low: float
     better_high: float
     p_value: float
@@ -76,11 +76,11 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
     return high * spread
 
 
-def compare(learner: str, task: str, scores: dict[str, Scores]) -> list[Row]:
-    """Returns a row an arm: each against `future` on the seeds that both have."""
-    base, arms = scores[BASELINE], {arm.name: arm for arm in ARMS}
-    others = [name for name in scores if name != BASELINE]
-    rows = [_row(learner, task, arms[name], scores[name], base, len(others)) for name in (BASELINE, *others)]
+def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm]) -> list[Row]:
+    """Returns a row an arm: each against the first of `arms` on the seeds that both have."""
+    base = scores[arms[0].name]
+    scored = [arm for arm in arms if arm.name in scores]
+    rows = [_row(learner, task, arm, scores[arm.name], base, len(scored) - 1) for arm in scored]
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
     for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested]) if tested else []):
         rows[number] = rows[number]._replace(p_corrected=p)
@@ -90,7 +90,7 @@ def compare(learner: str, task: str, scores: dict[str, Scores]) -> list[Row]:
 def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: int) -> Row:
     common = [seed for seed in own.seeds if seed in base.seeds]
     nan, paired = math.nan, {}
-    if arm.name != BASELINE and len(common) > 1:
+    if own is not base and len(common) > 1:
         mine, theirs = ([scores.seeds.index(seed) for seed in common] for scores in (own, base))
         difference = own.area[mine] - base.area[theirs]
         low, high = stats.bootstrap_interval(difference, np.mean)
@@ -126,15 +126,15 @@ def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: in
     )
 
 
-def forest(rows: Sequence[Row], path: Path) -> None:
-    """Draws the paired differences to `future` of a task's arms, a panel a learner, with intervals and corrected p."""
+def forest(rows: Sequence[Row], path: Path, baseline: str) -> None:
+    """Draws the paired differences of a task's arms to the baseline, a panel a learner, with intervals and corrected p."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     learners = list(dict.fromkeys(row.learner for row in rows))
-    names = [arm.name for arm in ARMS if any(row.arm == arm.name for row in rows) and arm.name != BASELINE]
+    names = list(dict.fromkeys(row.arm for row in rows if row.arm != baseline))
     height = 1.3 + 0.3 * max(len(names), 1)
     figure, axes = plt.subplots(1, len(learners), figsize=(5.2 * len(learners), height), sharey=True, squeeze=False)
     for axis, learner in zip(axes[0], learners):
@@ -150,7 +150,7 @@ def forest(rows: Sequence[Row], path: Path) -> None:
             )
         axis.axvline(0.0, color="0.6", linewidth=0.8)
         axis.set_title(learner, fontsize=10)
-        axis.set_xlabel(f"mean success over epochs, difference to {BASELINE}")
+        axis.set_xlabel(f"mean success over epochs, difference to {baseline}")
         axis.grid(axis="x", alpha=0.2)
     axes[0][0].set_yticks(range(len(names)), names)
     axes[0][0].invert_yaxis()

@@ -1,4 +1,4 @@
-"""bench/bakeoff.py: its arms, what they cost, what is made of their scores; and a whole one on the point mass, at night."""
+"""bench/bakeoff.py and ablation.py: their arms and costs, what is made of scores, and whole ones on the point mass, at night."""
 
 import argparse
 import csv
@@ -9,6 +9,7 @@ import pytest
 from conftest import ROOT
 
 from mjx_dher import envs
+from mjx_dher.runs import identity
 from mjx_dher.spec import GENERATORS, PRIORITIES, SAMPLERS, validate
 
 
@@ -36,6 +37,14 @@ def report(monkeypatch):
     return bakeoff_report
 
 
+@pytest.fixture
+def ablation(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import ablation
+
+    return ablation
+
+
 def test_every_arm_is_a_run_of_every_task_and_learner(arms):
     for learner in arms.LEARNERS:
         for task in arms.TASKS:
@@ -43,8 +52,7 @@ def test_every_arm_is_a_run_of_every_task_and_learner(arms):
             for spec in specs.values():
                 validate(spec, envs.list_envs())
             assert len(set(specs.values())) == len(arms.ARMS) >= 13
-            assert {arm.group for arm in arms.ARMS} == set(arms.GROUPS)
-            for group in arms.GROUPS:  # one program each
+            for group in arms.BAKEOFF.groups:  # one program each
                 assert len({specs[arm.name].program for arm in arms.ARMS if arm.group == group}) == 1
     built_in = {arm.parts.get("priority") for arm in arms.ARMS} | {arm.parts.get("generator") for arm in arms.ARMS}
     assert {*PRIORITIES, *GENERATORS} - {"eventful", "reset"} <= built_in
@@ -55,18 +63,52 @@ def test_the_plan_fits_into_two_hours(arms):
     assert 60 < arms.estimated_minutes(arms.LEARNERS, arms.TASKS, arms.ARMS, 10) < 110
 
 
+def changes(spec, base):
+    """What differs between two runs, by field."""
+    mine, theirs = identity.settings(spec), identity.settings(base)
+    return {name: value for name, value in mine.items() if value != theirs[name]}
+
+
+@pytest.mark.parametrize("task", ["pick_and_place", "slide"])
+def test_every_arm_of_the_ablation_leaves_out_what_its_name_says(ablation, task):
+    specs = {arm.name: ablation.spec_of("gpu", task, arm) for arm in ablation.ARMS}
+    for spec in specs.values():
+        validate(spec, envs.list_envs())
+    told = {name: changes(spec, specs["preset"]) for name, spec in specs.items()}
+    slide = task == "slide"
+    with_entropy = {"learner": "tqc", "action_l2": 0.0, "entropy_weight": 0.1}
+    without = {"learner": "dtqc", "action_l2": 1.0, "target_noise": 0.0}
+    ddpg = {"learner": "ddpg", "networks": "mlp", "n_step": 1}
+    assert told == {
+        "preset": {},
+        "no_quantiles": {"learner": "td3" if slide else "sac"},
+        "other_entropy": with_entropy if slide else without,
+        "one_critic": {"num_critics": 1},
+        "no_layer_norm": {"networks": "mlp"},
+        "one_step": {"n_step": 1},
+        "half_width": {"hidden_sizes": (256, 256, 256) if slide else (128, 128, 128)},
+        "half_batch": {"batch_size": 512},
+        "half_updates": {"updates_per_cycle": 500},
+        "no_eventful": {"priority_fraction": 0.0},
+        "ddpg": ddpg if slide else {**ddpg, "action_l2": 1.0},
+    }
+
+
 def scores(report, areas, first=0):
     areas = np.asarray(areas, float)
     seeds = tuple(range(first, first + len(areas)))
     return report.Scores(seeds, areas, areas, np.where(areas > 0.5, 1000.0, np.inf), 0)
 
 
-def test_arms_are_compared_seed_by_seed(report):
+def test_arms_are_compared_seed_by_seed(report, arms):
     base = np.linspace(0.3, 0.6, 10)
     ahead = base + np.linspace(0.01, 0.05, 10)
     alike = base + np.tile([0.01, -0.01], 5)
     rows = report.compare(
-        "paper", "push", {"future": scores(report, base), "energy": scores(report, ahead), "hgg": scores(report, alike)}
+        "paper",
+        "push",
+        {"future": scores(report, base), "energy": scores(report, ahead), "hgg": scores(report, alike)},
+        arms.ARMS,
     )
     future, energy, hgg = rows
     assert math.isnan(future.difference)
@@ -79,9 +121,9 @@ def test_arms_are_compared_seed_by_seed(report):
     assert energy.steps_to_threshold == np.median(np.where(ahead > 0.5, 1000.0, np.inf))
 
 
-def test_only_seeds_that_both_have_are_paired(report):
+def test_only_seeds_that_both_have_are_paired(report, arms):
     base, other = scores(report, [0.1, 0.2, 0.3]), scores(report, [0.5, 0.6, 0.7], first=1)
-    _, row = report.compare("best", "slide", {"future": base, "dpp": other})
+    _, row = report.compare("best", "slide", {"future": base, "dpp": other}, arms.ARMS)
     np.testing.assert_allclose(row.difference, np.mean([0.5 - 0.2, 0.6 - 0.3]))
 
 
@@ -96,11 +138,11 @@ def test_the_smallest_effect_of_ten_seeds_is_that_of_ten_equal_signs(report):
     assert math.isnan(report.smallest_effect(1.0, 5, 13))  # no five seeds have so small a p
 
 
-def test_forests_are_drawn(report, tmp_path):
+def test_forests_are_drawn(report, arms, tmp_path):
     rng = np.random.default_rng(0)
     given = {name: scores(report, rng.uniform(size=4)) for name in ("future", "energy", "archer")}
-    rows = [row for learner in ("paper", "best") for row in report.compare(learner, "push", given)]
-    report.forest(rows, tmp_path / "forest.png")
+    rows = [row for learner in ("paper", "best") for row in report.compare(learner, "push", given, arms.ARMS)]
+    report.forest(rows, tmp_path / "forest.png", "future")
     assert (tmp_path / "forest.png").stat().st_size > 10_000
 
 
@@ -135,15 +177,16 @@ def test_nothing_to_report_is_said(bakeoff, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_bakeoff_stops_and_goes_on_and_reports(bakeoff, tmp_path):
+@pytest.mark.parametrize("which", ["bakeoff", "ablation"])
+def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
+    experiment = bakeoff.BAKEOFF if which == "bakeoff" else ablation.ABLATION
     argv = ["--out", str(tmp_path), "--toy", "--seeds", "2", "--lanes", "10"]
-    assert bakeoff.main([*argv, "--minutes", "0.02"]) == 3
-    assert bakeoff.main(argv) == 0
-    with (tmp_path / "bakeoff.csv").open() as file:
+    assert bakeoff.main([*argv, "--minutes", "0.02"], experiment) == 3
+    assert bakeoff.main(argv, experiment) == 0
+    with (tmp_path / f"{which}.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["arm"] for row in rows] == [arm.name for arm in bakeoff.ARMS]
+    assert [row["arm"] for row in rows] == [arm.name for arm in experiment.arms]
     assert {row["seeds"] for row in rows} == {"2"}
     assert {row["failed"] for row in rows} == {"0"}
-    done = bakeoff.parse(argv)
-    assert isinstance(done, argparse.Namespace)
-    assert bakeoff.main(argv) == 0  # nothing is left, and it says the same
+    assert isinstance(bakeoff.parse(argv, experiment), argparse.Namespace)
+    assert bakeoff.main(argv, experiment) == 0  # nothing is left, and it says the same
