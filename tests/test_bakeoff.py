@@ -1,4 +1,4 @@
-"""bench/bakeoff.py and ablation.py: their arms and costs, what is made of scores, and whole ones on the point mass, at night."""
+"""bench/bakeoff.py and ablation.py: arms and their costs, what is made of scores; whole ones on the point mass."""
 
 import argparse
 import csv
