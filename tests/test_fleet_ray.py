@@ -60,7 +60,7 @@ def test_kills_of_a_worker_a_node_and_the_driver_cost_no_trial(bench):
 
 
 def test_without_a_storage_the_task_is_trained_again(bench, tmp_path):
-    flags = [*bench.LONG, 8 * bench.STEPS_PER_EPOCH, "--seeds", 2]
+    flags = [*bench.LONG, 40 * bench.STEPS_PER_EPOCH, "--seeds", 2]
     bench.finished(bench.sweep(tmp_path / "plain", *flags))
     with bench.Nodes(2) as nodes:
         driver = bench.sweep(tmp_path / "fleet", *flags, "--ray", nodes.address, "--ray-chunk", 2)

@@ -19,7 +19,7 @@ from mjx_dher.spec import RunSpec
 
 RETRIES = 5  # of a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # that a cluster has
-SECONDS_TO_LOOK = 60.0  # that nodes have to tell what they are
+SECONDS_TO_LOOK = 180.0  # that nodes have to tell what they are; four on two busy cores needed more than 60
 STORE_BYTES = 200 << 20  # of the object store of a cluster that is started here; what does not fit goes to the disk
 # Parts of the folder with own code that no node needs, as .gitignore names them. The package is each node's own.
 NOT_SENT = (
