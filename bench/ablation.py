@@ -43,7 +43,7 @@ HALVES = {"half_width": "hidden_sizes", "half_batch": "batch_size", "half_update
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's."""
     run = presets.preset(learner, "slide" if toy else task)
-    sizes = {**(TOY if toy else SIZES["best", task].changes), **arm.sizes}
+    sizes = {**({**TOY, "target_period": 10} if toy else SIZES["best", task].changes), **arm.sizes}
     run = dataclasses.replace(run, env=task, config=dataclasses.replace(run.config, **sizes), **arm.parts)
     if (field := HALVES.get(arm.name)) is not None:
         run = dataclasses.replace(run, config=dataclasses.replace(run.config, **{field: half(getattr(run.config, field))}))

@@ -94,6 +94,11 @@ def test_every_arm_of_the_ablation_leaves_out_what_its_name_says(ablation, task)
     }
 
 
+def test_every_arm_of_the_ablation_is_a_toy_too(ablation):
+    for arm in ablation.ARMS:
+        validate(ablation.spec_of("gpu", "reach", arm, True), envs.list_envs())
+
+
 def scores(report, areas, first=0):
     areas = np.asarray(areas, float)
     seeds = tuple(range(first, first + len(areas)))
