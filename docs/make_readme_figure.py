@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import paper_set
 
 from mjx_dher import stats
 
@@ -27,14 +27,8 @@ PANELS = (
 
 
 def curves(task: str, sampler: str) -> np.ndarray:
-    """Returns the success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper_TASK_curves.csv."""
-    with (DOCS / f"paper_{task}_curves.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["sweep"] == "samplers" and row["setting"] == sampler]
-    seeds, epochs = ({int(row[column]) for row in rows} for column in ("seed", "epoch"))
-    table = np.full((len(seeds), len(epochs)), np.nan)
-    for row in rows:
-        table[int(row["seed"]) - min(seeds), int(row["epoch"]) - 1] = float(row["success_rate"])
-    return table
+    """Returns the success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper/TASK_curves.csv."""
+    return paper_set.current()[task]["samplers", sampler].success
 
 
 def make() -> Any:

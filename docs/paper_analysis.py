@@ -121,12 +121,6 @@ def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats
     return f"{middle} ({low} to {high})" if middle != "never" or low != "never" else "never"
 
 
-def k_gain(push: Sweeps, k: int, other: int) -> Difference:
-    """Returns by how much k beats another k on Push, over the seeds of both samplers."""
-    areas = [np.concatenate([area(push["k", f"{s}, her_k {value}"]) for s in ("future", "weighted")]) for value in (k, other)]
-    return difference(*areas)
-
-
 def load() -> dict[str, Sweeps]:
-    """Returns the curves of 2026-11-22 by task."""
+    """Returns the curves of 2026-11-22 by task; `paper_set.current` has today's."""
     return {task: read(DOCS / f"paper_{task}_curves.csv") for task in NAMES}

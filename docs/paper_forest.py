@@ -7,50 +7,45 @@ from pathlib import Path
 
 from paper_analysis import LAST, NAMES, START, THRESHOLDS, Difference, Sweeps, gain, sooner, window
 
-SWEEPS = {
-    "samplers": ("#1b62a5", "main sweep"),
-    "fast": ("#8fb8de", ""),
-    "hopper": ("#8fb8de", ""),
-    "hopper again": ("#8fb8de", ""),
-}
+REPEATED = ("samplers", "fast", "hopper", "hopper again")  # those whose runs are whole
 CLAIMED = {("push", START): (2, 3), ("push", 0.9): (5, 5), ("pick_and_place", START): (2, 3), ("pick_and_place", 0.9): (10, 10)}
 Line = tuple[str, str, Difference, "tuple[float, float] | None"]  # label, sweep, difference, what the paper claims
 
 
-def success_lines(data: Mapping[str, Sweeps]) -> list[Line]:
+def success_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line]:
     """Returns what is drawn of success: over all epochs, and over the last ones."""
     lines: list[Line] = []
     for task, sweeps in data.items():
-        for sweep in (name for name in SWEEPS if (name, "weighted") in sweeps):
+        for sweep in (name for name in names if (name, "weighted") in sweeps):
             lines.append((f"{NAMES[task]}, all epochs", sweep, gain(sweeps, sweep, "weighted", "future"), None))
-        for sweep in (name for name in SWEEPS if (name, "weighted") in sweeps):
+        for sweep in (name for name in names if (name, "weighted") in sweeps):
             late = window(sweeps, sweep, slice(-LAST[task], None))
             lines.append((f"{NAMES[task]}, last {LAST[task]}", sweep, late, None))
     return lines
 
 
-def epoch_lines(data: Mapping[str, Sweeps]) -> list[Line]:
+def epoch_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line]:
     """Returns what is drawn of epochs: to the start, and to the threshold."""
     lines: list[Line] = []
     for task, sweeps in data.items():
         for threshold in (START, THRESHOLDS[task]):
-            for sweep in (name for name in SWEEPS if (name, "weighted") in sweeps):
+            for sweep in (name for name in names if (name, "weighted") in sweeps):
                 claimed = CLAIMED.get((task, threshold))
                 lines.append((f"{NAMES[task]}, to {threshold:.2f}", sweep, sooner(sweeps, sweep, threshold), claimed))
     return lines
 
 
-def draw(data: Mapping[str, Sweeps], path: Path) -> None:
-    """Draws the picture."""
+def draw(data: Mapping[str, Sweeps], path: Path, main: str) -> None:
+    """Draws the picture; `main` is the sweep that comes first, and darker."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(12, 5.4))
+    figure, axes = plt.subplots(1, 2, figsize=(12, 6.2))
     titles = ("mean success: weighted less future", "epochs that weighted is sooner than future")
-    for ax, lines, title in zip(axes, (success_lines(data), epoch_lines(data)), titles):
-        _panel(ax, lines)
+    for ax, lines, title in zip(axes, (success_lines(data, (main, *REPEATED)), epoch_lines(data, (main, *REPEATED))), titles):
+        _panel(ax, lines, main)
         ax.set(xlabel=title)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     axes[0].axvspan(-0.02, 0.02, color="#eef2f6", zorder=0)
@@ -59,16 +54,16 @@ def draw(data: Mapping[str, Sweeps], path: Path) -> None:
     plt.close(figure)
 
 
-def _panel(ax, lines: list[Line]) -> None:
+def _panel(ax, lines: list[Line], main: str) -> None:
     """Draws intervals from top to bottom; those of one question stand close together."""
     y, before, ticks = 0.0, "", []
     for label, sweep, d, claimed in lines:
         y -= 0.32 if label == before else 1.0
         if label != before:
             ticks.append((y, label))
-        color, name = SWEEPS[sweep]
-        first = "95 % interval, main sweep" if not any(ax.get_legend_handles_labels()[1]) else None
-        repeated = "repeated" if not name and "repeated" not in ax.get_legend_handles_labels()[1] else None
+        color, name = ("#1b62a5", "main") if sweep == main else ("#8fb8de", "")
+        first = "95 % interval, 2026-11-24" if not any(ax.get_legend_handles_labels()[1]) else None
+        repeated = "2026-11-22" if not name and "2026-11-22" not in ax.get_legend_handles_labels()[1] else None
         ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if name else 1.6, solid_capstyle="butt")
         ax.plot(d.mean, y, "o", color=color, markersize=6 if name else 4, label=first if name else repeated)
         if claimed and label != before:
@@ -77,5 +72,6 @@ def _panel(ax, lines: list[Line]) -> None:
         before = label
     ax.axvline(0, color="#1c232b", linewidth=0.8)
     ax.set_yticks([place for place, _ in ticks], [label for _, label in ticks])
+    ax.locator_params(axis="x", nbins=6)
     ax.spines[["top", "right", "left"]].set_visible(False)
     ax.tick_params(axis="y", length=0)

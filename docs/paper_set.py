@@ -17,6 +17,7 @@ from paper_analysis import (
     MARGIN,
     NAMES,
     THRESHOLDS,
+    Curves,
     Difference,
     Sweeps,
     area,
@@ -30,6 +31,7 @@ from paper_analysis import (
 )
 
 from mjx_dher import stats
+from mjx_dher.config import HParams
 
 FOLDER = DOCS / "paper"
 MAIN = {"push": "samplers", "pick_and_place": "pick_and_place", "slide": "slide"}  # the sweep with `future` and `weighted`
@@ -76,6 +78,30 @@ HEAD = "question | task | setting | against | epochs | mean success | 95 % inter
 def load_set(folder: Path) -> dict[str, Sweeps]:
     """Returns the curves of the set, by task, of those tasks that have any."""
     return {task: read(path) for task in NAMES if (path := folder / f"{task}_curves.csv").is_file()}
+
+
+def current(folder: Path = FOLDER) -> dict[str, Sweeps]:
+    """Returns the curves of the sweeps that have `future` and `weighted`, by task, as of a sweep `samplers`.
+
+    `epsilon_closest` is that with the preset's epsilon.
+    """
+    names = {f"epsilon_closest, epsilon {HParams().epsilon:g}": "epsilon_closest"}
+    return {
+        task: {("samplers", names.get(name, name)): curves for (sweep, name), curves in sweeps.items() if sweep == MAIN[task]}
+        for task, sweeps in load_set(folder).items()
+    }
+
+
+def ks(data: Mapping[str, Sweeps]) -> dict[str, dict[int, Curves]]:
+    """Returns the curves of `future` by task and k, of those tasks that have all of them."""
+    found = {}
+    for task, sweeps in data.items():
+        curves = {k: sweeps.get((f"k_{task}", f"future, her_k {k}")) for k in (1, 2, 8, 16)}
+        curves[4] = sweeps.get((MAIN[task], "future"))
+        whole = {k: own for k, own in sorted(curves.items()) if own is not None}
+        if len(whole) == len(curves):
+            found[task] = whole
+    return found
 
 
 def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
