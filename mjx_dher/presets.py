@@ -11,7 +11,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.names import check_name
 from mjx_dher.spec import RunSpec
 
-Preset = Literal["cpu", "gpu", "paper"]
+Preset = Literal["cpu", "gpu", "frugal", "paper"]
 PRESETS = get_args(Preset)
 
 _TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, priority_fraction=0.5)
@@ -30,9 +30,10 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     """Returns the run of a preset in an environment, with `changes` to its fields, such as `sampler` or `seed`.
 
     `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
-    warp (docs/design.md says how). `paper` is the set-up of "Distance Based Replay Sampling in Hindsight Experience
-    Replay", and where that is silent, of the code that its numbers are those of (docs/results.md has a table): its workers'
-    episodes are rolled out side by side, and the gradient of the joint batch stands for the sum of theirs.
+    warp; `frugal` is tuned for few environment steps, whatever the updates cost (docs/design.md says how). `paper` is the
+    set-up of "Distance Based Replay Sampling in Hindsight Experience Replay", and where that is silent, of the code that its
+    numbers are those of (docs/results.md has a table): its workers' episodes are rolled out side by side, and the gradient of
+    the joint batch stands for the sum of theirs.
 
     Args:
       name: the preset.
@@ -45,10 +46,10 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
       ValueError: no such preset.
     """
     check_name("preset", name, PRESETS)
-    best = _GPU_LEARNERS.get(env, _DDPG) if name == "gpu" else _DDPG
+    best = _LEARNERS.get((name, env), _DDPG)
     if learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
-    setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "paper": _paper}[name]
+    setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name]
     config, hparams = setup(env)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
     return RunSpec(env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **changes)
@@ -119,6 +120,25 @@ def _gpu_slide(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(target_noise=0.0)
 
 
+def _frugal(env: str) -> tuple[Config, HParams]:
+    config, hparams = _cpu(env)
+    if env == "reach":
+        return dataclasses.replace(config, updates_per_cycle=80, total_steps=8_000), hparams
+    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, config.total_steps)
+    return dataclasses.replace(config, cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps), hparams
+
+
+def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu_pick_and_place(env)
+    return dataclasses.replace(config, num_envs=64, total_steps=500_000, replay_size=500_000), hparams
+
+
+def _frugal_slide(env: str) -> tuple[Config, HParams]:
+    config, hparams = _frugal(env)
+    sizes = {"updates_per_cycle": 150, "num_critics": 1, "n_step": 3, "hidden_sizes": (256, 256)}
+    return dataclasses.replace(config, **sizes), hparams._replace(target_noise=0.0)
+
+
 class _Best(NamedTuple):
     """A preset's learner for a task; `setup` is None where the settings are those of `ddpg`."""
 
@@ -128,7 +148,9 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
-_GPU_LEARNERS = {
-    "pick_and_place": _Best("tqc", "layer_norm", _gpu_pick_and_place),
-    "slide": _Best("dtqc", "layer_norm", _gpu_slide),
+_LEARNERS = {
+    ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place),
+    ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide),
+    ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", _frugal_pick_and_place),
+    ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide),
 }

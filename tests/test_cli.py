@@ -117,7 +117,7 @@ BAD = [
     (["sweep", "--out", "x", "--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
     (["render", "--env", "not_there:Task", "--out", "x.png"], ["env 'not_there:Task': there is no module 'not_there'"]),
     (["--sampler", "wheighted"], ["sampler must be one of random, episode, future", "(did you mean 'weighted'?)"]),
-    (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, paper; got 'papr' (did you mean 'paper'?)"]),
+    (["--preset", "papr"], ["preset must be one of auto, cpu, gpu, frugal, paper; got 'papr' (did you mean 'paper'?)"]),
     (["--weight-kernel", "cubic"], ["weight_kernel must be one of linear, inverse, softmax, or module:attribute; got 'cubic'"]),
     (["--metric", "speed"], ["metric must be one of position", ", or module:attribute; got 'speed'"]),
     (["--num-envs", "0"], ["num_envs must lie in [1, 1000000]; got 0"]),

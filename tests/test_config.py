@@ -52,6 +52,14 @@ def test_presets_are_valid(name, env):
     spec.validate(presets.preset(name, env), envs.list_envs())
 
 
+@pytest.mark.parametrize("env", ["push", "pick_and_place", "slide", "reach"])
+def test_the_frugal_preset_plays_less_and_learns_more_from_it(env):
+    frugal, *others = (presets.preset(name, env).config for name in ("frugal", "cpu", "gpu"))
+    learned = [c.updates_per_cycle * c.batch_size / (50 * c.num_envs) for c in (frugal, *others)]  # transitions for each played
+    assert frugal.total_steps < min(c.total_steps for c in others)
+    assert learned[0] > max(learned[1:])
+
+
 def test_sizes_that_follow():
     c = Config(num_envs=16, cycles_per_epoch=50, total_steps=100_001, replay_size=1_000_049)
     assert config.steps_per_epoch(c, 50) == 40_000
@@ -190,5 +198,5 @@ def test_all_problems_are_named_at_once():
 
 
 def test_unknown_preset():
-    with pytest.raises(ValueError, match=r"preset must be one of cpu, gpu, paper; got .papper. .did you mean .paper."):
+    with pytest.raises(ValueError, match=r"preset must be one of cpu, gpu, frugal, paper; got .papper. .did you mean .paper."):
         presets.preset("papper", "push")

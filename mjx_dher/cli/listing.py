@@ -28,6 +28,7 @@ KINDS: dict[str, dict[str, str]] = {
         "auto": "cpu or gpu, the one for this machine",
         "cpu": "tuned for time to success on two cores, with native",
         "gpu": "tuned for time to success on one NVIDIA GPU, with warp",
+        "frugal": "tuned for success after few environment steps",
         "paper": "the settings of the paper",
     },
     "samplers": {

@@ -55,9 +55,9 @@ class TrainArgs:
     """
 
     spec: RunSpec
-    preset: Literal["auto", "cpu", "gpu", "paper"] = "auto"
-    """Settings that other options override: cpu or gpu (tuned for time to success there), auto (the one for this machine) or
-    paper (the paper's settings; docs/results.md has a table)."""
+    preset: Literal["auto", "cpu", "gpu", "frugal", "paper"] = "auto"
+    """Settings that other options override: cpu or gpu (tuned for time to success there), auto (the one for this machine),
+    frugal (few environment steps) or paper (the paper's settings; docs/results.md has a table)."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     """Run folder, or a config.json, whose settings and options are taken in place of a preset's; others given override them."""
     out: Path | None = None
