@@ -135,8 +135,8 @@ def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
 
 def _frugal_slide(env: str) -> tuple[Config, HParams]:
     config, hparams = _frugal(env)
-    sizes = {"updates_per_cycle": 150, "num_critics": 1, "n_step": 3, "hidden_sizes": (256, 256)}
-    return dataclasses.replace(config, **sizes), hparams._replace(target_noise=0.0)
+    config = dataclasses.replace(config, updates_per_cycle=150, num_critics=1, n_step=3, hidden_sizes=(256, 256))
+    return config, hparams._replace(target_noise=0.0)
 
 
 class _Best(NamedTuple):
