@@ -13,64 +13,70 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import bakeoff
-from bakeoff_arms import COMPILE_SECONDS, SIZES, TOY, Arm, Experiment
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes
 
 from mjx_dher import presets
 from mjx_dher.spec import RunSpec
 
-# Without a part: where the preset has entropy, the same critics without it, and the other way round.
-ENTROPY = {"tqc": "dtqc", "dtqc": "tqc"}
 PLAIN = {"tqc": "sac", "dtqc": "td3"}  # a mean in place of quantiles
-ARMS = (
-    Arm("preset", "preset"),
-    Arm("no_quantiles", "no_quantiles"),
-    Arm("other_entropy", "other_entropy"),
-    Arm("one_critic", "one_critic", sizes={"num_critics": 1}),
-    Arm("no_layer_norm", "no_layer_norm", {"networks": "mlp"}),
-    Arm("one_step", "one_step", sizes={"n_step": 1}),
-    Arm("half_width", "half_width"),
-    Arm("half_batch", "half_batch"),
-    Arm("half_updates", "half_updates"),
-    Arm("no_eventful", "no_eventful", numbers={"priority_fraction": 0.0}),
-    Arm("ddpg", "ddpg", {"learner": "ddpg", "networks": "mlp"}, sizes={"n_step": 1}),
-)
-HALVES = {"half_width": "hidden_sizes", "half_batch": "batch_size", "half_updates": "updates_per_cycle"}
+
+
+def sized(run: RunSpec, **sizes: Any) -> RunSpec:
+    """Returns a run with other fields of its Config."""
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **sizes))
+
+
+def numbered(run: RunSpec, **numbers: float) -> RunSpec:
+    """Returns a run with other fields of its HParams."""
+    return dataclasses.replace(run, hparams=run.hparams._replace(**numbers))
+
+
+def other_entropy(run: RunSpec) -> RunSpec:
+    """Returns a run of `tqc` with entropy as one of `dtqc` without, or the other way round.
+
+    The numbers are those of the preset that has that learner: actions are not punished where entropy is paid for, and
+    targets are not smoothed.
+    """
+    if run.learner == "tqc":
+        return numbered(dataclasses.replace(run, learner="dtqc"), action_l2=1.0, target_noise=0.0)
+    return numbered(dataclasses.replace(run, learner="tqc"), action_l2=0.0, entropy_weight=0.1)
+
+
+# What an arm changes about the preset's run.
+CHANGES: dict[str, Callable[[RunSpec], RunSpec]] = {
+    "preset": lambda run: run,
+    "no_quantiles": lambda run: dataclasses.replace(run, learner=PLAIN[run.learner]),
+    "other_entropy": other_entropy,
+    "one_critic": lambda run: sized(run, num_critics=1),
+    "no_layer_norm": lambda run: dataclasses.replace(run, networks="mlp"),
+    "one_step": lambda run: sized(run, n_step=1),
+    "half_width": lambda run: sized(run, hidden_sizes=tuple(size // 2 for size in run.config.hidden_sizes)),
+    "half_batch": lambda run: sized(run, batch_size=run.config.batch_size // 2),
+    "half_updates": lambda run: sized(run, updates_per_cycle=run.config.updates_per_cycle // 2),
+    "no_eventful": lambda run: numbered(run, priority_fraction=0.0),
+    "ddpg": lambda run: numbered(sized(dataclasses.replace(run, learner="ddpg", networks="mlp"), n_step=1), action_l2=1.0),
+}
+ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's."""
-    run = presets.preset(learner, "slide" if toy else task)
-    sizes = {**({**TOY, "target_period": 10} if toy else SIZES["best", task].changes), **arm.sizes}
-    run = dataclasses.replace(run, env=task, config=dataclasses.replace(run.config, **sizes), **arm.parts)
-    if (field := HALVES.get(arm.name)) is not None:
-        run = dataclasses.replace(run, config=dataclasses.replace(run.config, **{field: half(getattr(run.config, field))}))
-    numbers = dict(arm.numbers)
-    if arm.name == "no_quantiles":
-        run = dataclasses.replace(run, learner=PLAIN[run.learner])
-    elif arm.name == "other_entropy":
-        run = dataclasses.replace(run, learner=ENTROPY[run.learner])
-        # As the preset that has that learner: actions are not punished where entropy is paid for, and targets not smoothed.
-        numbers = {"action_l2": 0.0, "entropy_weight": 0.1} if run.learner == "tqc" else {"action_l2": 1.0, "target_noise": 0.0}
-    elif arm.name == "ddpg":
-        numbers = {"action_l2": 1.0}
-    return dataclasses.replace(run, hparams=run.hparams._replace(**numbers))
+    run = dataclasses.replace(presets.preset(learner, "slide" if toy else task), env=task)
+    return CHANGES[arm.name](sized(run, **({**TOY, "target_period": 10} if toy else SIZES["best", task].changes)))
 
 
-def half(size: Any) -> Any:
-    """Returns half of a size, or of each of several."""
-    return tuple(map(half, size)) if isinstance(size, tuple) else size // 2
-
-
-def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Returns the minutes of one H200 that the runs take, as if each arm cost what the preset does, compilation included."""
-    each = [SIZES["best", task].seconds * seeds + COMPILE_SECONDS for task in tasks for _ in arms]
-    return len(learners) * sum(each) / 60
-
-
-ABLATION = Experiment(ARMS, ("gpu",), ("pick_and_place", "slide"), spec_of, estimated_minutes, "ablation.csv")
+ABLATION = Experiment(
+    arms=ARMS,
+    learners=("gpu",),
+    tasks=("pick_and_place", "slide"),
+    spec_of=spec_of,
+    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    table="ablation.csv",
+)
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, ABLATION, __doc__))

@@ -17,7 +17,7 @@ THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """A setting that is compared with `future`."""
+    """A setting that is compared with the baseline."""
 
     name: str
     # Arms of a group share a program. Those that ask the learner about the whole ring at each cycle, and those that draw four
@@ -25,7 +25,6 @@ class Arm:
     group: str
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
-    sizes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # fields of Config
     claim: str = ""
     source: str = ""
 

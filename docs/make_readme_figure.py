@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import functools
 from typing import Any
 
 import numpy as np
 import paper_set
+from paper_analysis import DOCS, NAMES, STEPS, Sweeps
 
 from mjx_dher import stats
 
-DOCS = Path(__file__).parent
 # Okabe and Ito's colours, and a line's style.
 STYLES = {
     "future": ("#0072B2", "-"),
@@ -18,17 +18,20 @@ STYLES = {
     "epsilon_closest": ("#009E73", "-."),
     "closest": ("#000000", ":"),
 }
+SAMPLERS = {"push": tuple(STYLES), "pick_and_place": ("future", "weighted"), "slide": ("future", "weighted")}
 # Task, its file, environment steps an epoch, and samplers.
-PANELS = (
-    ("Push", "push", 40_000, tuple(STYLES)),
-    ("PickAndPlace", "pick_and_place", 80_000, ("future", "weighted")),
-    ("Slide", "slide", 40_000, ("future", "weighted")),
-)
+PANELS = tuple((NAMES[task], task, STEPS[task], samplers) for task, samplers in SAMPLERS.items())
+
+
+@functools.cache
+def today() -> dict[str, Sweeps]:
+    """Returns the curves of the paper's experiment by task."""
+    return paper_set.current(paper_set.load_set(paper_set.FOLDER))
 
 
 def curves(task: str, sampler: str) -> np.ndarray:
     """Returns the success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper/TASK_curves.csv."""
-    return paper_set.current()[task]["samplers", sampler].success
+    return today()[task]["samplers", sampler].success
 
 
 def make() -> Any:

@@ -42,22 +42,25 @@ from mjx_dher import stats
 PAGE = DOCS / "results.md"
 
 
-def verdicts(data: Mapping[str, Sweeps]) -> str:
+def verdicts(the_set: Mapping[str, Sweeps]) -> str:
     """Returns the table of the paper's claims."""
+    data, s = paper_set.current(the_set), "samplers"
     push, pick = data["push"], data["pick_and_place"]
-    s = "samplers"
-    claim = [gain(sweeps, s, "weighted", "future") for sweeps in data.values()]
-    p_push, p_pick, _ = stats.holm([d.p for d in claim])
+    found = paper_set.compared(the_set)
+    claim = {result.comparison.task: result for result in found["the paper's claim"]}
     rows = [
-        ["Push: `weighted` converges sooner than `future`", *_success(claim[0], p=p_push)],
+        ["Push: `weighted` converges sooner than `future`", *_success(claim["push"].difference, p=claim["push"].p)],
         ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, s, START), 2)],
         ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, s, 0.9), 5)],
         ["Push: `epsilon_closest` is behind `future`", *_success(gain(push, s, "future", "epsilon_closest"))],
         ["Push: `closest` is behind `epsilon_closest`", *_success(gain(push, s, "epsilon_closest", "closest"))],
-        ["PickAndPlace: `weighted` converges sooner than `future`", *_success(claim[1], p=p_pick)],
+        [
+            "PickAndPlace: `weighted` converges sooner than `future`",
+            *_success(claim["pick_and_place"].difference, p=claim["pick_and_place"].p),
+        ],
         ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, s, START), 2)],
         ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, s, 0.9), 10)],
-        ["Slide: no noticeable difference", *_alike(claim[2])],
+        ["Slide: no noticeable difference", *_alike(claim["slide"].difference)],
         ["The first epochs are alike: Push, epochs 1 to 5", *_alike(window(push, s, slice(FIRST)))],
         ["... PickAndPlace, epochs 1 to 5", *_alike(window(pick, s, slice(FIRST)))],
     ]
@@ -65,15 +68,9 @@ def verdicts(data: Mapping[str, Sweeps]) -> str:
         start = "In the long term `weighted` is at least as good: " if task == "push" else "... "
         late = window(sweeps, s, slice(-LAST[task], None))
         rows.append([f"{start}{NAMES[task]}, last {LAST[task]} epochs", *_no_worse(late)])
-    degrades = {
-        task: difference(area(curves[16]), area(curves[8]))
-        for task, curves in paper_set.ks(paper_set.load_set(paper_set.FOLDER)).items()
-    }
-    whole = len(degrades) == len(NAMES)
-    corrected = stats.holm([d.p for d in degrades.values()]) if whole else [math.nan] * len(degrades)
-    for (task, d), p in zip(degrades.items(), corrected):
-        start = "k above 8 degrades, 16 against 8: " if task == "push" else "... "
-        rows.append([f"{start}{NAMES[task]}", *_success(d, -1, p)])
+    for result in found["k 16 against 8"]:
+        start = "k above 8 degrades, 16 against 8: " if result.comparison.task == "push" else "... "
+        rows.append([f"{start}{NAMES[result.comparison.task]}", *_success(result.difference, -1, result.p)])
     return table("the paper says | our estimate | 95 % interval | p | verdict", rows)
 
 
@@ -138,10 +135,10 @@ def samplers(data: Mapping[str, Sweeps]) -> str:
     return table(f"{head} | P(better than `future`) | p, corrected", rows)
 
 
-def ks() -> str:
+def ks(the_set: Mapping[str, Sweeps]) -> str:
     """Returns the table of hindsight goals."""
     rows = []
-    for task, curves in paper_set.ks(paper_set.load_set(paper_set.FOLDER)).items():
+    for task, curves in paper_set.ks(the_set).items():
         for k, own in curves.items():
             against = signed(difference(area(own), area(curves[4]))) if k != 4 else ["", "", ""]
             epochs = of(reach(own, THRESHOLDS[task]), 0, np.median)
@@ -169,7 +166,7 @@ def repeats(data: Mapping[str, Sweeps]) -> str:
             curves, threshold = sweeps[sweep, "future"], THRESHOLDS[task]
             success, epochs = gain(sweeps, sweep, "weighted", "future"), sooner(sweeps, sweep, threshold)
             length = curves.success.shape[1]
-            rows.append([NAMES[task] if sweep == MAIN else "", sweep, str(length), *signed(success), *signed(epochs, 1)[:2]])
+            rows.append([NAMES[task] if sweep == TODAY else "", sweep, str(length), *signed(success), *signed(epochs, 1)[:2]])
     return table(
         "task | sweep | epochs | mean success, `weighted` less `future` | 95 % interval | p | epochs sooner | 95 % interval",
         rows,
@@ -224,21 +221,22 @@ def field(data: Mapping[str, Sweeps]) -> str:
     return table("who | Push: to 0.90 | at the end | PickAndPlace: to 0.90 | at the end | Slide: to 0.60 | at the end", rows)
 
 
-MAIN = "today's preset"
-OF_TODAY: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"verdicts": verdicts, "samplers": samplers, "field": field}
+TODAY = "today's preset"  # the name of the set's sweeps among those of 2026-11-22
+OF_TODAY: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"samplers": samplers, "field": field}
 OF_BEFORE: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"kernels": kernels, "robustness": robustness}
 
 
-def blocks() -> dict[str, str]:
-    """Returns all tables by name."""
-    today, before = paper_set.current(), load()
+def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
+    """Returns all tables by name, of the curves of the set and of those of 2026-11-22."""
+    today = paper_set.current(the_set)
     found = {name: make(today) for name, make in OF_TODAY.items()} | {name: make(before) for name, make in OF_BEFORE.items()}
-    return {**found, "k": ks(), "repeats": repeats(with_repeats(today, before)), **paper_set.blocks(before)}
+    found |= {"verdicts": verdicts(the_set), "k": ks(the_set), "repeats": repeats(with_repeats(today, before))}
+    return found | paper_set.blocks(the_set, before)
 
 
 def with_repeats(today: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
-    """Returns the sweeps of both times by task, today's first, by the name MAIN."""
-    renamed = {task: {(MAIN, name): curves for (_, name), curves in sweeps.items()} for task, sweeps in today.items()}
+    """Returns the sweeps of both times by task, today's first, by the name TODAY."""
+    renamed = {task: {(TODAY, name): curves for (_, name), curves in sweeps.items()} for task, sweeps in today.items()}
     return {task: renamed[task] | dict(sweeps) for task, sweeps in before.items()}
 
 
@@ -258,8 +256,9 @@ def with_tables(page: str, blocks: Mapping[str, str]) -> str:
 
 def main() -> None:
     """Writes tables and pictures."""
-    PAGE.write_text(with_tables(PAGE.read_text(), blocks()))
-    paper_forest.draw(with_repeats(paper_set.current(), load()), DOCS / "images" / "paper_forest.png", MAIN)
+    the_set, before = paper_set.load_set(paper_set.FOLDER), load()
+    PAGE.write_text(with_tables(PAGE.read_text(), blocks(the_set, before)))
+    paper_forest.draw(with_repeats(paper_set.current(the_set), before), DOCS / "images" / "paper_forest.png", TODAY)
 
 
 if __name__ == "__main__":

@@ -122,5 +122,5 @@ def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats
 
 
 def load() -> dict[str, Sweeps]:
-    """Returns the curves of 2026-11-22 by task; `paper_set.current` has today's."""
+    """Returns the curves of 2026-11-22 by task; `paper_set.load_set` has later ones."""
     return {task: read(DOCS / f"paper_{task}_curves.csv") for task in NAMES}

@@ -61,11 +61,12 @@ def _panel(ax, lines: list[Line], main: str) -> None:
         y -= 0.32 if label == before else 1.0
         if label != before:
             ticks.append((y, label))
-        color, name = ("#1b62a5", "main") if sweep == main else ("#8fb8de", "")
-        first = "95 % interval, 2026-11-24" if not any(ax.get_legend_handles_labels()[1]) else None
-        repeated = "2026-11-22" if not name and "2026-11-22" not in ax.get_legend_handles_labels()[1] else None
-        ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if name else 1.6, solid_capstyle="butt")
-        ax.plot(d.mean, y, "o", color=color, markersize=6 if name else 4, label=first if name else repeated)
+        is_main = sweep == main
+        color = "#1b62a5" if is_main else "#8fb8de"
+        told = "95 % interval, 2026-11-24" if is_main else "2026-11-22"
+        label_of_dot = told if told not in ax.get_legend_handles_labels()[1] else None
+        ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if is_main else 1.6, solid_capstyle="butt")
+        ax.plot(d.mean, y, "o", color=color, markersize=6 if is_main else 4, label=label_of_dot)
         if claimed and label != before:
             told = "the paper, one seed" if "the paper, one seed" not in ax.get_legend_handles_labels()[1] else None
             ax.plot(claimed, [y] * len(claimed), "D-", color="#b3261e", markersize=6, label=told)

@@ -80,15 +80,15 @@ def load_set(folder: Path) -> dict[str, Sweeps]:
     return {task: read(path) for task in NAMES if (path := folder / f"{task}_curves.csv").is_file()}
 
 
-def current(folder: Path = FOLDER) -> dict[str, Sweeps]:
-    """Returns the curves of the sweeps that have `future` and `weighted`, by task, as of a sweep `samplers`.
+def current(data: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
+    """Returns of the set the sweeps that have `future` and `weighted`, by task, each as a sweep `samplers`.
 
     `epsilon_closest` is that with the preset's epsilon.
     """
     names = {f"epsilon_closest, epsilon {HParams().epsilon:g}": "epsilon_closest"}
     return {
         task: {("samplers", names.get(name, name)): curves for (sweep, name), curves in sweeps.items() if sweep == MAIN[task]}
-        for task, sweeps in load_set(folder).items()
+        for task, sweeps in data.items()
     }
 
 
@@ -104,15 +104,32 @@ def ks(data: Mapping[str, Sweeps]) -> dict[str, dict[int, Curves]]:
     return found
 
 
-def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
-    """Returns a row for each comparison whose curves are all there; a family is corrected once it is whole."""
-    found = []
+class Compared(NamedTuple):
+    """What a comparison came to."""
+
+    comparison: Comparison
+    difference: Difference
+    epochs: int
+    p: float  # corrected over the family, and NaN until that is whole
+
+
+def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
+    """Returns by family what each comparison came to whose curves are all there."""
+    found = {}
     for family, comparisons in FAMILIES.items():
         ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
         differences = [_compare(data[c.task], c) for c in ready]
         p_values = [d.p for d, _ in differences]
         corrected = stats.holm(p_values) if len(ready) == len(comparisons) else [math.nan] * len(ready)
-        for c, (d, epochs), p in zip(ready, differences, corrected):
+        found[family] = [Compared(c, *d, p) for c, d, p in zip(ready, differences, corrected)]
+    return found
+
+
+def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
+    """Returns a row for each comparison whose curves are all there."""
+    found = []
+    for family, results in compared(data).items():
+        for c, d, epochs, p in results:
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
             said = ["", "open"] if math.isnan(p) else [number(p), verdict(d.low, d.high, p)]
             found.append([family, *cells, *said])
@@ -171,7 +188,7 @@ def power(data: Mapping[str, Sweeps]) -> str:
     return table(f"task | measure | spread of paired differences | {' | '.join(SIZES.values())}", rows)
 
 
-def blocks(data: Mapping[str, Sweeps], folder: Path = FOLDER) -> dict[str, str]:
-    """Returns the tables of the set and of its power; `data` are the curves that the power is computed from."""
-    found = rows(load_set(folder))
-    return {"set": table(HEAD, found) if found else "Not run yet: there are no curves in docs/paper.", "power": power(data)}
+def blocks(data: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
+    """Returns the tables of the set, `data`, and of its power, which is computed from the curves before it."""
+    found = rows(data)
+    return {"set": table(HEAD, found) if found else "Not run yet: there are no curves in docs/paper.", "power": power(before)}

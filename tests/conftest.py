@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import socket
 import sys
 import time
 import zlib
@@ -52,6 +53,13 @@ def load_recorded(task):
     """Episodes of the original task; see tests/data/README.md."""
     with np.load(ROOT / "tests" / "data" / f"fetch_{task}.npz") as file:
         return {name: file[name] for name in file.files}
+
+
+def free_port():
+    """Returns a port of this machine at which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="session")

@@ -7,18 +7,12 @@ import time
 
 import numpy as np
 import pytest
+from conftest import free_port
 
 from mjx_dher.cli import main
 from mjx_dher.cli.hosts import Hosts, first_node
 from mjx_dher.host import line
 from mjx_dher.runs import team
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
 
 JAX = {"JAX_COORDINATOR_ADDRESS": "gpu1:8000", "JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
 SLURM = {

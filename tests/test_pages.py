@@ -13,6 +13,8 @@ sys.path[:0] = [str(ROOT / "docs")]
 
 import make_results_figures  # noqa: E402
 import make_samplers_figure  # noqa: E402
+import paper_analysis  # noqa: E402
+import paper_set  # noqa: E402
 
 PAGES = sorted(
     path
@@ -65,7 +67,8 @@ def test_a_broken_table_would_be_noticed(text, problems):
 
 def test_the_tables_of_results_are_those_of_the_curves():
     page = make_results_figures.PAGE.read_text()
-    assert make_results_figures.with_tables(page, make_results_figures.blocks()) == page
+    tables = make_results_figures.blocks(paper_set.load_set(paper_set.FOLDER), paper_analysis.load())
+    assert make_results_figures.with_tables(page, tables) == page
 
 
 def test_each_table_of_results_with_numbers_is_made_from_the_curves():

@@ -4,24 +4,17 @@ import csv
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import time
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, free_port
 
 from mjx_dher.host import line
 from mjx_dher.runs import sinks
 
 pytestmark = pytest.mark.slow
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 REACH = (
@@ -117,7 +110,7 @@ def test_processes_with_other_settings_are_refused_before_anything_is_trained(tm
 
 
 def both(port, *arguments):
-    """What two processes with the same arguments print; they must end well."""
+    """Returns what two processes with the same arguments print; they must end well."""
     pair = [call(number, port, *arguments) for number in (0, 1)]
     outputs = [process.communicate(timeout=500)[0] for process in pair]
     assert [process.returncode for process in pair] == [0, 0], outputs
@@ -125,7 +118,7 @@ def both(port, *arguments):
 
 
 def test_two_processes_share_the_runs_of_a_sweep(tmp_path):
-    """Each trains runs of its own; the first writes all, and the tables are those of one program on two devices."""
+    """Each trains runs of its own; the first writes all, and the curves are those of one program."""
     arguments = ("sweep", *REACH, "--total-steps", "800", "--sampler", "future", "closest", "--seeds", "2")
     _, second = both(free_port(), *arguments, "--out", tmp_path / "two", "--devices", "all")
     assert "epoch" not in second

@@ -101,7 +101,7 @@ class SweepArgs:
     """Runs of each setting; every setting has the same seeds, and so the same first networks and resets."""
     first_seed: int = 0
     """First seed; the others follow it."""
-    preset: Literal["auto", "cpu", "gpu", "frugal", "paper"] = "auto"
+    preset: Literal["auto", presets.Preset] = "auto"
     """Settings that other options override: cpu, gpu, frugal, paper, or auto, the one for this machine."""
     lanes: int | None = None
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""

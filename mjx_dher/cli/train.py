@@ -34,7 +34,7 @@ from mjx_dher.host import files
 from mjx_dher.host.caches import check_platform, prepare
 from mjx_dher.host.files import FolderError
 from mjx_dher.names import check_name
-from mjx_dher.presets import PRESETS
+from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs import curves, identity, results, run_folder, sinks
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
@@ -55,7 +55,7 @@ class TrainArgs:
     """
 
     spec: RunSpec
-    preset: Literal["auto", "cpu", "gpu", "frugal", "paper"] = "auto"
+    preset: Literal["auto", Preset] = "auto"
     """Settings that other options override: cpu or gpu (tuned for time to success there), auto (the one for this machine),
     frugal (few environment steps) or paper (the paper's settings; docs/results.md has a table)."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None

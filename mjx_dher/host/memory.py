@@ -11,7 +11,7 @@ _HEAPS_A_CORE = 2
 
 
 def available_bytes() -> int | None:
-    """Returns the bytes that the default device can still allocate, or None where they are unknown.
+    """Returns the bytes that this process's first device can still allocate, or None where they are unknown.
 
     On a CPU: the free memory of the machine, or of the container if that is less (Linux only).
     """
@@ -26,7 +26,7 @@ def available_bytes() -> int | None:
 
 
 def used_bytes() -> int | None:
-    """Returns the bytes that JAX uses on the default device, or on a CPU this process (Linux only). None where unknown."""
+    """Returns the bytes that JAX uses on this process's first device; on a CPU, its own (Linux only). None where unknown."""
     import jax
 
     device = jax.local_devices()[0]
