@@ -27,6 +27,7 @@ from rich.console import Console
 
 from mjx_dher import envs, stats
 from mjx_dher.cli.common import Screen, make_env
+from mjx_dher.cli.settings import check_writable
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
 from mjx_dher.runs import identity, run_folder
@@ -64,6 +65,11 @@ def parse(
         parser.error(f"--first-seed must lie between 0 and {2**32 - 1001}; got {args.first_seed}")
     if not args.minutes > 0:
         parser.error(f"--minutes must be more than 0; got {args.minutes}")
+    if not (args.plan or args.report):
+        try:
+            check_writable(args.out)
+        except files.FolderError as error:
+            parser.error(str(error))
     if args.toy:
         args.learners, args.tasks = learners[:1], (TOY_TASK,)
         sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))

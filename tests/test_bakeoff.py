@@ -122,6 +122,7 @@ def test_arms_are_compared_seed_by_seed(report, arms):
     assert energy.p_value == 2 / 1024
     assert energy.p_corrected == 2 * 2 / 1024
     assert hgg.p_corrected == hgg.p_value > 0.5
+    assert energy.smallest_effect == report.smallest_effect(float((ahead - base).std(ddof=1)), 10, 2)  # of two arms
     assert energy.low > 0.02 > hgg.low
     assert energy.steps_to_threshold == np.median(np.where(ahead > 0.5, 1000.0, np.inf))
 
@@ -159,6 +160,7 @@ def test_forests_are_drawn(report, arms, tmp_path):
         (["--first-seed", "-1"], "--first-seed must lie"),
         (["--minutes", "nan"], "--minutes must be more than 0"),
         (["--arms", "energi"], "invalid choice"),
+        (["--out", "/proc/x"], "cannot be written to"),
     ],
 )
 def test_wrong_arguments_are_refused(bakeoff, capsys, argv, message):
