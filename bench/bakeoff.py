@@ -6,7 +6,8 @@
     python bench/bakeoff.py --out toy --toy --seeds 3   the same on the point mass, on a CPU in minutes
 
 Each learner and task is a sweep in a folder of its own (`python train.py plot bakeoff/paper-slide` draws it, too). The report
-is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. docs/what_helps.md says beforehand what is compared.
+is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. p is corrected over the arms that --arms names.
+Sweeps of several machines are one when their cells lie in one folder. docs/what_helps.md says beforehand what is compared.
 """
 
 from __future__ import annotations
@@ -177,7 +178,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
     for task in args.tasks:
         for learner in args.learners:
             scores = read(args, learner, task)
-            rows += compare(learner, task, scores, args.experiment.arms) if args.experiment.baseline in scores else []
+            rows += compare(learner, task, scores, args.arms) if args.experiment.baseline in scores else []
     if not rows:
         console.print(f"{args.out}: no run of `{args.experiment.baseline}` has ended, and so nothing can be compared yet")
         return 0
@@ -195,13 +196,17 @@ def report(args: argparse.Namespace, console: Console) -> int:
 
 
 def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
-    """Plans, trains and reports; 0 where all is done, 3 where runs are left for the same command."""
+    """Plans, trains and reports; 0: all is done, 2: a folder cannot be used, 3: the same command has runs left."""
     args, console = parse(argv, experiment, about), Console(highlight=False, soft_wrap=True)
     if args.plan:
         plan(args, console)
         return 0
-    done = args.report or train(args, console)
-    report(args, console)
+    try:
+        done = args.report or train(args, console)
+        report(args, console)
+    except files.FolderError as error:
+        console.print(f"error: {error}", style="red")
+        return 2
     if not done:
         console.print("stopped; the same command goes on")
     return 0 if done else 3

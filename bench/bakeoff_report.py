@@ -46,7 +46,7 @@ class Row(NamedTuple):
     better_low: float
     better_high: float
     p_value: float
-    p_corrected: float  # by Holm's method, over all arms of a learner and task
+    p_corrected: float  # by Holm's method, over all arms of a learner and task; the p of one that has not been run counts as 1
     smallest_effect: float  # that would be seen four times in five, for this spread of the differences
     claim: str
     source: str
@@ -77,12 +77,16 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
 
 
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm]) -> list[Row]:
-    """Returns a row an arm: each against the first of `arms` on the seeds that both have."""
-    base = scores[arms[0].name]
-    scored = [arm for arm in arms if arm.name in scores]
-    rows = [_row(learner, task, arm, scores[arm.name], base, len(scored) - 1) for arm in scored]
+    """Returns a row an arm that has scores, each against the first of `arms` on the seeds that both have.
+
+    p is corrected over all of `arms`: what has not been run yet counts with a p of 1, so that no corrected p becomes larger
+    when it has been.
+    """
+    base, tests = scores[arms[0].name], len(arms) - 1
+    rows = [_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores]
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
-    for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested]) if tested else []):
+    p_values = [rows[number].p_value for number in tested]
+    for number, p in zip(tested, stats.holm([*p_values, *[1.0] * (tests - len(tested))])):
         rows[number] = rows[number]._replace(p_corrected=p)
     return rows
 

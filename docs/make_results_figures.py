@@ -1,4 +1,4 @@
-"""Writes the tables and the forest plot of docs/results.md from the committed curves: `python docs/make_results_figures.py`.
+"""Writes the tables and the forest plots of docs/results.md from the committed curves: `python docs/make_results_figures.py`.
 
 A table stands in the page between `<!-- NAME: docs/make_results_figures.py -->` and `<!-- end of NAME -->`. The curves are
 those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, docs/paper_TASK_curves.csv.
@@ -259,6 +259,7 @@ def main() -> None:
     the_set, before = paper_set.load_set(paper_set.FOLDER), load()
     PAGE.write_text(with_tables(PAGE.read_text(), blocks(the_set, before)))
     paper_forest.draw(with_repeats(paper_set.current(the_set), before), DOCS / "images" / "paper_forest.png", TODAY)
+    paper_forest.draw_set(paper_set.compared(the_set), DOCS / "images" / "set_forest.png")
 
 
 if __name__ == "__main__":

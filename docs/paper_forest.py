@@ -1,14 +1,23 @@
-"""The forest plot of docs/results.md: `weighted` against `future`, in every sweep of every task."""
+"""The forest plots of docs/results.md: `weighted` against `future` in every sweep of every task, and the set's comparisons."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from paper_analysis import LAST, NAMES, START, THRESHOLDS, Difference, Sweeps, gain, sooner, window
+from paper_analysis import LAST, MARGIN, NAMES, START, THRESHOLDS, Difference, Sweeps, gain, sooner, window
+from paper_set import Compared
 
 REPEATED = ("samplers", "fast", "hopper", "hopper again")  # those whose runs are whole
 CLAIMED = {("push", START): (2, 3), ("push", 0.9): (5, 5), ("pick_and_place", START): (2, 3), ("pick_and_place", 0.9): (10, 10)}
+SHOWN = (-0.3, 0.18)  # differences that the picture of the set has room for
+WORDS = {
+    "future, ": "",
+    "her_k": "k",
+    "epsilon_closest, epsilon": "method 2, ε",
+    "priority_fraction 0.5": "half of each batch eventful",
+}
 Line = tuple[str, str, Difference, "tuple[float, float] | None"]  # label, sweep, difference, what the paper claims
 
 
@@ -52,6 +61,45 @@ def draw(data: Mapping[str, Sweeps], path: Path, main: str) -> None:
     figure.legend(*axes[1].get_legend_handles_labels(), loc="lower center", ncols=3, frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
+    """Draws every comparison of the set, a panel a task; dark where p, corrected over its family, is below 0.05."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    every = [result for results in found.values() for result in results]
+    names = list(dict.fromkeys(_short(result) for result in every))
+    figure, axes = plt.subplots(1, len(NAMES), figsize=(12, 1.4 + 0.26 * len(names)), sharey=True)
+    for ax, (task, title) in zip(axes, NAMES.items()):
+        for result in (result for result in every if result.comparison.task == task):
+            y, d = -names.index(_short(result)), result.difference
+            color = "#1b62a5" if result.p < 0.05 else "#b8860b" if math.isnan(result.p) else "#9aa5b1"
+            if d.high < SHOWN[0]:
+                ax.annotate(f"◂ {d.mean:+.2f}", (SHOWN[0], y), color=color, va="center")
+                continue
+            ax.plot([d.low, d.high], [y, y], color=color, linewidth=2)
+            ax.plot(d.mean, y, "o", color=color, markersize=5)
+        ax.axvline(0, color="#1c232b", linewidth=0.8)
+        ax.axvspan(-MARGIN, MARGIN, color="#eef2f6", zorder=0)
+        ax.set(title=title, xlim=SHOWN, xlabel="mean success, difference")
+        ax.grid(axis="y", alpha=0.25)
+        ax.spines[["top", "right", "left"]].set_visible(False)
+        ax.tick_params(axis="y", length=0)
+    axes[0].set_yticks([-place for place in range(len(names))], names)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _short(result: Compared) -> str:
+    """Returns a comparison's name in the picture: its setting, and what it is compared with unless that is `future`."""
+    setting, against = (result.comparison.setting, (result.comparison.against or ("", ""))[1])
+    for name, word in WORDS.items():
+        setting, against = setting.replace(name, word), against.replace(name, word)
+    return f"{setting}, against {against}" if against else setting
 
 
 def _panel(ax, lines: list[Line], main: str) -> None:

@@ -130,7 +130,7 @@ def _frugal(env: str) -> tuple[Config, HParams]:
 
 def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu_pick_and_place(env)
-    return dataclasses.replace(config, num_envs=64, total_steps=500_000, replay_size=500_000), hparams
+    return dataclasses.replace(config, num_envs=64, n_step=1, total_steps=500_000, replay_size=500_000), hparams
 
 
 def _frugal_slide(env: str) -> tuple[Config, HParams]:

@@ -11,6 +11,7 @@ from markdown_it import MarkdownIt
 
 sys.path[:0] = [str(ROOT / "docs")]
 
+import make_ablation_table  # noqa: E402
 import make_results_figures  # noqa: E402
 import make_samplers_figure  # noqa: E402
 import paper_analysis  # noqa: E402
@@ -83,6 +84,11 @@ def test_each_table_of_results_with_numbers_is_made_from_the_curves():
 def test_the_table_of_readings_is_what_the_weights_are():
     page = make_samplers_figure.PAGE.read_text()
     assert make_samplers_figure.with_table(page) == page
+
+
+def test_the_table_of_the_ablation_is_that_of_its_report():
+    page = make_ablation_table.PAGE.read_text()
+    assert make_ablation_table.with_table(page, make_ablation_table.read(make_ablation_table.DATA)) == page
 
 
 def test_readings_by_formula():
