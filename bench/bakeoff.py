@@ -7,7 +7,8 @@
 
 Each learner and task is a sweep in a folder of its own (`python train.py plot bakeoff/paper-slide` draws it, too). The report
 is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. p is corrected over the arms that --arms names.
-Sweeps of several machines are one when their cells lie in one folder. docs/what_helps.md says beforehand what is compared.
+A row a run is in bakeoff_runs.csv: `--runs FILE` goes on from it elsewhere, where the folders are not.
+docs/what_helps.md says beforehand what is compared.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from bakeoff_arms import BAKEOFF, THRESHOLDS, Experiment
-from bakeoff_report import Row, Scores, compare, forest
+from bakeoff_report import Row, compare, forest
+from bakeoff_runs import Run, by_arm, load, merged, save
 from rich.console import Console
 
 from mjx_dher import envs, stats
@@ -31,7 +33,7 @@ from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.host import files
 from mjx_dher.host.caches import prepare
-from mjx_dher.runs import identity, run_folder
+from mjx_dher.runs import identity, results, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.stopping import Stop
 from mjx_dher.spec import RunSpec, validate
@@ -56,6 +58,9 @@ def parse(
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop, to go on later, after the epoch that ends then")
     parser.add_argument("--plan", action="store_true", help="say what would be trained, and train nothing")
     parser.add_argument("--report", action="store_true", help="report what has ended, and train nothing")
+    parser.add_argument(
+        "--runs", type=Path, nargs="+", default=(), help="runs that have ended elsewhere: *_runs.csv of a report"
+    )
     parser.add_argument("--toy", action="store_true", help="the point mass, tiny networks: tries the mechanics on a CPU")
     args = parser.parse_args(argv)
     for name in ("seeds", "lanes"):
@@ -76,6 +81,10 @@ def parse(
         sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
     args.arms = [arm for arm in experiment.arms if arm.name in (experiment.baseline, *args.arms)]
     args.experiment = experiment
+    try:
+        args.known = [run for path in args.runs for run in load(path, experiment)]
+    except files.FolderError as error:
+        parser.error(str(error))
     return args
 
 
@@ -99,7 +108,7 @@ def plan(args: argparse.Namespace, console: Console) -> None:
         for task in args.tasks:
             folder = folder_of(args, learner, task)
             runs = [run for group in args.experiment.groups for run in trials_of(args, learner, task, group)]
-            done = sum(grid.is_done(folder, run) for run in runs)
+            done = sum(is_done(args, folder, run) for run in runs)
             steps = runs[0].config.total_steps
             console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} of them done; learner {runs[0].learner}")
     if not args.toy:
@@ -129,7 +138,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
     """Trains the runs of a group that are not done, in one program; returns whether all of them are."""
     learner, task, group = which
     folder = folder_of(args, learner, task)
-    todo = [run for run in trials_of(args, learner, task, group) if not grid.is_done(folder, run)]
+    todo = [run for run in trials_of(args, learner, task, group) if not is_done(args, folder, run)]
     if not todo:
         return True
     files.make_folder(folder / grid.CELLS)
@@ -148,40 +157,55 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
         )
     finally:
         screen.close()
-    return all(grid.is_done(folder, run) for run in todo)
+    return all(is_done(args, folder, run) for run in todo)
 
 
-def read(args: argparse.Namespace, learner: str, task: str) -> dict[str, Scores]:
-    """Returns what the runs that have ended came to, by arm; empty where there are none."""
+def is_done(args: argparse.Namespace, folder: Path, run: RunSpec) -> bool:
+    """Returns whether a run has ended, in its folder or as one of --runs."""
+    return identity.trial_name(run) in {known.name for known in args.known} or grid.is_done(folder, run)
+
+
+def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
+    """Returns what the runs that have ended came to, those of --runs after those of the sweep's own folder."""
     folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
-    if not any((folder / grid.CELLS).glob("*/result.json")):
-        return {}
     wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
-    by_arm: dict[str, list[dict[str, Any]]] = {}
-    for trial in tables.read(folder):
+    trials: dict[str, list[dict[str, Any]]] = {}
+    for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
         _, spec = run_folder.read(trial["folder"])
-        if (name := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
-            by_arm.setdefault(name, []).append(trial)
-    return {name: _scores(task, name, by_arm[name], threshold) for name in wanted.values() if name in by_arm}
+        if (arm := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
+            trials.setdefault(arm, []).append(trial)
+    own = [run for arm in wanted.values() if arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]
+    return merged([*own, *(run for run in args.known if (run.learner, run.task) == (learner, task))])
 
 
-def _scores(task: str, name: str, trials: list[dict[str, Any]], threshold: float) -> Scores:
+def _runs(which: tuple[str, str, str], trials: list[dict[str, Any]], threshold: float) -> list[Run]:
     (groups,) = comparison.groups(trials).values()
     (group,) = groups
+    area = stats.area_under_curve(group.epoch, group.success)
     reach = stats.first_reach(group.env_steps, group.success, threshold)
-    return Scores(group.seeds, stats.area_under_curve(group.epoch, group.success), group.final, reach, group.failed)
+    by_seed = {trial["seed"]: trial for trial in trials}
+    return [
+        Run(
+            *which, seed, Path(by_seed[seed]["folder"]).name, int(by_seed[seed]["status"] == results.FAILED), *map(float, found)
+        )
+        for seed, *found in zip(group.seeds, area, group.final, reach)
+    ]
 
 
 def report(args: argparse.Namespace, console: Console) -> int:
     """Writes the table and a forest plot a task of what has ended; returns the number of rows."""
     rows: list[Row] = []
+    runs: list[Run] = []
     for task in args.tasks:
         for learner in args.learners:
-            scores = read(args, learner, task)
+            runs += (own := read(args, learner, task))
+            scores = by_arm(own)
             rows += compare(learner, task, scores, args.arms) if args.experiment.baseline in scores else []
     if not rows:
         console.print(f"{args.out}: no run of `{args.experiment.baseline}` has ended, and so nothing can be compared yet")
         return 0
+    save(args.out / args.experiment.runs, runs)
+    console.print(f"wrote {args.out / args.experiment.runs}, {len(runs)} runs")
     with files.atomic_write(args.out / args.experiment.table) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(Row._fields)

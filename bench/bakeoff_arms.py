@@ -43,7 +43,12 @@ class Experiment:
     tasks: tuple[str, ...]
     spec_of: Callable[[str, str, Arm, bool], Any]  # the RunSpec of a learner, task and arm, seed 0; the last one: as a toy
     minutes: Callable[[tuple[str, ...], tuple[str, ...], tuple[Arm, ...], int], float]  # of one H200, by an estimate
-    table: str
+    table: str  # name of the report's table
+
+    @property
+    def runs(self) -> str:
+        """The name of the report's file of runs."""
+        return self.table.replace(".csv", "_runs.csv")
 
     @property
     def baseline(self) -> str:

@@ -1,11 +1,10 @@
 """Writes the table of bench/ablation.py in docs/learners.md, and its pictures: `python docs/make_ablation_table.py`.
 
-They are made from docs/ablation.csv, which `bench/ablation.py` writes as ablation.csv into the folder of its runs.
+They are made from docs/ablation_runs.csv, which `bench/ablation.py` writes into the folder of its sweeps.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 import sys
 from pathlib import Path
@@ -15,21 +14,21 @@ from paper_set import verdict
 
 sys.path.append(str(DOCS.parent / "bench"))
 
-from bakeoff_report import Row, forest
+from ablation import ABLATION
+from bakeoff_report import Row, compare, forest
+from bakeoff_runs import by_arm, load
 
-PAGE, DATA, IMAGES = DOCS / "learners.md", DOCS / "ablation.csv", DOCS / "images"
+PAGE, DATA, IMAGES = DOCS / "learners.md", DOCS / "ablation_runs.csv", DOCS / "images"
 BEGIN, END = "<!-- ablation: docs/make_ablation_table.py -->\n", "<!-- end of ablation -->"
-BASELINE = "preset"
 HEAD = "task | arm | mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
-WORDS = ("learner", "task", "arm", "claim", "source")
 
 
 def read(path: Path) -> list[Row]:
-    """Returns the rows of the report."""
-    with path.open(newline="") as file:
-        return [
-            Row(**{name: text if name in WORDS else float(text) for name, text in row.items()}) for row in csv.DictReader(file)
-        ]
+    """Returns what a file of runs says of each arm, task by task."""
+    runs, (learner,) = load(path), ABLATION.learners
+    tasks = [task for task in ABLATION.tasks if any(run.task == task for run in runs)]
+    scores = {task: by_arm(run for run in runs if run.task == task) for task in tasks}
+    return [row for task in tasks for row in compare(learner, task, scores[task], ABLATION.arms)]
 
 
 def cells(row: Row, first: bool) -> list[str]:
@@ -56,7 +55,7 @@ def main() -> None:
     rows = read(DATA)
     PAGE.write_text(with_table(PAGE.read_text(), rows))
     for task in dict.fromkeys(row.task for row in rows):
-        forest([row for row in rows if row.task == task], IMAGES / f"ablation_{task}.png", BASELINE)
+        forest([row for row in rows if row.task == task], IMAGES / f"ablation_{task}.png", ABLATION.baseline)
 
 
 if __name__ == "__main__":

@@ -195,6 +195,83 @@ def test_nothing_to_report_is_said(bakeoff, tmp_path, capsys):
     assert "nothing can be compared yet" in capsys.readouterr().out
 
 
+@pytest.fixture
+def ended(ablation):
+    """Runs of two arms of the ablation that have ended elsewhere."""
+    import bakeoff_runs
+
+    specs = {arm.name: ablation.spec_of("gpu", "slide", arm) for arm in ablation.ARMS[:2]}
+    made = [(arm, seed, bakeoff_runs.name_of(spec, seed)) for arm, spec in specs.items() for seed in range(10)]
+    return [
+        bakeoff_runs.Run("gpu", "slide", arm, seed, name, 0, round(0.25 + seed / 100, 2), 0.5, math.inf)
+        for arm, seed, name in made
+    ]
+
+
+def test_runs_are_read_as_they_were_written(ablation, ended, tmp_path):
+    import bakeoff_runs
+
+    bakeoff_runs.save(tmp_path / "runs.csv", ended)
+    assert bakeoff_runs.load(tmp_path / "runs.csv", ablation.ABLATION) == ended
+    assert bakeoff_runs.merged([*ended, ended[0]._replace(final=0.9)]) == ended
+    scores = bakeoff_runs.by_arm(reversed(ended))["no_quantiles"]
+    assert scores.seeds == tuple(range(10))
+    np.testing.assert_allclose(scores.area, 0.25 + np.arange(10) / 100)
+
+
+def test_runs_that_have_ended_elsewhere_are_not_trained_again(bakeoff, ablation, ended, tmp_path, capsys):
+    import bakeoff_runs
+
+    bakeoff_runs.save(tmp_path / "runs.csv", ended)
+    argv = ["--out", str(tmp_path / "a"), "--tasks", "slide", "--runs", str(tmp_path / "runs.csv")]
+    assert bakeoff.main([*argv, "--plan"], ablation.ABLATION) == 0
+    assert "110 runs of 1,740,800 steps, 20 of them done" in capsys.readouterr().out
+    (tmp_path / "a").mkdir()
+    assert bakeoff.main([*argv, "--report"], ablation.ABLATION) == 0
+    assert (tmp_path / "a" / "ablation_runs.csv").read_text() == (tmp_path / "runs.csv").read_text()
+    with (tmp_path / "a" / "ablation.csv").open() as file:
+        assert [(row["arm"], row["seeds"], row["p_corrected"]) for row in csv.DictReader(file)] == [
+            ("preset", "10", "nan"),
+            ("no_quantiles", "10", "1"),
+        ]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("name", "slide-future-s0-0123456789", "has other settings than preset has today (slide-future-s0-"),
+        ("seed", 3, "has other settings than preset has today"),
+        ("arm", "no_such", "arm must be one of preset, no_quantiles"),
+        ("task", "push", "task must be one of pick_and_place, slide; got 'push'"),
+        ("final", 1.5, "success must lie between 0 and 1"),
+        ("mean_success", math.nan, "success must lie between 0 and 1"),
+        ("steps", "many", "could not convert string to float: 'many'"),
+        ("failed", 2, "failed be 0 or 1"),
+    ],
+)
+def test_runs_that_are_none_of_the_experiment_are_refused(bakeoff, ablation, ended, tmp_path, capsys, column, value, message):
+    import bakeoff_runs
+
+    bakeoff_runs.save(tmp_path / "runs.csv", [ended[0]._replace(**{column: value})])
+    with pytest.raises(SystemExit) as stopped:
+        bakeoff.main(["--out", str(tmp_path / "a"), "--plan", "--runs", str(tmp_path / "runs.csv")], ablation.ABLATION)
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [(None, "cannot be read"), ("a,b\n1,2\n", "has not the columns learner, task"), (b"\xff\x00", "cannot be read")],
+)
+def test_a_file_without_runs_is_refused(bakeoff, ablation, tmp_path, capsys, text, message):
+    path = tmp_path / "runs.csv"
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SystemExit):
+        bakeoff.main(["--out", str(tmp_path / "a"), "--report", "--runs", str(path)], ablation.ABLATION)
+    assert message in capsys.readouterr().err.replace("\n", " ")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["bakeoff", "ablation"])
 def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):

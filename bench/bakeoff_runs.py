@@ -1,0 +1,118 @@
+"""The runs of bench/bakeoff.py as rows of a file: all that is compared, without the folders that they were trained in."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from bakeoff_arms import Experiment
+from bakeoff_report import Scores
+
+from mjx_dher.host import files
+from mjx_dher.host.files import FolderError
+from mjx_dher.runs import identity
+from mjx_dher.spec import RunSpec
+
+
+class Run(NamedTuple):
+    """What a run came to."""
+
+    learner: str
+    task: str
+    arm: str
+    seed: int
+    name: str  # of its folder, which has a digest of its settings
+    failed: int  # 1 where it failed
+    mean_success: float  # over the epochs
+    final: float  # success of the last policy
+    steps: float  # environment steps to the threshold; infinite where it is never reached
+
+
+def save(path: Path, runs: Iterable[Run]) -> None:
+    """Writes runs, a row each."""
+    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(Run._fields)
+        writer.writerows([f"{value:.12g}" if isinstance(value, float) else value for value in run] for run in runs)
+
+
+def load(path: Path, experiment: Experiment | None = None) -> list[Run]:
+    """Returns the runs of a file that `save` has written.
+
+    Raises:
+      FolderError: no such file, a row that is none, or a run whose settings are not those of the `experiment`'s arm today.
+    """
+    try:
+        with path.open(newline="") as file:
+            rows = csv.DictReader(file)
+            if tuple(rows.fieldnames or ()) != Run._fields:
+                raise FolderError(f"{path} has not the columns {', '.join(Run._fields)}")
+            found = [_run(f"{path}, line {number}", row) for number, row in enumerate(rows, start=2)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FolderError(f"{path} cannot be read ({error})") from error
+    if experiment is not None:
+        for number, run in enumerate(found, start=2):
+            _check(f"{path}, line {number}", run, experiment)
+    return found
+
+
+def _run(where: str, row: dict[str, str]) -> Run:
+    """Returns the run of a row; raises FolderError for one that is none."""
+    try:
+        run = Run(
+            *(row[name] for name in ("learner", "task", "arm")),
+            int(row["seed"]),
+            row["name"],
+            int(row["failed"]),
+            *(float(row[name]) for name in ("mean_success", "final", "steps")),
+        )
+    except (TypeError, ValueError) as error:
+        raise FolderError(f"{where}: {error}") from error
+    if not (0 <= run.mean_success <= 1 and 0 <= run.final <= 1 and run.steps > 0 and run.failed in (0, 1)):
+        raise FolderError(f"{where}: success must lie between 0 and 1, steps above 0, failed be 0 or 1; got {run[5:]}")
+    return run
+
+
+def _check(where: str, run: Run, experiment: Experiment) -> None:
+    """Raises FolderError for a run that the experiment does not have, or has with other settings."""
+    arms = {arm.name: arm for arm in experiment.arms}
+    for column, values in {"learner": experiment.learners, "task": experiment.tasks, "arm": tuple(arms)}.items():
+        if getattr(run, column) not in values:
+            raise FolderError(f"{where}: {column} must be one of {', '.join(values)}; got {getattr(run, column)!r}")
+    today = name_of(experiment.spec_of(run.learner, run.task, arms[run.arm], False), run.seed)
+    if run.name != today:
+        raise FolderError(f"{where}: {run.name} has other settings than {run.arm} has today ({today}); remove the row")
+
+
+def name_of(spec: RunSpec, seed: int) -> str:
+    """Returns the name of the folder of a run with this seed."""
+    return identity.trial_name(dataclasses.replace(spec, seed=seed))
+
+
+def merged(runs: Iterable[Run]) -> list[Run]:
+    """Returns the runs, each once: the first of each name."""
+    found: dict[str, Run] = {}
+    for run in runs:
+        found.setdefault(run.name, run)
+    return list(found.values())
+
+
+def by_arm(runs: Iterable[Run]) -> dict[str, Scores]:
+    """Returns the scores of the runs of one learner and task by arm, ordered by seed."""
+    found: dict[str, list[Run]] = {}
+    for run in sorted(runs, key=lambda run: run.seed):
+        found.setdefault(run.arm, []).append(run)
+    return {
+        arm: Scores(
+            seeds=tuple(run.seed for run in own),
+            area=np.array([run.mean_success for run in own]),
+            final=np.array([run.final for run in own]),
+            steps=np.array([run.steps for run in own]),
+            failed=sum(run.failed for run in own),
+        )
+        for arm, own in found.items()
+    }
