@@ -6,7 +6,6 @@ those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, do
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping
 
@@ -77,12 +76,12 @@ def verdicts(the_set: Mapping[str, Sweeps]) -> str:
 def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
     """Returns the cells of a claim that success is larger, or smaller where `sign` is -1.
 
-    `p` is corrected over the claim's family: NaN where that is not whole, None where the claim is in none.
+    `p` is corrected over the claim's family, None where the claim is in none.
     """
     low, high = sorted((sign * d.low, sign * d.high))
     verdict = "**yes**" if low > 0 else "**no**, the opposite" if high < 0 else "not shown"
     if p is not None and not p < 0.05:
-        verdict = "open" if math.isnan(p) else "not shown"
+        verdict = "not shown"
     mean, interval, p = signed(d)
     return [f"mean success {mean}", interval, p, verdict]
 

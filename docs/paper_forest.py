@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -76,7 +75,7 @@ def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
     for ax, (task, title) in zip(axes, NAMES.items()):
         for result in (result for result in every if result.comparison.task == task):
             y, d = -names.index(_short(result)), result.difference
-            color = "#1b62a5" if result.p < 0.05 else "#b8860b" if math.isnan(result.p) else "#9aa5b1"
+            color = "#1b62a5" if result.p < 0.05 else "#9aa5b1"
             if d.high < SHOWN[0]:
                 ax.annotate(f"◂ {d.mean:+.2f}", (SHOWN[0], y), color=color, va="center")
                 continue

@@ -110,7 +110,7 @@ class Compared(NamedTuple):
     comparison: Comparison
     difference: Difference
     epochs: int
-    p: float  # corrected over the family, and NaN until that is whole
+    p: float  # corrected over the family, in which comparisons that have not been run have a p of 1
 
 
 def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
@@ -120,7 +120,7 @@ def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
         ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
         differences = [_compare(data[c.task], c) for c in ready]
         p_values = [d.p for d, _ in differences]
-        corrected = stats.holm(p_values) if len(ready) == len(comparisons) else [math.nan] * len(ready)
+        corrected = stats.holm([*p_values, *[1.0] * (len(comparisons) - len(ready))])
         found[family] = [Compared(c, *d, p) for c, d, p in zip(ready, differences, corrected)]
     return found
 
@@ -131,8 +131,7 @@ def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
     for family, results in compared(data).items():
         for c, d, epochs, p in results:
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
-            said = ["", "open"] if math.isnan(p) else [number(p), verdict(d.low, d.high, p)]
-            found.append([family, *cells, *said])
+            found.append([family, *cells, number(p), verdict(d.low, d.high, p)])
     return found
 
 
