@@ -128,6 +128,11 @@ def _frugal(env: str) -> tuple[Config, HParams]:
     return dataclasses.replace(config, cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps), hparams
 
 
+def _frugal_push(env: str) -> tuple[Config, HParams]:
+    config, hparams = _frugal(env)
+    return config, hparams._replace(noise_std=0.6)
+
+
 def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu_pick_and_place(env)
     return dataclasses.replace(config, num_envs=64, n_step=1, total_steps=500_000, replay_size=500_000), hparams
@@ -151,6 +156,7 @@ _DDPG = _Best("ddpg", "mlp", None)
 _LEARNERS = {
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide),
+    ("frugal", "push"): _Best("td3", "mlp", _frugal_push),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", _frugal_pick_and_place),
     ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide),
 }
