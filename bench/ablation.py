@@ -3,6 +3,7 @@
     python bench/ablation.py --out ablation --plan      what would be trained, and how long it would take
     python bench/ablation.py --out ablation             trains and reports; the same command goes on where it was stopped
     python bench/ablation.py --out ablation --report    reports what has ended
+    python bench/ablation.py --out ablation --runs docs/ablation_runs.csv   trains only what that file does not have
     python bench/ablation.py --out toy --toy --seeds 3  the same on the point mass, on a CPU in minutes
 
 It is bench/bakeoff.py with other arms, and has its options. Each arm is a program of its own. docs/learners.md says beforehand
