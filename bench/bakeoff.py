@@ -71,18 +71,15 @@ def parse(
         parser.error(f"--first-seed must lie between 0 and {2**32 - 1001}; got {args.first_seed}")
     if not args.minutes > 0:
         parser.error(f"--minutes must be more than 0; got {args.minutes}")
-    if not (args.plan or args.report):
-        try:
-            check_writable(args.out)
-        except files.FolderError as error:
-            parser.error(str(error))
     if args.toy:
         args.learners, args.tasks = learners[:1], (TOY_TASK,)
         sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "examples"))
     args.arms = [arm for arm in experiment.arms if arm.name in (experiment.baseline, *args.arms)]
     args.experiment = experiment
     try:
-        args.known = [run for path in args.runs for run in load(path, experiment)]
+        if not args.plan:
+            check_writable(args.out)
+        args.known = {run.name: run for path in args.runs for run in load(path, experiment)}
     except files.FolderError as error:
         parser.error(str(error))
     return args
@@ -162,7 +159,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
 
 def is_done(args: argparse.Namespace, folder: Path, run: RunSpec) -> bool:
     """Returns whether a run has ended, in its folder or as one of --runs."""
-    return identity.trial_name(run) in {known.name for known in args.known} or grid.is_done(folder, run)
+    return identity.trial_name(run) in args.known or grid.is_done(folder, run)
 
 
 def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
@@ -175,7 +172,7 @@ def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
         if (arm := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
             trials.setdefault(arm, []).append(trial)
     own = [run for arm in wanted.values() if arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]
-    return merged([*own, *(run for run in args.known if (run.learner, run.task) == (learner, task))])
+    return merged([*own, *(run for run in args.known.values() if (run.learner, run.task) == (learner, task))])
 
 
 def _runs(which: tuple[str, str, str], trials: list[dict[str, Any]], threshold: float) -> list[Run]:
@@ -204,6 +201,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
     if not rows:
         console.print(f"{args.out}: no run of `{args.experiment.baseline}` has ended, and so nothing can be compared yet")
         return 0
+    files.make_folder(args.out)
     save(args.out / args.experiment.runs, runs)
     console.print(f"wrote {args.out / args.experiment.runs}, {len(runs)} runs")
     with files.atomic_write(args.out / args.experiment.table) as partial, partial.open("w", newline="") as file:

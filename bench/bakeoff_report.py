@@ -79,14 +79,12 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm]) -> list[Row]:
     """Returns a row an arm that has scores, each against the first of `arms` on the seeds that both have.
 
-    p is corrected over all of `arms`: what has not been run yet counts with a p of 1, so that no corrected p becomes larger
-    when it has been.
+    p is corrected over all of `arms`, those that have not been run yet, too (`stats.holm`).
     """
     base, tests = scores[arms[0].name], len(arms) - 1
     rows = [_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores]
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
-    p_values = [rows[number].p_value for number in tested]
-    for number, p in zip(tested, stats.holm([*p_values, *[1.0] * (tests - len(tested))])):
+    for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested], tests)):
         rows[number] = rows[number]._replace(p_corrected=p)
     return rows
 

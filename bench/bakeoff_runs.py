@@ -61,7 +61,7 @@ def load(path: Path, experiment: Experiment | None = None) -> list[Run]:
 
 
 def _run(where: str, row: dict[str, str]) -> Run:
-    """Returns the run of a row; raises FolderError for one that is none."""
+    """Returns the run of a row; raises FolderError where it holds none."""
     try:
         run = Run(
             *(row[name] for name in ("learner", "task", "arm")),

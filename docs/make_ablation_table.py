@@ -9,7 +9,7 @@ import math
 import sys
 from pathlib import Path
 
-from paper_analysis import DOCS, NAMES, number, table
+from paper_analysis import DOCS, NAMES, number, table, with_tables
 from paper_set import verdict
 
 sys.path.append(str(DOCS.parent / "bench"))
@@ -19,7 +19,7 @@ from bakeoff_report import Row, compare, forest
 from bakeoff_runs import by_arm, load
 
 PAGE, DATA, IMAGES = DOCS / "learners.md", DOCS / "ablation_runs.csv", DOCS / "images"
-BEGIN, END = "<!-- ablation: docs/make_ablation_table.py -->\n", "<!-- end of ablation -->"
+SCRIPT = "docs/make_ablation_table.py"
 HEAD = "task | arm | mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
 
 
@@ -44,10 +44,8 @@ def cells(row: Row, first: bool) -> list[str]:
 
 def with_table(page: str, rows: list[Row]) -> str:
     """Returns the text of the page with the table as it is now."""
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
     lines = [cells(row, first=number == 0 or rows[number - 1].task != row.task) for number, row in enumerate(rows)]
-    return f"{before}{BEGIN}{table(HEAD, lines)}\n{END}{after}"
+    return with_tables(page, SCRIPT, {"ablation": table(HEAD, lines)})
 
 
 def main() -> None:

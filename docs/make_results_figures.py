@@ -6,7 +6,6 @@ those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, do
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -34,11 +33,12 @@ from paper_analysis import (
     sooner,
     table,
     window,
+    with_tables,
 )
 
 from mjx_dher import stats
 
-PAGE = DOCS / "results.md"
+PAGE, SCRIPT = DOCS / "results.md", "docs/make_results_figures.py"
 
 
 def verdicts(the_set: Mapping[str, Sweeps]) -> str:
@@ -239,24 +239,10 @@ def with_repeats(today: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> d
     return {task: renamed[task] | dict(sweeps) for task, sweeps in before.items()}
 
 
-def with_tables(page: str, blocks: Mapping[str, str]) -> str:
-    """Returns the page with its tables as they are now.
-
-    Raises:
-      ValueError: the page has no place for one of them.
-    """
-    for name, text in blocks.items():
-        begin, end = f"<!-- {name}: docs/make_results_figures.py -->\n", f"<!-- end of {name} -->"
-        if page.count(begin) != 1 or page.count(end) != 1:
-            raise ValueError(f"the page has not one place for {name}")
-        page = re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, t=begin + text + "\n" + end: t, page, flags=re.DOTALL)
-    return page
-
-
 def main() -> None:
     """Writes tables and pictures."""
     the_set, before = paper_set.load_set(paper_set.FOLDER), load()
-    PAGE.write_text(with_tables(PAGE.read_text(), blocks(the_set, before)))
+    PAGE.write_text(with_tables(PAGE.read_text(), SCRIPT, blocks(the_set, before)))
     paper_forest.draw(with_repeats(paper_set.current(the_set), before), DOCS / "images" / "paper_forest.png", TODAY)
     paper_forest.draw_set(paper_set.compared(the_set), DOCS / "images" / "set_forest.png")
 

@@ -10,13 +10,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from paper_analysis import DOCS, with_tables
 
 from mjx_dher import HParams, samplers
 from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 
-DOCS = Path(__file__).parent
-PAGE, PICTURE = DOCS / "samplers.md", DOCS / "images" / "sampler_weights.png"
-BEGIN, END = "<!-- readings: docs/make_samplers_figure.py -->\n", "<!-- end of readings -->\n"
+PAGE, PICTURE, SCRIPT = DOCS / "samplers.md", DOCS / "images" / "sampler_weights.png", "docs/make_samplers_figure.py"
 CANDIDATES = 25
 _STEPS = np.arange(CANDIDATES)
 SITUATIONS = {
@@ -61,17 +60,15 @@ def rows() -> list[tuple[str, list[float]]]:
 
 
 def table() -> str:
-    """Returns the table as Markdown, between the marks that the page has around it."""
+    """Returns the table as Markdown."""
     lines = [f"| normalization, kernel | {' | '.join(SITUATIONS)} |", "|---|" + "---|" * len(SITUATIONS)]
     lines += [f"| {name} | {' | '.join(f'{value:.3f}' for value in values)} |" for name, values in rows()]
-    return BEGIN + "\n".join(lines) + "\n" + END
+    return "\n".join(lines)
 
 
 def with_table(page: str) -> str:
     """Returns the text of the page with the table as it is now."""
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return before + table() + after
+    return with_tables(page, SCRIPT, {"readings": table()})
 
 
 def draw(path: Path) -> None:

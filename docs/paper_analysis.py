@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -100,6 +101,20 @@ def table(head: str, rows: list[list[str]]) -> str:
         raise ValueError(f"a row of {len(columns)} columns has {len(wrong[0])} cells: {wrong[0]}")
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def with_tables(page: str, script: str, blocks: Mapping[str, str]) -> str:
+    """Returns the page with the tables that a script writes into it as they are now, by name.
+
+    Raises:
+      ValueError: the page has no place for one of them.
+    """
+    for name, text in blocks.items():
+        begin, end = f"<!-- {name}: {script} -->\n", f"<!-- end of {name} -->"
+        if page.count(begin) != 1 or page.count(end) != 1:
+            raise ValueError(f"the page has not one place for {name}")
+        page = re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, t=begin + text + "\n" + end: t, page, flags=re.DOTALL)
+    return page
 
 
 def signed(d: Difference, digits: int = 3) -> list[str]:

@@ -120,7 +120,7 @@ def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
         ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
         differences = [_compare(data[c.task], c) for c in ready]
         p_values = [d.p for d, _ in differences]
-        corrected = stats.holm([*p_values, *[1.0] * (len(comparisons) - len(ready))])
+        corrected = stats.holm(p_values, len(comparisons))
         found[family] = [Compared(c, *d, p) for c, d, p in zip(ready, differences, corrected)]
     return found
 

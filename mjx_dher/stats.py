@@ -187,17 +187,25 @@ def paired_p_value(a: ArrayLike, b: ArrayLike, repeats: int = 100_000, seed: int
     return float(test.pvalue)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def holm(p_values: Sequence[float], tests: int | None = None) -> list[float]:
     """Adjusts the p-values of several comparisons by Holm's method, which controls the familywise error rate (Holm 1979).
 
+    Args:
+      p_values: of the comparisons that have been made.
+      tests: how many belong together; those beyond `p_values` count with a p of 1. So no result becomes larger once they have
+        been made.
+
     Raises:
-      ValueError: a p-value does not lie in [0, 1].
+      ValueError: a p-value does not lie in [0, 1], or there are more of them than tests.
     """
+    tests = len(p_values) if tests is None else tests
     if not all(0 <= p <= 1 for p in p_values):
         raise ValueError(f"p-values must lie in [0, 1]; got {list(p_values)}")
+    if tests < len(p_values):
+        raise ValueError(f"there are {len(p_values)} p-values, which is more than {tests} tests")
     adjusted, least = [0.0] * len(p_values), 0.0
     for rank, index in enumerate(sorted(range(len(p_values)), key=lambda i: p_values[i])):
-        least = max(least, min(1.0, (len(p_values) - rank) * p_values[index]))
+        least = max(least, min(1.0, (tests - rank) * p_values[index]))
         adjusted[index] = least
     return adjusted
 

@@ -69,7 +69,7 @@ def test_a_broken_table_would_be_noticed(text, problems):
 def test_the_tables_of_results_are_those_of_the_curves():
     page = make_results_figures.PAGE.read_text()
     tables = make_results_figures.blocks(paper_set.load_set(paper_set.FOLDER), paper_analysis.load())
-    assert make_results_figures.with_tables(page, tables) == page
+    assert paper_analysis.with_tables(page, make_results_figures.SCRIPT, tables) == page
 
 
 def test_each_table_of_results_with_numbers_is_made_from_the_curves():
@@ -89,6 +89,12 @@ def test_the_table_of_readings_is_what_the_weights_are():
 def test_the_table_of_the_ablation_is_that_of_its_report():
     page = make_ablation_table.PAGE.read_text()
     assert make_ablation_table.with_table(page, make_ablation_table.read(make_ablation_table.DATA)) == page
+
+
+@pytest.mark.parametrize("page", ["", "<!-- a: docs/x.py -->\n", 2 * "<!-- a: docs/x.py -->\n<!-- end of a -->\n"])
+def test_a_page_without_one_place_for_a_table_is_refused(page):
+    with pytest.raises(ValueError, match="the page has not one place for a"):
+        paper_analysis.with_tables(page, "docs/x.py", {"a": "| table |"})
 
 
 def test_readings_by_formula():

@@ -137,6 +137,9 @@ def test_holm():
     assert stats.holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
     assert stats.holm([0.5, 0.6]) == [1, 1]
     assert stats.holm([]) == []
+    assert stats.holm([0.01, 0.03], tests=4) == stats.holm([0.01, 0.03, 1, 1])[:2] == pytest.approx([0.04, 0.09])
+    with pytest.raises(ValueError, match="2 p-values, which is more than 1 tests"):
+        stats.holm([0.01, 0.03], tests=1)
     with pytest.raises(ValueError, match=r"\[0, 1\].*1\.1"):
         stats.holm([0.1, 1.1])
 
