@@ -93,14 +93,15 @@ def current(data: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
 
 
 def ks(data: Mapping[str, Sweeps]) -> dict[str, dict[int, Curves]]:
-    """Returns the curves of `future` by task and k, of those tasks that have all of them."""
+    """Returns the curves of `future` by task and k over the epochs that all have, of those tasks that have all of them."""
     found = {}
     for task, sweeps in data.items():
         curves = {k: sweeps.get((f"k_{task}", f"future, her_k {k}")) for k in (1, 2, 8, 16)}
         curves[4] = sweeps.get((MAIN[task], "future"))
         whole = {k: own for k, own in sorted(curves.items()) if own is not None}
         if len(whole) == len(curves):
-            found[task] = whole
+            epochs = min(own.success.shape[1] for own in whole.values())
+            found[task] = {k: own._replace(success=own.success[:, :epochs]) for k, own in whole.items()}
     return found
 
 

@@ -180,6 +180,17 @@ def test_a_figure_that_is_none_is_refused(capsys, monkeypatch):
     assert "got samplrs" in capsys.readouterr().err
 
 
+def test_k_is_compared_over_the_epochs_that_all_have():
+    """On Slide k 4 has 200 epochs, from another sweep, and the others have 50."""
+    data = paper_set.load_set(paper.CURVES)
+    for task, curves in paper_set.ks(data).items():
+        assert {own.success.shape[1] for own in curves.values()} == {50}
+        rows = [row for row in paper_set.compared(data)["k against 4"] if row.comparison.task == task]
+        means = {k: float(paper_analysis.area(own).mean()) for k, own in curves.items()}
+        differences = {int(row.comparison.setting.split()[-1]): row.difference.mean for row in rows}
+        assert differences == {k: pytest.approx(mean - means[4]) for k, mean in means.items() if k != 4}
+
+
 def test_figures_and_sweeps_go_by_name():
     assert [sweep.name for sweep in paper.chosen(["k", "k_push", "slide"])] == [
         "k_push",
