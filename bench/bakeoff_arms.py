@@ -188,7 +188,8 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     `paper`, as their authors do, and in `best` for the preset's half of it, where they take the place of `eventful`.
     """
     run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts_of(task, arm))
-    changes = TOY if toy else SIZES[learner, task].changes
+    # A ring of all that is played: a larger one costs memory alone.
+    changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}
     numbers = dict(arm.numbers)
     if arm.prioritized and learner == "paper":
         numbers["priority_fraction"] = 1.0

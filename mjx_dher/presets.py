@@ -110,7 +110,7 @@ def _paper(env: str) -> tuple[Config, HParams]:
 
 def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu(env)
-    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, n_step=3)
+    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000)
     return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
 
 
@@ -135,7 +135,7 @@ def _frugal_push(env: str) -> tuple[Config, HParams]:
 
 def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu_pick_and_place(env)
-    return dataclasses.replace(config, num_envs=64, n_step=1, total_steps=500_000, replay_size=500_000), hparams
+    return dataclasses.replace(config, num_envs=64, total_steps=500_000, replay_size=500_000), hparams
 
 
 def _frugal_slide(env: str) -> tuple[Config, HParams]:
