@@ -166,16 +166,6 @@ assert not {{"jax", "mujoco"}} & set(sys.modules)
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True)
 
 
-def test_python_does_not_look_for_cycles_at_the_end():
-    """What is registered first is called last: after the command line's own handler."""
-    program = (
-        "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count() > 0));"
-        "from mjx_dher.cli import main; main(['--version'])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.splitlines()[-1] == "True"
-
-
 def test_presets_are_the_base_that_options_override():
     args = cli_train.parse_train_args(["--preset=paper", "--env", "push", "--num-envs", "4", "--gamma", "0.9"])
     base = presets.preset("paper", "push")

@@ -315,3 +315,13 @@ def test_trials_of_a_sweep_have_their_arguments(tmp_path, capsys):
     assert dict(zip(header.split(","), line.split(",")))["env_kwargs"] == "episode_length=6"
     (config,) = (tmp_path / "sweep" / "cells").glob("*/config.json")
     assert run_folder.read_spec(config.parent).env_kwargs == ("episode_length=6",)
+
+
+def test_python_does_not_look_for_cycles_at_the_end():
+    """What is registered first is called last: after the command line's own handler."""
+    program = (
+        "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count() > 0));"
+        "from mjx_dher.cli import main; main(['--version'])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.splitlines()[-1] == "True"

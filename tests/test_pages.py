@@ -11,7 +11,7 @@ from markdown_it import MarkdownIt
 
 sys.path[:0] = [str(ROOT / "docs")]
 
-import make_ablation_table  # noqa: E402
+import make_comparison_tables  # noqa: E402
 import make_results_figures  # noqa: E402
 import make_samplers_figure  # noqa: E402
 import paper_analysis  # noqa: E402
@@ -86,9 +86,14 @@ def test_the_table_of_readings_is_what_the_weights_are():
     assert make_samplers_figure.with_table(page) == page
 
 
-def test_the_table_of_the_ablation_is_that_of_its_report():
-    page = make_ablation_table.PAGE.read_text()
-    assert make_ablation_table.with_table(page, make_ablation_table.read(make_ablation_table.DATA)) == page
+@pytest.mark.parametrize("page", make_comparison_tables.PAGES, ids=lambda page: page.name)
+def test_tables_of_comparisons_are_those_of_their_reports(page):
+    assert make_comparison_tables.with_table(page, make_comparison_tables.read(page)) == page.page.read_text()
+
+
+def test_an_arm_is_shown_when_all_of_its_seeds_have_been_run():
+    for page in make_comparison_tables.PAGES:
+        assert {row.seeds for row in make_comparison_tables.read(page)} == {10}
 
 
 @pytest.mark.parametrize("page", ["", "<!-- a: docs/x.py -->\n", 2 * "<!-- a: docs/x.py -->\n<!-- end of a -->\n"])

@@ -1,0 +1,116 @@
+"""Writes the tables of bench/ablation.py and bench/bakeoff.py into their pages: `python docs/make_comparison_tables.py`.
+
+They are made from docs/ablation_runs.csv and docs/bakeoff_runs.csv, which the two write into the folder of their sweeps, and so
+are the forest plots. An arm is shown when all of its seeds have been run.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from paper_analysis import DOCS, NAMES, number, table, with_tables
+from paper_set import verdict
+
+sys.path.append(str(DOCS.parent / "bench"))
+
+from ablation import ABLATION
+from bakeoff_arms import BAKEOFF, Experiment
+from bakeoff_report import ALPHA, Row, compare, forest
+from bakeoff_runs import by_arm, load
+
+IMAGES, SCRIPT, SEEDS = DOCS / "images", "docs/make_comparison_tables.py", 10
+COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
+LEARNERS = {"paper": "`paper`", "best": "`best`", "gpu": "`gpu`"}
+
+
+class Page(NamedTuple):
+    """An experiment's page."""
+
+    experiment: Experiment
+    page: Path
+    data: Path
+    name: str  # of its table, and of its pictures
+
+
+PAGES = (
+    Page(ABLATION, DOCS / "learners.md", DOCS / "ablation_runs.csv", "ablation"),
+    Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff"),
+)
+
+
+def read(page: Page) -> list[Row]:
+    """Returns what a file of runs says of each arm whose seeds are all there, learner by learner and task by task."""
+    experiment, runs, found = page.experiment, load(page.data), []
+    for learner in experiment.learners:
+        for task in experiment.tasks:
+            scores = by_arm(run for run in runs if (run.learner, run.task) == (learner, task))
+            whole = {arm: own for arm, own in scores.items() if len(own.seeds) == SEEDS}
+            if experiment.baseline in whole:
+                found += compare(learner, task, whole, experiment.arms)
+    return found
+
+
+def cells(row: Row) -> list[str]:
+    """Returns the cells of an arm, from its name on."""
+    start = [f"`{row.arm}`", f"{row.mean_success:.3f}"]
+    if math.isnan(row.difference):
+        return [*start, "", "", "", "", f"{row.final:.3f}", "", ""]
+    interval = f"{row.low:+.3f} to {row.high:+.3f}"
+    said = verdict(row.low, row.high, row.p_corrected)
+    found = [f"{row.difference:+.3f}", interval, number(row.p_value), number(row.p_corrected)]
+    return [*start, *found, f"{row.final:.3f}", f"{row.smallest_effect:.2f}", said]
+
+
+def whole_table(page: Page, rows: Sequence[Row]) -> str:
+    """Returns the table of all arms; learner and task are named in the first row that has them."""
+    several, lines, before = len(page.experiment.learners) > 1, [], None
+    for row in rows:
+        family = (row.learner, row.task)
+        names = [NAMES[row.task], *([LEARNERS[row.learner]] if several else [])]
+        lines.append([*(names if family != before else [""] * len(names)), *cells(row)])
+        before = family
+    return table(f"task | {'learner | ' if several else ''}arm | {COLUMNS}", lines)
+
+
+def claims(rows: Sequence[Row], experiment: Experiment) -> str:
+    """Returns the table of what is claimed of each arm, and the differences that were found; bold where they are shown."""
+    lines = [[f"`{arm.name}`", arm.claim, arm.source, _found(arm.name, rows)] for arm in experiment.arms[1:]]
+    return table("arm | claimed | source | found here", lines)
+
+
+def _found(arm: str, rows: Sequence[Row]) -> str:
+    by_learner: dict[str, list[str]] = {}
+    for row in rows:
+        if row.arm == arm:
+            mark = "**" if row.p_corrected < ALPHA else ""
+            by_learner.setdefault(row.learner, []).append(f"{NAMES[row.task]} {mark}{row.difference:+.3f}{mark}")
+    return "; ".join(f"{LEARNERS[learner]}: {', '.join(found)}" for learner, found in by_learner.items())
+
+
+def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
+    """Returns the tables of a page by name."""
+    found = {page.name: whole_table(page, rows)}
+    return found if page.experiment is ABLATION else {**found, "claims": claims(rows, page.experiment)}
+
+
+def with_table(page: Page, rows: Sequence[Row]) -> str:
+    """Returns the text of the page with the tables as they are now."""
+    return with_tables(page.page.read_text(), SCRIPT, blocks(page, rows))
+
+
+def main() -> None:
+    """Writes the tables and the pictures."""
+    for page in PAGES:
+        rows = read(page)
+        page.page.write_text(with_table(page, rows))
+        for task in dict.fromkeys(row.task for row in rows):
+            picture = IMAGES / f"{page.name}_{task}.png"
+            forest([row for row in rows if row.task == task], picture, page.experiment.baseline)
+
+
+if __name__ == "__main__":
+    main()
