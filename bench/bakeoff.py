@@ -29,6 +29,7 @@ from bakeoff_runs import Run, by_arm, load, merged, save
 from rich.console import Console
 
 from mjx_dher import envs, stats
+from mjx_dher.cli import sentence
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.host import files
@@ -218,7 +219,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
 
 
 def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
-    """Plans, trains and reports; 0: all is done, 2: a folder cannot be used, 3: the same command has runs left."""
+    """Plans, trains and reports; 0: all is done, 2: not possible, as a sentence says, 3: the same command has runs left."""
     args, console = parse(argv, experiment, about), Console(highlight=False, soft_wrap=True)
     if args.plan:
         plan(args, console)
@@ -226,8 +227,10 @@ def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, ab
     try:
         done = args.report or train(args, console)
         report(args, console)
-    except files.FolderError as error:
-        console.print(f"error: {error}", style="red")
+    except Exception as error:
+        if (reason := sentence(error)) is None:
+            raise  # a fault of this program
+        console.print(f"error: {reason}", style="red")
         return 2
     if not done:
         console.print("stopped; the same command goes on")

@@ -285,3 +285,12 @@ def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
     assert {row["failed"] for row in rows} == {"0"}
     assert isinstance(bakeoff.parse(argv, experiment), argparse.Namespace)
     assert bakeoff.main(argv, experiment) == 0  # nothing is left, and it says the same
+
+
+def test_memory_that_does_not_suffice_is_a_sentence(bakeoff, ablation, tmp_path, monkeypatch, capsys):
+    def train(args, console):
+        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 2.48GiB")
+
+    monkeypatch.setattr(bakeoff, "train", train)
+    assert bakeoff.main(["--out", str(tmp_path / "a"), "--toy"], ablation.ABLATION) == 2
+    assert "error: memory does not suffice (RESOURCE_EXHAUSTED" in capsys.readouterr().out

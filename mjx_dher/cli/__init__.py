@@ -52,7 +52,7 @@ def _run(name: str, argv: list[str]) -> int:
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT
     except Exception as error:
-        if (reason := _sentence(error)) is None:
+        if (reason := sentence(error)) is None:
             raise  # a fault of this program, whose place its report should have
         with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
             for line in reason.splitlines():
@@ -60,7 +60,7 @@ def _run(name: str, argv: list[str]) -> int:
         return 2
 
 
-def _sentence(error: Exception) -> str | None:
+def sentence(error: Exception) -> str | None:
     """Returns what a user is told of an error that comes of what was asked for, or of the machine; None for others."""
     if isinstance(error, ValueError):
         return str(error)
