@@ -67,7 +67,7 @@ ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's.
 
-    In PickAndPlace the preset had returns of three steps when this was stated. It has one since the arm `one_step` won.
+    Returns have three steps in all arms but `one_step` and `ddpg`. The preset of Slide has three, that of PickAndPlace one.
     """
     run = dataclasses.replace(presets.preset(learner, "slide" if toy else task), env=task)
     sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task].changes

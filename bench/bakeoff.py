@@ -220,7 +220,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
 
 def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
     """Plans, trains and reports; 0: all is done, 2: not possible, as a sentence says, 3: the same command has runs left."""
-    args, console = parse(argv, experiment, about), Console(highlight=False, soft_wrap=True)
+    args, console = parse(argv, experiment, about), Console(highlight=False, markup=False, soft_wrap=True)
     if args.plan:
         plan(args, console)
         return 0

@@ -24,7 +24,6 @@ from bakeoff_runs import by_arm, load
 
 IMAGES, SCRIPT, SEEDS = DOCS / "images", "docs/make_comparison_tables.py", 10
 COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
-LEARNERS = {"paper": "`paper`", "best": "`best`", "gpu": "`gpu`"}
 
 
 class Page(NamedTuple):
@@ -70,7 +69,7 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
     several, lines, before = len(page.experiment.learners) > 1, [], None
     for row in rows:
         family = (row.learner, row.task)
-        names = [NAMES[row.task], *([LEARNERS[row.learner]] if several else [])]
+        names = [NAMES[row.task], *([f"`{row.learner}`"] if several else [])]
         lines.append([*(names if family != before else [""] * len(names)), *cells(row)])
         before = family
     return table(f"task | {'learner | ' if several else ''}arm | {COLUMNS}", lines)
@@ -88,13 +87,14 @@ def _found(arm: str, rows: Sequence[Row]) -> str:
         if row.arm == arm:
             mark = "**" if row.p_corrected < ALPHA else ""
             by_learner.setdefault(row.learner, []).append(f"{NAMES[row.task]} {mark}{row.difference:+.3f}{mark}")
-    return "; ".join(f"{LEARNERS[learner]}: {', '.join(found)}" for learner, found in by_learner.items())
+    return "; ".join(f"`{learner}`: {', '.join(found)}" for learner, found in by_learner.items())
 
 
 def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
-    """Returns the tables of a page by name."""
+    """Returns the tables of a page by name; that of claims where the arms have any."""
     found = {page.name: whole_table(page, rows)}
-    return found if page.experiment is ABLATION else {**found, "claims": claims(rows, page.experiment)}
+    claimed = any(arm.claim for arm in page.experiment.arms)
+    return {**found, "claims": claims(rows, page.experiment)} if claimed else found
 
 
 def with_table(page: Page, rows: Sequence[Row]) -> str:

@@ -52,6 +52,7 @@ def test_every_arm_is_a_run_of_every_task_and_learner(arms):
             for spec in specs.values():
                 validate(spec, envs.list_envs())
             assert len(set(specs.values())) == len(arms.ARMS) >= 13
+            assert all(spec.config.replay_size == spec.config.total_steps for spec in specs.values())
             for group in arms.BAKEOFF.groups:  # one program each
                 assert len({specs[arm.name].program for arm in arms.ARMS if arm.group == group}) == 1
     built_in = {arm.parts.get("priority") for arm in arms.ARMS} | {arm.parts.get("generator") for arm in arms.ARMS}
@@ -289,8 +290,10 @@ def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
 
 def test_memory_that_does_not_suffice_is_a_sentence(bakeoff, ablation, tmp_path, monkeypatch, capsys):
     def train(args, console):
-        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 2.48GiB")
+        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 2.48GiB. [executable_name='jit__init']")
 
     monkeypatch.setattr(bakeoff, "train", train)
     assert bakeoff.main(["--out", str(tmp_path / "a"), "--toy"], ablation.ABLATION) == 2
-    assert "error: memory does not suffice (RESOURCE_EXHAUSTED" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "error: memory does not suffice (RESOURCE_EXHAUSTED" in said
+    assert "[executable_name='jit__init']" in said  # no markup

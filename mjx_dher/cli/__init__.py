@@ -22,7 +22,7 @@ TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (2: the arguments were refused)."""
-    # At the end Python looks for cycles among all objects, which takes some 0.5 s of those that JAX alone has made.
+    # Else Python looks for cycles among all objects before it ends, which takes half a second after a run.
     atexit.register(gc.freeze)
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
