@@ -76,7 +76,7 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
     preset = startup.machine_preset()
     run = presets.preset(preset, "push", learner="ddpg").config
     steps = str(2 * config.steps_per_epoch(run, 50))
-    command = ["--env", "push", "--preset", preset, "--total-steps", steps, "--no-curve"]
+    command = ["--env", "push", "--preset", preset, "--learner", "ddpg", "--total-steps", steps, "--no-curve"]
     with tempfile.TemporaryDirectory() as home:
         starts = [startup.measure(command, home)["to the first epoch"] for _ in range(1 + repeats)]
 

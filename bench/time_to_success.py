@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 from timing import print_table
 
-from mjx_dher import HParams, envs, learners, presets, samplers, stats, trainer
+from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats, trainer
 from mjx_dher.host.caches import keep_compiled_programs
 from mjx_dher.runs.loop import train
 from mjx_dher.runs.play import play
@@ -44,7 +44,7 @@ def main() -> None:
             config = dataclasses.replace(config, **{name: int(value)})
     env = envs.make(args.env, engine=args.engine)
     learner = learners.make(spec.learner, config, trainer.env_sizes(env), spec.networks)
-    parts = {"sampler": samplers.make(args.sampler), "learner": learner}
+    parts = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority), "learner": learner}
     keep_compiled_programs()
     rows, curve, compiled = [], [], []
     for seed in range(args.seeds):

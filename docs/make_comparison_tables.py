@@ -1,11 +1,13 @@
 """Writes the tables of bench/ablation.py and bench/bakeoff.py into their pages: `python docs/make_comparison_tables.py`.
 
 They are made from docs/ablation_runs.csv and docs/bakeoff_runs.csv, which the two write into the folder of their sweeps, and so
-are the forest plots. An arm is shown when all of its seeds have been run.
+are the forest plots. docs/bakeoff_repeat_runs.csv is the bakeoff_runs.csv of the second sweep. An arm is shown when all of its
+seeds have been run.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -33,11 +35,16 @@ class Page(NamedTuple):
     page: Path
     data: Path
     name: str  # of its table, and of its pictures
+    claims: bool = False  # whether the page has the table of claims, too
+    pictures: bool = True
 
 
+REPEATED = ("future", "next_future", "energy", "td_error")  # a family of its own: those that --arms names
+REPEAT = dataclasses.replace(BAKEOFF, arms=tuple(arm for arm in BAKEOFF.arms if arm.name in REPEATED), learners=("best",))
 PAGES = (
     Page(ABLATION, DOCS / "learners.md", DOCS / "ablation_runs.csv", "ablation"),
-    Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff"),
+    Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
+    Page(REPEAT, DOCS / "what_helps.md", DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
 )
 
 
@@ -91,10 +98,9 @@ def _found(arm: str, rows: Sequence[Row]) -> str:
 
 
 def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
-    """Returns the tables of a page by name; that of claims where the arms have any."""
+    """Returns the tables of a page by name."""
     found = {page.name: whole_table(page, rows)}
-    claimed = any(arm.claim for arm in page.experiment.arms)
-    return {**found, "claims": claims(rows, page.experiment)} if claimed else found
+    return {**found, "claims": claims(rows, page.experiment)} if page.claims else found
 
 
 def with_table(page: Page, rows: Sequence[Row]) -> str:
@@ -107,7 +113,7 @@ def main() -> None:
     for page in PAGES:
         rows = read(page)
         page.page.write_text(with_table(page, rows))
-        for task in dict.fromkeys(row.task for row in rows):
+        for task in dict.fromkeys(row.task for row in rows if page.pictures):
             picture = IMAGES / f"{page.name}_{task}.png"
             forest([row for row in rows if row.task == task], picture, page.experiment.baseline)
 

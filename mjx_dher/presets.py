@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 from mjx_dher.config import Config, HParams
@@ -52,7 +52,9 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name]
     config, hparams = setup(env)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
-    return RunSpec(env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **changes)
+    return RunSpec(
+        env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **{**best.parts, **changes}
+    )
 
 
 def _cpu(env: str) -> tuple[Config, HParams]:
@@ -120,6 +122,21 @@ def _gpu_slide(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(target_noise=0.0)
 
 
+def _cpu_push(env: str) -> tuple[Config, HParams]:
+    config, hparams = _cpu(env)
+    config = dataclasses.replace(
+        config, updates_per_cycle=64, num_critics=1, policy_delay=2, hidden_sizes=(256, 256), total_steps=480_000
+    )
+    return config, hparams._replace(critic_lr=2e-3, target_noise=0.0)
+
+
+def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu_pick_and_place(env)
+    # An epoch a cycle: on two cores a cycle takes more than half a minute.
+    config = dataclasses.replace(config, cycles_per_epoch=1, policy_delay=2, total_steps=512_000, replay_size=512_000)
+    return config, hparams
+
+
 def _frugal(env: str) -> tuple[Config, HParams]:
     config, hparams = _cpu(env)
     if env == "reach":
@@ -150,10 +167,13 @@ class _Best(NamedTuple):
     learner: str
     networks: str
     setup: Callable[[str], tuple[Config, HParams]] | None
+    parts: Mapping[str, str] = {}  # other fields of the run
 
 
 _DDPG = _Best("ddpg", "mlp", None)
 _LEARNERS = {
+    ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
+    ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide),
     ("frugal", "push"): _Best("td3", "mlp", _frugal_push),

@@ -52,6 +52,14 @@ def test_presets_are_valid(name, env):
     spec.validate(presets.preset(name, env), envs.list_envs())
 
 
+def test_a_preset_has_a_priority_of_its_own_where_its_learner_is_taken():
+    own = presets.preset("cpu", "pick_and_place")
+    assert (own.learner, own.priority) == ("tqc", "energy")
+    assert presets.preset("cpu", "pick_and_place", priority="td_error") == dataclasses.replace(own, priority="td_error")
+    assert presets.preset("cpu", "pick_and_place", learner="ddpg").priority == "eventful"
+    assert presets.preset("cpu", "push").priority == "eventful"
+
+
 @pytest.mark.parametrize("env", ["push", "pick_and_place", "slide", "reach"])
 def test_the_frugal_preset_plays_less_and_learns_more_from_it(env):
     frugal, *others = (presets.preset(name, env).config for name in ("frugal", "cpu", "gpu"))

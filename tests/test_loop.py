@@ -50,6 +50,26 @@ def test_a_plain_program_is_not_optimized_on_a_cpu(backend, level, monkeypatch):
     assert [options.get("xla_backend_optimization_level") for options in asked] == [level, None]
 
 
+@pytest.mark.parametrize(
+    ("backend", "flags", "expected"),
+    [("cpu", "", "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"), ("cpu", f"--{loop._YNN}=", None), ("gpu", "", None)],
+)
+def test_on_a_cpu_matrix_products_alone_are_handed_over_unless_the_user_says_otherwise(backend, flags, expected, monkeypatch):
+    asked = []
+    lowered = types.SimpleNamespace(compile=lambda compiler_options: asked.append(compiler_options))
+    assert loop._is_option(loop._YNN, loop._PRODUCTS)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    loop.compile_lowered(lowered)
+    assert [options.get(loop._YNN) for options in asked] == [expected]
+
+
+def test_an_option_that_the_compiler_does_not_have_is_left_out(monkeypatch):
+    monkeypatch.setattr(loop, "_YNN", "xla_cpu_no_such_option")
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    assert loop.compile_lowered(jax.jit(lambda x: x + 1).lower(1.0))(1.0) == 2.0
+
+
 def test_the_options_of_a_plain_program_are_known_to_the_compiler():
     compiled = loop.compile_lowered(jax.jit(lambda x: x + 1).lower(1.0), plain=True)
     assert compiled(1.0) == 2.0

@@ -167,3 +167,16 @@ def test_every_number_and_every_size_can_be_set():
 
 def cli_args(*argv):
     return cli_sweep.parse_sweep_args(["--out", "nowhere", "--preset", "cpu", *argv])
+
+
+@pytest.mark.parametrize(
+    ("asked", "priorities"),
+    [
+        ([], {"energy"}),
+        (["--priority", "eventful", "td_error"], {"eventful", "td_error"}),
+        (["--learner", "ddpg"], {"eventful"}),
+    ],
+)
+def test_a_sweep_has_the_preset_s_priority_unless_others_are_named(asked, priorities):
+    command = ["--out", "x", "--env", "pick_and_place", "--preset", "cpu", "--sampler", "future", "--seeds", "1", *asked]
+    assert {trial.priority for trial in cli_sweep.parse_sweep_args(command)[1]} == priorities

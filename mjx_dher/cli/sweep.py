@@ -88,9 +88,9 @@ class SweepArgs:
     metric: tuple[str, ...] = ("position",)
     """Distances that closest, epsilon_closest and weighted go by: position, velocity, resting_point, resting_point_rough,
     time_to_goal, or module:attribute."""
-    priority: tuple[str, ...] = ("eventful",)
-    """Priorities in replay: eventful, energy, max_entropy, diversity, dpp, td_error, curriculum, not_misleading, or
-    module:attribute."""
+    priority: tuple[str, ...] | None = None
+    """Priorities in replay; the preset's for the learner unless given: eventful, energy, max_entropy, diversity, dpp,
+    td_error, curriculum, not_misleading, or module:attribute."""
     generator: tuple[str, ...] = ("reset",)
     """Generators of the goals that training episodes are played for: reset, hgg, or module:attribute."""
     learner: tuple[str, ...] | None = None
@@ -178,7 +178,8 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
     parts = [list(dict.fromkeys(getattr(args, field) or (None,))) for field in GRID]
     for env, *choice in itertools.product(*parts):
-        base = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs, **dict(zip(GRID[1:], choice)))
+        named = {field: part for field, part in zip(GRID[1:], choice) if part is not None}
+        base = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs, **named)
         base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))
         for point in itertools.product(*axes.values()):
             run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))

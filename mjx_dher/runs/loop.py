@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,8 @@ from mjx_dher.types import Array, Env, Metrics, PRNGKey
 # Updates, of all runs side by side, from which on the compiler's search for the fastest matrix products pays: on one H100 it
 # takes half a minute, and Push's epochs then take 0.83 of the time (docs/design.md).
 WORTH_A_SEARCH = 500_000
+# What XLA hands over to YNNPACK on a CPU.
+_YNN, _PRODUCTS = "xla_cpu_experimental_ynn_fusion_type", "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
 
 
 class Start(NamedTuple):
@@ -177,6 +180,16 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     return Compiled(init=start, epoch=compiled, nbytes=nbytes)
 
 
+@functools.cache
+def _is_option(name: str, value: str) -> bool:
+    """Returns whether this version of the compiler has an option, which may go as it came: it is called experimental."""
+    try:
+        jax.jit(lambda x: x + 1).lower(1.0).compile(compiler_options={name: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
 def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
     """Compiles what `jax.jit(...).lower` gave, without what takes most of the time and gains little.
 
@@ -184,10 +197,16 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
     Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many tilings each,
     what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix products compiled,
     with many tilings each, to be timed against those of cuBLAS, which has its own ready.
+
+    On a CPU XLA hands sums along an axis, as a norm has them, to a library (YNNPACK), too. Of small sums each call takes longer
+    than the sum: with layer normalization an update took two to three times as long. Only matrix products are handed over.
     """
     options: dict[str, Any] = {}
-    if plain and jax.default_backend() == "cpu":
-        options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    if jax.default_backend() == "cpu":
+        if plain:
+            options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+        if _YNN not in os.environ.get("XLA_FLAGS", "") and _is_option(_YNN, _PRODUCTS):
+            options[_YNN] = _PRODUCTS
     if jax.default_backend() == "gpu":
         options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
         if "xla_gpu_enable_triton_gemm" not in os.environ.get("XLA_FLAGS", ""):
