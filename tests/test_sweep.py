@@ -41,7 +41,7 @@ def test_a_trial_s_name_is_that_of_an_earlier_version():
     """A sweep of 0.1.0 made these folders: point_mass:PointMass, future and weighted."""
     sizes = {"num_envs": 2, "cycles_per_epoch": 2, "updates_per_cycle": 4, "target_period": 1, "batch_size": 16}
     static = config.Config(**sizes, total_steps=80, replay_size=100, hidden_sizes=(8, 8), eval_episodes=4)
-    hparams = mjx_dher.preset("cpu", "push").hparams
+    hparams = mjx_dher.preset("cpu", "push", learner="ddpg").hparams
     names = [trial_name(RunSpec("point_mass:PointMass", sampler=s, config=static, hparams=hparams), {}) for s in OLD_NAMES]
     assert names == [f"point_mass-pointmass-{sampler}-s0-{digest}" for sampler, digest in OLD_NAMES.items()]
 
