@@ -38,7 +38,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     Args:
       name: the preset.
       env: the environment.
-      learner: the preset's unless given; `ddpg` and the preset's have numbers of their own, others those of `ddpg`.
+      learner: the preset's unless given; `ddpg` and the preset's have numbers of their own, and the preset's may have a
+        priority of its own; others have the numbers of `ddpg`.
       networks: the preset's for that learner unless given.
       **changes: other fields of the run.
 
@@ -167,7 +168,7 @@ class _Best(NamedTuple):
     learner: str
     networks: str
     setup: Callable[[str], tuple[Config, HParams]] | None
-    parts: Mapping[str, str] = {}  # other fields of the run
+    parts: Mapping[str, str] = {}  # fields of the run that differ from RunSpec's defaults
 
 
 _DDPG = _Best("ddpg", "mlp", None)

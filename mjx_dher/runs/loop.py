@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import functools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -180,16 +179,6 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     return Compiled(init=start, epoch=compiled, nbytes=nbytes)
 
 
-@functools.cache
-def _is_option(name: str, value: str) -> bool:
-    """Returns whether this version of the compiler has an option, which may go as it came: it is called experimental."""
-    try:
-        jax.jit(lambda x: x + 1).lower(1.0).compile(compiler_options={name: value})
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
-
-
 def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
     """Compiles what `jax.jit(...).lower` gave, without what takes most of the time and gains little.
 
@@ -205,12 +194,18 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
     if jax.default_backend() == "cpu":
         if plain:
             options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-        if _YNN not in os.environ.get("XLA_FLAGS", "") and _is_option(_YNN, _PRODUCTS):
+        if _YNN not in os.environ.get("XLA_FLAGS", ""):
             options[_YNN] = _PRODUCTS
     if jax.default_backend() == "gpu":
         options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
         if "xla_gpu_enable_triton_gemm" not in os.environ.get("XLA_FLAGS", ""):
             options["xla_gpu_enable_triton_gemm"] = search
+    try:
+        return lowered.compile(compiler_options=options)
+    except jax.errors.JaxRuntimeError as error:
+        if _YNN not in options or _YNN not in str(error):
+            raise
+    del options[_YNN]  # this version of the compiler does not have it: it is called experimental
     return lowered.compile(compiler_options=options)
 
 
