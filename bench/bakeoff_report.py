@@ -76,17 +76,20 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
     return high * spread
 
 
-def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm]) -> list[Row]:
+def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm], tests: int | None = None) -> list[Row]:
     """Returns a row an arm that has scores, each against the first of `arms` on the seeds that both have.
 
-    p is corrected over all of `arms`, those that have not been run yet, too (`stats.holm`).
+    p is corrected over `tests` comparisons: all of `arms`, those that have not been run yet, too, unless given.
     """
-    base, tests = scores[arms[0].name], len(arms) - 1
-    rows = [_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores]
+    base, tests = scores[arms[0].name], len(arms) - 1 if tests is None else tests
+    return corrected([_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores], tests)
+
+
+def corrected(rows: Sequence[Row], tests: int) -> list[Row]:
+    """Returns the rows with p corrected over `tests` comparisons together (`stats.holm`)."""
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
-    for number, p in zip(tested, stats.holm([rows[number].p_value for number in tested], tests)):
-        rows[number] = rows[number]._replace(p_corrected=p)
-    return rows
+    by_row = dict(zip(tested, stats.holm([rows[number].p_value for number in tested], tests)))
+    return [row._replace(p_corrected=by_row[n]) if n in by_row else row for n, row in enumerate(rows)]
 
 
 def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: int) -> Row:
