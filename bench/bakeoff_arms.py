@@ -190,7 +190,8 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     `paper` is DDPG under the paper's settings, `best` the preset `gpu`. Priorities are drawn by for the whole batch in
     `paper`, as their authors do, and in `best` for the preset's half of it, where they take the place of `eventful`.
     """
-    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts_of(task, arm))
+    parts = {"priority": "eventful", **parts_of(task, arm)}  # whatever the preset has by now
+    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts)
     # A ring of all that is played: a larger one costs memory alone.
     changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}
     numbers = dict(arm.numbers)

@@ -131,6 +131,20 @@ def _cpu_push(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(critic_lr=2e-3, target_noise=0.0)
 
 
+def _cpu_slide(env: str) -> tuple[Config, HParams]:
+    config, hparams = _cpu(env)
+    config = dataclasses.replace(
+        config,
+        updates_per_cycle=96,
+        num_critics=1,
+        policy_delay=2,
+        n_step=3,
+        hidden_sizes=(256, 256),
+        total_steps=1_200_000,
+    )
+    return config, hparams._replace(target_noise=0.0, noise_std=0.1, random_eps=0.2, her_k=4.0)
+
+
 def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _gpu_pick_and_place(env)
     # An epoch a cycle: on two cores a cycle takes more than half a minute.
@@ -175,9 +189,10 @@ _DDPG = _Best("ddpg", "mlp", None)
 _LEARNERS = {
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
+    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide),
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place),
-    ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide),
+    ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", _frugal_push),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", _frugal_pick_and_place),
-    ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide),
+    ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide, {"priority": "td_error"}),
 }
