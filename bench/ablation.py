@@ -67,8 +67,8 @@ ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's.
 
-    Priority is `eventful`, whatever the preset has by now. Returns have three steps in all arms but `one_step` and `ddpg`:
-    the preset of Slide has three, that of PickAndPlace one.
+    The priority is `eventful` in all arms, and returns have three steps in all but `one_step` and `ddpg`. The presets differ:
+    that of Slide has the priority `td_error`, and that of PickAndPlace returns of one step.
     """
     run = dataclasses.replace(presets.preset(learner, "slide" if toy else task, priority="eventful"), env=task)
     sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task].changes

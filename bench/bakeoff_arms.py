@@ -187,10 +187,10 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0.
 
-    `paper` is DDPG under the paper's settings, `best` the preset `gpu`. Priorities are drawn by for the whole batch in
-    `paper`, as their authors do, and in `best` for the preset's half of it, where they take the place of `eventful`.
+    `paper` is DDPG under the paper's settings, `best` the preset `gpu` with `eventful`. Priorities choose the whole batch in
+    `paper`, as their authors do, and in `best` the preset's half of it, where they take the place of `eventful`.
     """
-    parts = {"priority": "eventful", **parts_of(task, arm)}  # whatever the preset has by now
+    parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
     run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts)
     # A ring of all that is played: a larger one costs memory alone.
     changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}

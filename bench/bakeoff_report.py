@@ -79,7 +79,7 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm], tests: int | None = None) -> list[Row]:
     """Returns a row an arm that has scores, each against the first of `arms` on the seeds that both have.
 
-    p is corrected over `tests` comparisons: all of `arms`, those that have not been run yet, too, unless given.
+    p is corrected over `tests` comparisons (`corrected`): unless given, all of `arms`, those that have not been run yet, too.
     """
     base, tests = scores[arms[0].name], len(arms) - 1 if tests is None else tests
     return corrected([_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores], tests)

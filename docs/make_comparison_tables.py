@@ -40,12 +40,13 @@ class Page(NamedTuple):
     over_tasks: bool = False  # whether p is corrected over the tasks, too
 
 
-REPEATED = ("future", "next_future", "energy", "td_error")  # a family of its own: those that --arms names
-REPEAT = dataclasses.replace(BAKEOFF, arms=tuple(arm for arm in BAKEOFF.arms if arm.name in REPEATED), learners=("best",))
-THIRD_TASKS = ("pick_and_place", "slide")
-THIRD = dataclasses.replace(
-    REPEAT, tasks=THIRD_TASKS, arms=tuple(arm for arm in BAKEOFF.arms if arm.name in ("future", "td_error"))
-)
+def repeat(*names: str) -> Experiment:
+    """Returns the bake-off of those arms alone, as a family of its own: what --arms names, and the baseline."""
+    arms = tuple(arm for arm in BAKEOFF.arms if arm.name in (BAKEOFF.baseline, *names))
+    return dataclasses.replace(BAKEOFF, arms=arms, learners=("best",), tasks=("pick_and_place", "slide"))
+
+
+REPEAT, THIRD = repeat("next_future", "energy", "td_error"), repeat("td_error")
 PAGES = (
     Page(ABLATION, DOCS / "learners.md", DOCS / "ablation_runs.csv", "ablation"),
     Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),

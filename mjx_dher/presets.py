@@ -123,33 +123,26 @@ def _gpu_slide(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(target_noise=0.0)
 
 
+def _small(config: Config, hparams: HParams, **sizes: int) -> tuple[Config, HParams]:
+    """Returns the settings with one critic, two layers and no noise on a target's actions, and with other `sizes`."""
+    config = dataclasses.replace(config, num_critics=1, hidden_sizes=(256, 256), **sizes)
+    return config, hparams._replace(target_noise=0.0)
+
+
 def _cpu_push(env: str) -> tuple[Config, HParams]:
-    config, hparams = _cpu(env)
-    config = dataclasses.replace(
-        config, updates_per_cycle=64, num_critics=1, policy_delay=2, hidden_sizes=(256, 256), total_steps=480_000
-    )
-    return config, hparams._replace(critic_lr=2e-3, target_noise=0.0)
+    config, hparams = _small(*_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000)
+    return config, hparams._replace(critic_lr=2e-3)
 
 
 def _cpu_slide(env: str) -> tuple[Config, HParams]:
-    config, hparams = _cpu(env)
-    config = dataclasses.replace(
-        config,
-        updates_per_cycle=96,
-        num_critics=1,
-        policy_delay=2,
-        n_step=3,
-        hidden_sizes=(256, 256),
-        total_steps=1_200_000,
-    )
-    return config, hparams._replace(target_noise=0.0, noise_std=0.1, random_eps=0.2, her_k=4.0)
+    config, hparams = _small(*_cpu(env), updates_per_cycle=96, policy_delay=2, n_step=3, total_steps=1_296_000)
+    return config, hparams._replace(noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
 def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu_pick_and_place(env)
-    # An epoch a cycle: on two cores a cycle takes more than half a minute.
-    config = dataclasses.replace(config, cycles_per_epoch=1, policy_delay=2, total_steps=512_000, replay_size=512_000)
-    return config, hparams
+    # An epoch a cycle: on two cores a cycle takes some ten seconds.
+    sizes = {"cycles_per_epoch": 1, "policy_delay": 2, "total_steps": 1_024_000, "replay_size": 1_024_000}
+    return _small(*_gpu_pick_and_place(env), **sizes)
 
 
 def _frugal(env: str) -> tuple[Config, HParams]:
@@ -171,9 +164,7 @@ def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
 
 
 def _frugal_slide(env: str) -> tuple[Config, HParams]:
-    config, hparams = _frugal(env)
-    config = dataclasses.replace(config, updates_per_cycle=150, num_critics=1, n_step=3, hidden_sizes=(256, 256))
-    return config, hparams._replace(target_noise=0.0)
+    return _small(*_frugal(env), updates_per_cycle=150, n_step=3)
 
 
 class _Best(NamedTuple):

@@ -140,6 +140,35 @@ def test_arms_that_have_not_been_run_count_in_the_correction(report, arms):
     assert all(later[row.arm].p_corrected <= row.p_corrected for row in rows[1:])
 
 
+def test_arms_of_several_tasks_can_be_corrected_together(report, arms):
+    """Two of them: the smaller p is doubled, the larger one is not, and differences are seen as of two tests."""
+    rng = np.random.default_rng(0)
+    base, noise = rng.uniform(0.4, 0.6, size=10), rng.uniform(0.0, 0.02, size=10)
+    both = [arm for arm in arms.ARMS if arm.name in ("future", "energy")]
+    rows = []
+    for task, sign in (("slide", 1.0), ("push", np.where(np.arange(10) < 1, -1.0, 1.0))):
+        own = {"future": scores(report, base), "energy": scores(report, base + sign * (0.01 + noise))}
+        rows += report.compare("best", task, own, both, tests=2)
+    alone = report.compare(
+        "best", "slide", {"future": scores(report, base), "energy": scores(report, base + 0.01 + noise)}, both
+    )
+    assert alone[1].p_value == alone[1].p_corrected == rows[1].p_value == 2 / 1024
+    assert rows[1].smallest_effect > alone[1].smallest_effect
+    first, small, second, large = report.corrected(rows, 2)
+    assert large.p_value > small.p_value
+    assert (small.p_corrected, large.p_corrected) == (2 * small.p_value, large.p_value)
+    assert np.isnan([first.p_corrected, second.p_corrected]).all()
+
+
+def test_runs_that_are_kept_are_those_of_the_arms_as_they_are(arms, ablation):
+    """Else `--runs` would train them again: a preset that changes must not change what was compared."""
+    import bakeoff_runs
+
+    ours, parts = arms.BAKEOFF, ablation.ABLATION
+    for name, experiment in [("bakeoff", ours), ("bakeoff_repeat", ours), ("bakeoff_third", ours), ("ablation", parts)]:
+        assert bakeoff_runs.load(ROOT / "docs" / f"{name}_runs.csv", experiment)
+
+
 def test_only_seeds_that_both_have_are_paired(report, arms):
     base, other = scores(report, [0.1, 0.2, 0.3]), scores(report, [0.5, 0.6, 0.7], first=1)
     _, row = report.compare("best", "slide", {"future": base, "dpp": other}, arms.ARMS)
