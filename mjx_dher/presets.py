@@ -140,9 +140,10 @@ def _cpu_slide(env: str) -> tuple[Config, HParams]:
 
 
 def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu_pick_and_place(env)
     # An epoch a cycle: on two cores a cycle takes some ten seconds.
-    sizes = {"cycles_per_epoch": 1, "policy_delay": 2, "total_steps": 1_024_000, "replay_size": 1_024_000}
-    return _small(*_gpu_pick_and_place(env), **sizes)
+    config = dataclasses.replace(config, cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000)
+    return _small(config, hparams, policy_delay=2)
 
 
 def _frugal(env: str) -> tuple[Config, HParams]:
