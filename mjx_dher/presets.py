@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, Any, NamedTuple, get_args
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.names import check_name
@@ -123,7 +123,7 @@ def _gpu_slide(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(target_noise=0.0)
 
 
-def _small(config: Config, hparams: HParams, **sizes: int) -> tuple[Config, HParams]:
+def _small(config: Config, hparams: HParams, **sizes: Any) -> tuple[Config, HParams]:
     """Returns the settings with one critic, two layers and no noise on a target's actions, and with other `sizes`."""
     config = dataclasses.replace(config, num_critics=1, hidden_sizes=(256, 256), **sizes)
     return config, hparams._replace(target_noise=0.0)
