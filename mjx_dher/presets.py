@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.names import check_name
