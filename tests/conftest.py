@@ -46,7 +46,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
                 _entry.unlink()
 # Compiling takes most of the tests' time, and a fifth less of it without what makes programs fast.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES), str(ROOT / "docs")]
 
 
 def load_recorded(task):

@@ -145,13 +145,13 @@ def test_arms_of_several_tasks_can_be_corrected_together(report, arms):
     rng = np.random.default_rng(0)
     base, noise = rng.uniform(0.4, 0.6, size=10), rng.uniform(0.0, 0.02, size=10)
     both = [arm for arm in arms.ARMS if arm.name in ("future", "energy")]
-    rows = []
-    for task, sign in (("slide", 1.0), ("push", np.where(np.arange(10) < 1, -1.0, 1.0))):
-        own = {"future": scores(report, base), "energy": scores(report, base + sign * (0.01 + noise))}
-        rows += report.compare("best", task, own, both, tests=2)
-    alone = report.compare(
-        "best", "slide", {"future": scores(report, base), "energy": scores(report, base + 0.01 + noise)}, both
-    )
+    signs = {"slide": 1.0, "push": np.where(np.arange(10) < 1, -1.0, 1.0)}
+    own = {
+        task: {"future": scores(report, base), "energy": scores(report, base + sign * (0.01 + noise))}
+        for task, sign in signs.items()
+    }
+    rows = [row for task in own for row in report.compare("best", task, own[task], both, tests=2)]
+    alone = report.compare("best", "slide", own["slide"], both)
     assert alone[1].p_value == alone[1].p_corrected == rows[1].p_value == 2 / 1024
     assert rows[1].smallest_effect > alone[1].smallest_effect
     first, small, second, large = report.corrected(rows, 2)

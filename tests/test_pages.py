@@ -2,20 +2,16 @@
 
 import csv
 import re
-import sys
 
+import make_comparison_tables
+import make_results_figures
+import make_samplers_figure
 import numpy as np
+import paper_analysis
+import paper_set
 import pytest
 from conftest import ROOT
 from markdown_it import MarkdownIt
-
-sys.path[:0] = [str(ROOT / "docs")]
-
-import make_comparison_tables  # noqa: E402
-import make_results_figures  # noqa: E402
-import make_samplers_figure  # noqa: E402
-import paper_analysis  # noqa: E402
-import paper_set  # noqa: E402
 
 PAGES = sorted(
     path

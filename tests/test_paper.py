@@ -10,6 +10,8 @@ import sys
 import threading
 
 import numpy as np
+import paper_analysis
+import paper_set
 import pytest
 from conftest import ROOT
 
@@ -18,11 +20,6 @@ from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.runs import identity
 from mjx_dher.sweeps import comparison
 from probes import held
-
-sys.path[:0] = [str(ROOT / "docs")]
-
-import paper_analysis  # noqa: E402
-import paper_set  # noqa: E402
 
 _spec = importlib.util.spec_from_file_location("bench_paper", ROOT / "bench" / "paper.py")
 paper = importlib.util.module_from_spec(_spec)
