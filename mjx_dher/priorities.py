@@ -28,7 +28,8 @@ CANDIDATES = 4  # transitions that are drawn for each that a priority of transit
 
 # priority(episode, compute_reward, hparams) -> weight [], 0 or more
 PriorityFn = Callable[[Episode, RewardFn, HParams], Array]
-# renew(ring, view) -> weights [E] of all its rows, 0 or more; what they are for empty rows does not matter
+# renew(ring, view) -> weights [E] of all its rows, 0 or more; what they are for empty rows does not matter. With
+# `Config.renewals` the ring is one of some episodes, new ones and others.
 RenewFn = Callable[[ReplayState, View], Array]
 # choose(key, sample [CANDIDATES * B], batch [CANDIDATES * B], number B, view) -> indices [B] of the candidates
 ChooseFn = Callable[[PRNGKey, Sample, Batch, int, View], Array]
@@ -39,7 +40,7 @@ class Priority:
     """A priority: any of three ways to prefer, each of them optional."""
 
     weigh: PriorityFn | None = None  # an episode, once, when it is added
-    renew: RenewFn | None = None  # all episodes of the ring, at each cycle, before anything is learned
+    renew: RenewFn | None = None  # episodes of the ring, at each cycle, before anything is learned
     choose: ChooseFn | None = None  # among transitions, hindsight goals in place
     uses_values: bool = False  # of `view.values`
 
@@ -102,20 +103,28 @@ def weights(priority: PriorityFn | Priority, episodes: Episode, compute_reward: 
     return replay.as_priority(weight)
 
 
-def renewed(priority: Priority, ring: ReplayState, view: View) -> ReplayState:
+def renewed(priority: Priority, ring: ReplayState, view: View, rows: Array | None = None) -> ReplayState:
     """Returns the ring with weights that `priority.renew` gives; as it is, where the priority has no such function.
 
+    Args:
+      priority: whose `renew` is asked.
+      ring: the ring.
+      view: what `renew` may look at.
+      rows: [R] those to renew, handed to `renew` as a ring of their own; all, where None. A row may be there twice.
+
     Raises:
-      ValueError: they are no real numbers [E].
+      ValueError: the weights are no real numbers [E], or [R].
     """
     if priority.renew is None:
         return ring
-    weight = priority.renew(ring, view)
-    if getattr(weight, "shape", None) != ring.priority.shape:
+    part = ring if rows is None else replay.take(ring, rows)
+    weight = priority.renew(part, view)
+    if getattr(weight, "shape", None) != part.priority.shape:
         given = list(weight.shape) if hasattr(weight, "shape") else f"a {type(weight).__name__}"
-        raise ValueError(f"priority: renew gives weights [E] = {list(ring.priority.shape)}; this one gives {given}")
-    filled = jnp.arange(ring.priority.shape[0]) < ring.size
-    return dataclasses.replace(ring, priority=jnp.where(filled, replay.as_priority(weight), 0.0))
+        raise ValueError(f"priority: renew gives weights [E] = {list(part.priority.shape)}; this one gives {given}")
+    filled = (jnp.arange(ring.priority.shape[0]) if rows is None else rows) < ring.size
+    weight = jnp.where(filled, replay.as_priority(weight), 0.0)
+    return dataclasses.replace(ring, priority=weight if rows is None else ring.priority.at[rows].set(weight))
 
 
 def chosen(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, number: int, view: View) -> tuple[Sample, Batch]:

@@ -197,6 +197,22 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array
     return jnp.where(coin & (total > 0), by_priority, randint_from_bits(any_bits, state.size))
 
 
+def take(state: ReplayState, rows: Array) -> ReplayState:
+    """Returns a full ring of the episodes in `rows` [R], with their priorities."""
+    episodes = jax.tree.map(lambda x: x[rows], state.episodes)
+    number = jnp.asarray(rows.shape[0], jnp.int32)
+    return ReplayState(episodes=episodes, priority=state.priority[rows], cursor=jnp.zeros_like(number), size=number)
+
+
+def newest_and_others(state: ReplayState, key: PRNGKey, newest: int, others: int) -> Array:
+    """Returns the rows [newest + others] of the newest episodes, and of others drawn at random, with replacement.
+
+    Rows of `newest` hold no episode where as many have not been written. The ring must not be empty for the others.
+    """
+    new = (state.cursor - 1 - jnp.arange(newest, dtype=jnp.int32)) % capacity(state)
+    return jnp.concatenate([new, randint_from_bits(jax.random.bits(key, (others,)), state.size)])
+
+
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
     """Draws `batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
 

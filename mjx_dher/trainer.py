@@ -33,7 +33,8 @@ from mjx_dher.view import View
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
-GENERATE = 0x476F616C  # folded into a cycle's key, for its goals; no index of `jax.random.split`
+# Folded into a cycle's key, for its goals and for the rows that are renewed; no indices of `jax.random.split`.
+GENERATE, RENEW = 0x476F616C, 0x52656E65
 
 
 @struct.dataclass
@@ -224,7 +225,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, split.key(normalizer_key))
     annealed = anneal(hparams, progress)
     view = _view(loop, learner, annealed, progress)
-    ring = priorities.renewed(loop.priority, ring, view)
+    ring = priorities.renewed(loop.priority, ring, view, _rows_to_renew(loop, state, ring, num_envs))
     learned, losses = _learn(loop, learner, ring, view, split.key(learn_key))
     # As long as the ring, or that of a part, is empty, nothing is learned.
     learner = jax.tree.map(lambda new, old: jnp.where(split.all(replay.can_sample(ring)), new, old), learned, learner)
@@ -245,6 +246,15 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 def _view(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> View:
     values = learners.values_of(loop.learner, learner, hparams) if loop.uses_values else None
     return View(loop.env.compute_reward, hparams, progress, values)
+
+
+def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState, num_new: int) -> Array | None:
+    """Returns the rows whose priorities are renewed after `num_new` episodes were added; None for all of them."""
+    number = loop.config.renewals * num_new
+    if loop.priority.renew is None or not 0 < number < replay.capacity(ring):
+        return None
+    key = loop.split.key(jax.random.fold_in(state.key, RENEW))
+    return replay.newest_and_others(ring, key, num_new, number - num_new)
 
 
 def _goals(loop: Loop, state: TrainState, progress: Array) -> Callable[[GoalObs], Array] | None:

@@ -1,0 +1,91 @@
+"""What is renewed of a ring's priorities at a cycle."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_trainer import SMALL
+
+from mjx_dher import HParams, make_train, priorities, replay, testing
+from mjx_dher.priorities import Priority
+from mjx_dher.view import View
+from point_mass import PointMass
+
+ENV = PointMass()
+VIEW = View(ENV.compute_reward, HParams())
+# The share of the run that has been made says at which cycle an episode was renewed.
+BY_CYCLE = Priority(renew=lambda ring, view: jnp.full(ring.priority.shape, 1.0 + view.progress))
+
+
+def ring_of(number, rows):
+    episodes = jax.tree.map(lambda x: x[:number], testing.trial.random_episodes(ENV))
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), rows), episodes, jnp.arange(1.0, number + 1))
+
+
+def test_the_newest_rows_come_first_and_the_others_are_of_the_whole_ring():
+    ring = ring_of(5, rows=8)
+    rows = np.asarray(replay.newest_and_others(ring, jax.random.key(0), 3, 1000))
+    np.testing.assert_array_equal(rows[:3], [4, 3, 2])
+    counts = np.bincount(rows[3:], minlength=8)
+    np.testing.assert_array_equal(counts[5:], 0)
+    assert (counts[:5] > 130).all()  # 200 each, 12.6 the standard deviation
+    around = dataclasses.replace(ring, cursor=jnp.int32(1), size=jnp.int32(8))
+    np.testing.assert_array_equal(replay.newest_and_others(around, jax.random.key(0), 3, 0), [0, 7, 6])
+
+
+def test_only_the_rows_that_are_named_are_renewed():
+    ring = ring_of(5, rows=8)
+    seen = []
+
+    def renew(part, view):
+        seen.append((part.priority, part.size, part.episodes))
+        return 10.0 + part.priority
+
+    rows = jnp.array([3, 1, 6, 3])  # a row twice, and one that holds no episode
+    renewed = priorities.renewed(Priority(renew=renew), ring, VIEW, rows)
+    np.testing.assert_array_equal(renewed.priority, [1, 12, 3, 14, 5, 0, 0, 0])
+    ((weights, size, episodes),) = seen
+    np.testing.assert_array_equal(weights, [4, 2, 0, 4])
+    assert size == 4
+    np.testing.assert_array_equal(episodes.achieved_goal[1], ring.episodes.achieved_goal[1])
+    np.testing.assert_array_equal((renewed.size, renewed.cursor), (ring.size, ring.cursor))
+
+
+def test_weights_of_the_wrong_number_are_refused():
+    with pytest.raises(ValueError, match=r"weights \[E\] = \[2\]; this one gives \[8\]"):
+        priorities.renewed(Priority(renew=lambda part, view: jnp.ones(8)), ring_of(5, rows=8), VIEW, jnp.array([0, 1]))
+
+
+def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
+    rows, ring = jnp.array([0, 2]), ring_of(5, rows=8)
+    joined = priorities.one_of([priorities.eventful, BY_CYCLE])
+    for number, alone in enumerate((priorities.whole(priorities.eventful), BY_CYCLE)):
+        found = priorities.renewed(joined, ring, VIEW._replace(hparams=choice(number)), rows)
+        np.testing.assert_array_equal(found.priority, priorities.renewed(alone, ring, VIEW, rows).priority)
+
+
+def choice(number):
+    @dataclasses.dataclass
+    class Choice:
+        priority_choice: int
+
+    return Choice(number)
+
+
+@pytest.mark.parametrize("renewals", [0, 1, 2, 10**6])
+def test_a_run_renews_its_own_episodes_and_as_many_others_as_it_is_told(renewals):
+    config = dataclasses.replace(SMALL, renewals=renewals, cycles_per_epoch=4)
+    config = dataclasses.replace(config, total_steps=4 * config.num_envs * ENV.episode_length)
+    train = make_train(ENV, config, priority=BY_CYCLE)
+    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
+    number = config.num_envs
+    cycle = np.round((np.asarray(state.replay.priority[: 4 * number]).reshape(4, number) - 1.0) * 4)
+    if renewals in (0, 10**6):  # all of the ring, at the last cycle
+        np.testing.assert_array_equal(cycle, 3)
+    else:
+        assert (cycle >= np.arange(4)[:, None]).all()
+        np.testing.assert_array_equal(cycle[3], 3)
+        others = int((cycle > np.arange(4)[:, None]).sum())
+        assert others == 0 if renewals == 1 else 0 < others < 3 * number
