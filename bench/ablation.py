@@ -18,9 +18,8 @@ from collections.abc import Callable
 from typing import Any
 
 import bakeoff
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes, tuned
 
-from mjx_dher import presets
 from mjx_dher.spec import RunSpec
 
 PLAIN = {"tqc": "sac", "dtqc": "td3"}  # a mean in place of quantiles
@@ -65,12 +64,13 @@ ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's.
+    """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's, as the bake-off has it.
 
     The priority is `eventful` in all arms, and returns have three steps in all but `one_step` and `ddpg`. The presets differ:
-    that of Slide has the priority `td_error`, and that of PickAndPlace returns of one step.
+    that of Slide has the priority `td_error`, and that of PickAndPlace smaller networks, returns of one step and `energy`.
     """
-    run = dataclasses.replace(presets.preset(learner, "slide" if toy else task, priority="eventful"), env=task)
+    del learner
+    run = dataclasses.replace(tuned("slide" if toy else task, priority="eventful"), env=task)
     sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task].changes
     return CHANGES[arm.name](sized(run, n_step=3, **sizes))
 

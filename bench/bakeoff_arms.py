@@ -184,14 +184,25 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
     return parts
 
 
+def tuned(task: str, **parts: str) -> RunSpec:
+    """Returns the run of the preset `gpu` that these experiments start from, with `parts` in place of its own.
+
+    PickAndPlace's is the one of until 2026-11-25: that of `frugal` with 512 environments and a larger ring.
+    """
+    if task != "pick_and_place":
+        return presets.preset("gpu", task, **parts)
+    run = presets.preset("frugal", task, **parts)
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, num_envs=512, replay_size=4_000_000))
+
+
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Returns a run of an arm, seed 0.
 
-    `paper` is DDPG under the paper's settings, `best` the preset `gpu` with `eventful`. Priorities choose the whole batch in
+    `paper` is DDPG under the paper's settings, `best` what `tuned` gives, with `eventful`. Priorities choose the whole batch in
     `paper`, as their authors do, and in `best` the preset's half of it, where they take the place of `eventful`.
     """
     parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
-    run = presets.preset("paper" if learner == "paper" else "gpu", task, **parts)
+    run = presets.preset("paper", task, **parts) if learner == "paper" else tuned(task, **parts)
     # A ring of all that is played: a larger one costs memory alone.
     changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}
     numbers = dict(arm.numbers)

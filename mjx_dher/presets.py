@@ -111,7 +111,8 @@ def _paper(env: str) -> tuple[Config, HParams]:
     return config, HParams(random_noise=1.0, adam_eps=1e-8 / workers)
 
 
-def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
+def _entropy_pick_and_place(env: str) -> tuple[Config, HParams]:
+    """Returns the settings of PickAndPlace that its presets, all of them with `tqc`, have in common or start from."""
     config, hparams = _gpu(env)
     config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000)
     return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
@@ -129,18 +130,24 @@ def _small(config: Config, hparams: HParams, **sizes: Any) -> tuple[Config, HPar
     return config, hparams._replace(target_noise=0.0)
 
 
+def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
+    config, hparams = _small(*_entropy_pick_and_place(env), num_envs=256, updates_per_cycle=500, policy_delay=2)
+    return config, hparams._replace(critic_lr=3e-3)
+
+
 def _cpu_push(env: str) -> tuple[Config, HParams]:
     config, hparams = _small(*_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000)
     return config, hparams._replace(critic_lr=2e-3)
 
 
 def _cpu_slide(env: str) -> tuple[Config, HParams]:
-    config, hparams = _small(*_cpu(env), updates_per_cycle=96, policy_delay=2, n_step=3, total_steps=1_296_000)
-    return config, hparams._replace(noise_std=0.1, random_eps=0.2, her_k=4.0)
+    config = dataclasses.replace(_cpu(env)[0], num_envs=256, cycles_per_epoch=2, total_steps=1_280_000, replay_size=1_280_000)
+    config, hparams = _small(config, _cpu(env)[1], updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5)
+    return config, hparams._replace(critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
 def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu_pick_and_place(env)
+    config, hparams = _entropy_pick_and_place(env)
     # An epoch a cycle: on two cores a cycle takes some ten seconds.
     config = dataclasses.replace(config, cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000)
     return _small(config, hparams, policy_delay=2)
@@ -160,7 +167,7 @@ def _frugal_push(env: str) -> tuple[Config, HParams]:
 
 
 def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu_pick_and_place(env)
+    config, hparams = _entropy_pick_and_place(env)
     return dataclasses.replace(config, num_envs=64, total_steps=500_000, replay_size=500_000), hparams
 
 
@@ -181,8 +188,8 @@ _DDPG = _Best("ddpg", "mlp", None)
 _LEARNERS = {
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
-    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide),
-    ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place),
+    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
+    ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", _frugal_push),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", _frugal_pick_and_place),
