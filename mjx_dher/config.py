@@ -88,8 +88,8 @@ class Config:
     n_step: Annotated[int, Number("[1, 1000]")] = 1
     """Steps of a return that are taken from the episode, before the value of the state that they lead to."""
     renewals: Annotated[int, Number("[0, 1000000]")] = 0
-    """Episodes whose priority is renewed at a cycle, for each that it plays: these, and others drawn at random. 0: the whole
-    ring at every cycle, as for `max_entropy`, which ranks all episodes. Priorities that are not renewed do not read it."""
+    """Episodes whose priority is renewed at a cycle, for each that it plays: these, and others drawn at random; 0: the whole
+    ring. Read by priorities that are renewed and weigh each episode alone: of the built-in ones, td_error."""
     eval_episodes: Count = 100
     """Episodes of the deterministic evaluation that ends each epoch."""
 

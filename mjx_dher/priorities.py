@@ -28,8 +28,7 @@ CANDIDATES = 4  # transitions that are drawn for each that a priority of transit
 
 # priority(episode, compute_reward, hparams) -> weight [], 0 or more
 PriorityFn = Callable[[Episode, RewardFn, HParams], Array]
-# renew(ring, view) -> weights [E] of all its rows, 0 or more; what they are for empty rows does not matter. With
-# `Config.renewals` the ring is one of some episodes, new ones and others.
+# renew(ring, view) -> weights [E] of all its rows, 0 or more; what they are for empty rows does not matter
 RenewFn = Callable[[ReplayState, View], Array]
 # choose(key, sample [CANDIDATES * B], batch [CANDIDATES * B], number B, view) -> indices [B] of the candidates
 ChooseFn = Callable[[PRNGKey, Sample, Batch, int, View], Array]
@@ -43,6 +42,8 @@ class Priority:
     renew: RenewFn | None = None  # episodes of the ring, at each cycle, before anything is learned
     choose: ChooseFn | None = None  # among transitions, hindsight goals in place
     uses_values: bool = False  # of `view.values`
+    # Whether `renew` weighs each episode alone. Then it may be handed a ring of some of them (`Config.renewals`).
+    by_part: bool = False
 
 
 def eventful(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
@@ -206,4 +207,5 @@ def one_of(choices: Sequence[Priority | PriorityFn]) -> Priority:
         renew=renew if any(own.renew for own in made) else None,
         choose=choose if any(own.choose for own in made) else None,
         uses_values=any(own.uses_values for own in made),
+        by_part=all(own.by_part for own in made if own.renew),
     )

@@ -251,7 +251,7 @@ def _view(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> Vie
 def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState, num_new: int) -> Array | None:
     """Returns the rows whose priorities are renewed after `num_new` episodes were added; None for all of them."""
     number = loop.config.renewals * num_new
-    if loop.priority.renew is None or not 0 < number < replay.capacity(ring):
+    if loop.priority.renew is None or not loop.priority.by_part or not 0 < number < replay.capacity(ring):
         return None
     key = loop.split.key(jax.random.fold_in(state.key, RENEW))
     return replay.newest_and_others(ring, key, num_new, number - num_new)

@@ -9,6 +9,7 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, make_train, priorities, replay, testing
+from mjx_dher.methods import episodes, transitions
 from mjx_dher.priorities import Priority
 from mjx_dher.view import View
 from point_mass import PointMass
@@ -16,12 +17,12 @@ from point_mass import PointMass
 ENV = PointMass()
 VIEW = View(ENV.compute_reward, HParams())
 # The share of the run that has been made says at which cycle an episode was renewed.
-BY_CYCLE = Priority(renew=lambda ring, view: jnp.full(ring.priority.shape, 1.0 + view.progress))
+BY_CYCLE = Priority(renew=lambda ring, view: jnp.full(ring.priority.shape, 1.0 + view.progress), by_part=True)
 
 
 def ring_of(number, rows):
-    episodes = jax.tree.map(lambda x: x[:number], testing.trial.random_episodes(ENV))
-    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), rows), episodes, jnp.arange(1.0, number + 1))
+    played = jax.tree.map(lambda x: x[:number], testing.trial.random_episodes(ENV))
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], played), rows), played, jnp.arange(1.0, number + 1))
 
 
 def test_the_newest_rows_come_first_and_the_others_are_of_the_whole_ring():
@@ -46,10 +47,10 @@ def test_only_the_rows_that_are_named_are_renewed():
     rows = jnp.array([3, 1, 6, 3])  # a row twice, and one that holds no episode
     renewed = priorities.renewed(Priority(renew=renew), ring, VIEW, rows)
     np.testing.assert_array_equal(renewed.priority, [1, 12, 3, 14, 5, 0, 0, 0])
-    ((weights, size, episodes),) = seen
+    ((weights, size, handed),) = seen
     np.testing.assert_array_equal(weights, [4, 2, 0, 4])
     assert size == 4
-    np.testing.assert_array_equal(episodes.achieved_goal[1], ring.episodes.achieved_goal[1])
+    np.testing.assert_array_equal(handed.achieved_goal[1], ring.episodes.achieved_goal[1])
     np.testing.assert_array_equal((renewed.size, renewed.cursor), (ring.size, ring.cursor))
 
 
@@ -74,14 +75,31 @@ def choice(number):
     return Choice(number)
 
 
+def renewed_at(renewals, priority):
+    """The cycle, of four, at which the episodes of each cycle were renewed last."""
+    number, cycles = SMALL.num_envs, 4
+    steps = cycles * number * ENV.episode_length
+    config = dataclasses.replace(SMALL, renewals=renewals, cycles_per_epoch=cycles, total_steps=steps, replay_size=2 * steps)
+    train = make_train(ENV, config, priority=priority)
+    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
+    return np.round((np.asarray(state.replay.priority[: cycles * number]).reshape(cycles, number) - 1.0) * cycles)
+
+
+def test_a_priority_that_compares_episodes_is_handed_all_of_them():
+    for priority in (
+        dataclasses.replace(BY_CYCLE, by_part=False),
+        priorities.one_of([BY_CYCLE, dataclasses.replace(BY_CYCLE, by_part=False)]),
+    ):
+        assert not priority.by_part
+    np.testing.assert_array_equal(renewed_at(1, dataclasses.replace(BY_CYCLE, by_part=False)), 3)
+    assert priorities.one_of([priorities.eventful, BY_CYCLE]).by_part
+    assert transitions.td_error.by_part
+    assert not episodes.max_entropy.by_part
+
+
 @pytest.mark.parametrize("renewals", [0, 1, 2, 10**6])
 def test_a_run_renews_its_own_episodes_and_as_many_others_as_it_is_told(renewals):
-    config = dataclasses.replace(SMALL, renewals=renewals, cycles_per_epoch=4)
-    config = dataclasses.replace(config, total_steps=4 * config.num_envs * ENV.episode_length)
-    train = make_train(ENV, config, priority=BY_CYCLE)
-    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
-    number = config.num_envs
-    cycle = np.round((np.asarray(state.replay.priority[: 4 * number]).reshape(4, number) - 1.0) * 4)
+    cycle, number = renewed_at(renewals, BY_CYCLE), SMALL.num_envs
     if renewals in (0, 10**6):  # all of the ring, at the last cycle
         np.testing.assert_array_equal(cycle, 3)
     else:

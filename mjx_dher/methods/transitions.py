@@ -123,4 +123,4 @@ dpp = Priority(weigh=diversity, choose=in_groups(pick_diverse, 2))
 curriculum = Priority(choose=in_groups(pick_curriculum, CURRICULUM_GROUP))
 not_misleading = Priority(choose=by_weight(not_misled))
 # Luu & Yoo 2021 ("HGR"): episodes by their mean error, then hindsight goals by theirs.
-td_error = Priority(renew=mean_error, choose=by_weight(_error_size), uses_values=True)
+td_error = Priority(renew=mean_error, choose=by_weight(_error_size), uses_values=True, by_part=True)
