@@ -6,7 +6,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from test_replay import T, make_episodes, make_ring
 
@@ -52,7 +52,7 @@ def test_what_can_run_is_taken_and_its_sizes_agree(found):
 
 def test_every_size_and_every_number_has_a_range():
     assert set(SIZES) == {field.name for field in dataclasses.fields(Config) if type(field.default) is int}
-    assert len(SIZES) == 14
+    assert len(SIZES) == 15
     assert INTERVALS.keys() == {*SIZES, "hidden_sizes", *HParams._fields}
 
 
@@ -62,6 +62,7 @@ NO_COUNTS = st.one_of(st.integers(-(10**6), 0), st.floats(), st.booleans(), st.n
 @given(configs(), st.sampled_from(SIZES), NO_COUNTS)
 @every_run_alike
 def test_what_is_no_count_is_refused_by_the_name_of_its_field(found, field, value):
+    assume(not (type(value) is int and value == 0 and INTERVALS[field].startswith("[0")))
     must = "lie" if type(value) is int else "be an integer"
     message = f"{field} must {must} in {INTERVALS[field]}; got {value!r}"
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
