@@ -187,7 +187,7 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
 def tuned(task: str, **parts: str) -> RunSpec:
     """Returns the run of the preset `gpu` that these experiments start from, with `parts` in place of its own.
 
-    PickAndPlace's is the one of until 2026-11-25: that of `frugal` with 512 environments and a larger ring.
+    For PickAndPlace it is that preset as it was until 2026-11-25: `frugal` with 512 environments and a larger ring.
     """
     if task != "pick_and_place":
         return presets.preset("gpu", task, **parts)

@@ -112,7 +112,7 @@ def _paper(env: str) -> tuple[Config, HParams]:
 
 
 def _entropy_pick_and_place(env: str) -> tuple[Config, HParams]:
-    """Returns the settings of PickAndPlace that its presets, all of them with `tqc`, have in common or start from."""
+    """Returns the settings that the presets of PickAndPlace with `tqc` start from."""
     config, hparams = _gpu(env)
     config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000)
     return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
@@ -141,8 +141,8 @@ def _cpu_push(env: str) -> tuple[Config, HParams]:
 
 
 def _cpu_slide(env: str) -> tuple[Config, HParams]:
-    config = dataclasses.replace(_cpu(env)[0], num_envs=256, cycles_per_epoch=2, total_steps=1_280_000, replay_size=1_280_000)
-    config, hparams = _small(config, _cpu(env)[1], updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5)
+    config, hparams = _small(*_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5)
+    config = dataclasses.replace(config, cycles_per_epoch=2, total_steps=1_280_000, replay_size=1_280_000)
     return config, hparams._replace(critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 

@@ -1,6 +1,7 @@
 """What is renewed of a ring's priorities at a cycle."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -63,16 +64,8 @@ def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
     rows, ring = jnp.array([0, 2]), ring_of(5, rows=8)
     joined = priorities.one_of([priorities.eventful, BY_CYCLE])
     for number, alone in enumerate((priorities.whole(priorities.eventful), BY_CYCLE)):
-        found = priorities.renewed(joined, ring, VIEW._replace(hparams=choice(number)), rows)
+        found = priorities.renewed(joined, ring, VIEW._replace(hparams=SimpleNamespace(priority_choice=number)), rows)
         np.testing.assert_array_equal(found.priority, priorities.renewed(alone, ring, VIEW, rows).priority)
-
-
-def choice(number):
-    @dataclasses.dataclass
-    class Choice:
-        priority_choice: int
-
-    return Choice(number)
 
 
 def renewed_at(renewals, priority):
