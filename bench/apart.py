@@ -19,7 +19,7 @@ def measured(script: str, args: Sequence[str], environ: Mapping[str, str] | None
       environ: variables to add to this program's environment.
       python: interpreter that runs the script; it need not have this library.
     """
-    from mjx_dher.host import subprocesses
+    from mjx_dher.system import subprocesses
 
     answer = subprocesses.ask([python, script, MEASURE, *args], environ)
     if answer.failure:

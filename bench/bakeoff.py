@@ -32,13 +32,13 @@ from mjx_dher import envs, stats
 from mjx_dher.cli import sentence
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
-from mjx_dher.host import files
-from mjx_dher.host.caches import prepare
-from mjx_dher.runs import identity, results, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.stopping import Stop
+from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
+from mjx_dher.system import files
+from mjx_dher.system.caches import prepare
 
 TOY_TASK = "point_mass:PointMass"
 
@@ -88,7 +88,7 @@ def parse(
 
 def folder_of(args: argparse.Namespace, learner: str, task: str) -> Path:
     """Returns the folder of a sweep."""
-    return args.out / f"{learner}-{identity.in_a_path(task)}"
+    return args.out / f"{learner}-{fingerprint.in_a_path(task)}"
 
 
 def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> list[RunSpec]:
@@ -160,7 +160,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
 
 def is_done(args: argparse.Namespace, folder: Path, run: RunSpec) -> bool:
     """Returns whether a run has ended, in its folder or as one of --runs."""
-    return identity.trial_name(run) in args.known or grid.is_done(folder, run)
+    return fingerprint.trial_name(run) in args.known or grid.is_done(folder, run)
 
 
 def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
@@ -212,7 +212,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
     console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
         if own := [row for row in rows if row.task == task]:
-            path = args.out / f"{identity.in_a_path(task)}_forest.png"
+            path = args.out / f"{fingerprint.in_a_path(task)}_forest.png"
             forest(own, path, args.experiment.baseline)
             console.print(f"wrote {path}")
     return len(rows)

@@ -12,10 +12,10 @@ import numpy as np
 from bakeoff_arms import Experiment
 from bakeoff_report import Scores
 
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 
 class Run(NamedTuple):
@@ -90,7 +90,7 @@ def _check(where: str, run: Run, experiment: Experiment) -> None:
 
 def name_of(spec: RunSpec, seed: int) -> str:
     """Returns the name of the folder of a run with this seed."""
-    return identity.trial_name(dataclasses.replace(spec, seed=seed))
+    return fingerprint.trial_name(dataclasses.replace(spec, seed=seed))
 
 
 def merged(runs: Iterable[Run]) -> list[Run]:

@@ -270,7 +270,7 @@ def yardstick():
     import gymnasium as gym
     import gymnasium_robotics
 
-    from mjx_dher.tools.originals import ORIGINALS
+    from mjx_dher.tools.transfer import ORIGINALS
 
     warnings.filterwarnings("ignore")
     gym.register_envs(gymnasium_robotics)

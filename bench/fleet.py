@@ -192,22 +192,29 @@ def pretend(chunk, tell):
     import numpy as np
 
     from mjx_dher.fleet import parcels
-    from mjx_dher.host import files
-    from mjx_dher.runs import identity, run_folder, sinks
+    from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+    from mjx_dher.system import files
 
     packed, summary = [], {"success_rate": 0.5, "reset_success_rate": 0.0, "return_mean": -1.0, "episodes": 10}
     for spec in chunk.specs:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            run = identity.identity(spec, "native", identity.sources(spec))
+            run = fingerprint.identity(spec, "native", fingerprint.sources(spec))
             run_folder.create(folder, spec, "native", {})
-            log = sinks.CsvSink(folder / "metrics.csv", 0, identity.digest(run))
+            log = loggers.CsvSink(folder / "metrics.csv", 0, fingerprint.digest(run))
             for epoch in range(1, 11):
                 log.write({"epoch": epoch, "env_steps": epoch * 100, "updates": epoch, "wall_seconds": 0.1, **summary})
             log.close()
             weights = np.zeros(20_000, np.float32)
             np.savez(folder / "policy.npz", weights=weights, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
-            content = {"status": "finished", "reason": "", "epochs": 10, "lanes": 1, "digest": identity.digest(run), **summary}
+            content = {
+                "status": "finished",
+                "reason": "",
+                "epochs": 10,
+                "lanes": 1,
+                "digest": fingerprint.digest(run),
+                **summary,
+            }
             files.write_json(folder / "result.json", content)
             packed.append(parcels.pack(folder))
     return packed

@@ -188,7 +188,7 @@ def read(tasks):
     import gymnasium as gym
     import gymnasium_robotics
 
-    from mjx_dher.tools.originals import ORIGINALS
+    from mjx_dher.tools.transfer import ORIGINALS
 
     gym.register_envs(gymnasium_robotics)
     np.set_printoptions(precision=7, suppress=True, linewidth=200, threshold=60)

@@ -28,9 +28,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from mjx_dher.cli.settings import check_writable  # noqa: E402
-from mjx_dher.host import files  # noqa: E402
-from mjx_dher.host.files import FolderError  # noqa: E402
 from mjx_dher.sweeps import comparison, tables  # noqa: E402
+from mjx_dher.system import files  # noqa: E402
+from mjx_dher.system.files import FolderError  # noqa: E402
 
 CURVES = ROOT / "docs" / "paper"
 COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")

@@ -38,16 +38,16 @@ from typing import Any
 from peers_worker import EPISODE_LENGTH, FIRST_SEED, PEERS, ZOO, usable_cores
 
 from mjx_dher.config import check_count, check_number
-from mjx_dher.host import subprocesses
-from mjx_dher.host.caches import user_cache
-from mjx_dher.names import check_name, require_extra
-from mjx_dher.runs import run_folder, sinks
+from mjx_dher.lookup import check_name, require_extra
+from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.spec import LEARNERS, SAMPLERS
 from mjx_dher.stats import wilson_interval
-from mjx_dher.tools import originals
+from mjx_dher.system import subprocesses
+from mjx_dher.system.caches import user_cache
+from mjx_dher.tools import transfer
 
 HERE = Path(__file__).resolve().parent
-REQUIREMENTS = (*originals.REQUIREMENTS, "stable-baselines3==2.9.2", "sb3-contrib==2.9.2", "torch==2.13.0")
+REQUIREMENTS = (*transfer.REQUIREMENTS, "stable-baselines3==2.9.2", "sb3-contrib==2.9.2", "torch==2.13.0")
 TASKS = ("push", "pick_and_place", "slide")
 COLUMNS = ("who", "env", "seed", "seconds", "env_steps", "success_rate", "return_mean")
 SUCCESS = 0.9  # the table says when it was first reached
@@ -82,15 +82,15 @@ def find_python(given: Path | None) -> Path:
       ValueError: the one that is given lacks something, or pip failed; says what to do.
     """
     if given:
-        if not originals.is_ready(given, REQUIREMENTS):
+        if not transfer.is_ready(given, REQUIREMENTS):
             raise ValueError(f"{given} must have {', '.join(REQUIREMENTS)}")
         return given
     environment = user_cache() / "peers"
-    python = originals.interpreter(environment)
-    if not originals.is_ready(python, REQUIREMENTS):
+    python = transfer.interpreter(environment)
+    if not transfer.is_ready(python, REQUIREMENTS):
         print(f"making the peers' environment in {environment} ...", flush=True)
         try:
-            originals.set_up(environment, REQUIREMENTS)
+            transfer.set_up(environment, REQUIREMENTS)
         except (ValueError, OSError, subprocess.SubprocessError) as error:
             raise ValueError(
                 f"{error}\nThe peers need {', '.join(REQUIREMENTS)}: let pip reach a package index, or name with --python"
@@ -143,7 +143,7 @@ def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
         running = True
         while running:
             running = process.poll() is None  # before the rows are read: none is missed
-            for row in sinks.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
+            for row in loggers.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
                 if not run.rows:
                     first = time.perf_counter() - row["wall_seconds"]  # when training began
                     spec = run_folder.read_spec(folder)
@@ -154,7 +154,7 @@ def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
                 stopped = True
             time.sleep(0.2)
         check_ended(process, log, (0, 128 + signal.SIGTERM) if stopped else (0,))
-    outcome = originals.play_apart(folder, python, args.final_episodes, FIRST_SEED, usable_cores())
+    outcome = transfer.play_apart(folder, python, args.final_episodes, FIRST_SEED, usable_cores())
     run.final_success, run.final_return = outcome["success"].astype(int).tolist(), outcome["ret"].tolist()
     return run
 
@@ -163,7 +163,7 @@ def train_theirs(args: argparse.Namespace, learner: str, seed: int, python: Path
     """Runs a learner of the peers for the budget, then its policy for the final episodes."""
     changes = [f"{name}={value}".replace(" ", "") for name, value in args.settings.items() if value != ZOO[name]]
     run, log = Run(" ".join((PEERS[learner], *changes)), args.env, seed), args.out / f"{learner}_seed{seed}.log"
-    request = {"task": originals.ORIGINALS[args.env], "learner": learner, "settings": args.settings, "seed": seed}
+    request = {"task": transfer.ORIGINALS[args.env], "learner": learner, "settings": args.settings, "seed": seed}
     request |= {"seconds": 60 * args.minutes, "every": args.eval_every}
     request |= {"episodes": args.episodes, "final": args.final_episodes}
     began = time.perf_counter()
@@ -259,11 +259,11 @@ def print_rates(parts: Sequence[str], env_name: str, python: Path) -> None:
 
     rows = []
     for part in parts:
-        answer = subprocesses.ask(worker(python, part=part, task=originals.ORIGINALS[env_name]))
+        answer = subprocesses.ask(worker(python, part=part, task=transfer.ORIGINALS[env_name]))
         if answer.failure:
             raise ValueError(f"the part {part} failed: {answer.err.strip() or answer.failure}")
         rows += [(name, f"{rate:,.0f}") for name, rate in answer.last_json()["result"].items()]
-    print_table((f"the peers on {originals.ORIGINALS[env_name]}", "a second"), rows)
+    print_table((f"the peers on {transfer.ORIGINALS[env_name]}", "a second"), rows)
 
 
 # The command.

@@ -13,7 +13,7 @@ from pathlib import Path
 from reliability_pairs import ROOT, SHAPES, of_run, of_sweep
 
 from mjx_dher import Options, cli, envs, train_runs
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "docs" / "examples")]
 TOLD = ("total_steps", "final_episodes")  # what `resume` takes, and says so

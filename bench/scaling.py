@@ -20,9 +20,10 @@ from timing import print_table
 
 from mjx_dher import config as config_lib
 from mjx_dher import envs, presets
-from mjx_dher.host.caches import prepare
-from mjx_dher.runs import loop, mesh
-from mjx_dher.runs import program as program_lib
+from mjx_dher.parallel import mesh
+from mjx_dher.runs.program import loop
+from mjx_dher.runs.program import program as program_lib
+from mjx_dher.system.caches import prepare
 
 
 class Case:

@@ -29,8 +29,8 @@ import scipy.stats
 from timing import print_table
 
 from mjx_dher import cli, envs, rollout
-from mjx_dher.host import memory
-from mjx_dher.runs import sinks
+from mjx_dher.runs.folder import loggers
+from mjx_dher.system import memory
 
 BLOCKS = 10
 REFERENCE_EPISODES = 24  # some 0.1 s on two cores
@@ -126,11 +126,11 @@ def main() -> int:
     if args.reference:
         tell_speed()
         return 0
-    open_sinks = sinks.open_sinks
+    open_sinks = loggers.open_sinks
     with tempfile.TemporaryDirectory() as parent:
         out = args.out or Path(parent) / "soak.csv"
         watch = Watch(out, args.minutes * 60)
-        sinks.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
+        loggers.open_sinks = lambda *rest: [*open_sinks(*rest), watch]
         command = ["--env", args.env, "--total-steps", "1000000000", "--checkpoint-every", "20", "--log", "jsonl"]
         status = cli.main([*command, "--out", str(Path(parent) / "run"), *args.options])
         if status != 128 + signal.SIGTERM:

@@ -19,9 +19,9 @@ import jax
 from timing import print_table
 
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats, trainer
-from mjx_dher.host.caches import keep_compiled_programs
-from mjx_dher.runs.loop import train
 from mjx_dher.runs.play import play
+from mjx_dher.runs.program.loop import train
+from mjx_dher.system.caches import keep_compiled_programs
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Puts the policy of a run into the package, with a card: `python docs/publish_policy.py RUN --machine "..." --commit ...`.
 
-The run folder is copied to mjx_dher/policies, under the name of its task, in place of the policy that is there. Before that the
-policy is played, here and, where the originals' environment is set up (`train.py transfer --set-up`), in the original task.
+Copies the run folder to mjx_dher/policy/bundled, under the name of its task, and replaces the policy there. Before that it
+plays the policy here and, where the originals' environment is set up (`train.py transfer --set-up`), in the original task.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from mjx_dher import envs, policies, presets, spec  # noqa: E402
-from mjx_dher.host import files  # noqa: E402
-from mjx_dher.runs import results, run_folder  # noqa: E402
+from mjx_dher import envs, presets, spec  # noqa: E402
+from mjx_dher.policy import bundled  # noqa: E402
+from mjx_dher.runs.folder import results, run_folder  # noqa: E402
 from mjx_dher.spec import RunSpec  # noqa: E402
+from mjx_dher.system import files  # noqa: E402
 
 LIMIT = 5_000_000  # bytes of all policies together
 KEPT = (run_folder.CONFIG_FILE, run_folder.METRICS_FILE, run_folder.POLICY_FILE, run_folder.RESULT_FILE)
@@ -59,7 +60,7 @@ def _text(value: Any) -> str:
 def card(folder: Path) -> str:
     """Returns the card of the policy in `folder`, made of what is there: config.json, result.json and card.json."""
     content, run = run_folder.read(folder)
-    result, facts = results.read(folder), policies.facts(folder)
+    result, facts = results.read(folder), bundled.facts(folder)
     versions = content["versions"]
     sizes = ", ".join(map(str, run.config.hidden_sizes))
     rows = {
@@ -123,10 +124,10 @@ def check(folder: Path, run: RunSpec) -> None:
 def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) -> dict[str, Any]:
     """Plays the policy here, on native, and in the original where `python` has it; returns both summaries."""
     from mjx_dher.envs.engines.native import usable_cores
-    from mjx_dher.host.caches import keep_compiled_programs
-    from mjx_dher.runs.load import check_fits, check_plain, load_policy
+    from mjx_dher.policy.load import check_fits, check_plain, load_policy
     from mjx_dher.runs.play import play, summarize
-    from mjx_dher.tools import originals
+    from mjx_dher.system.caches import keep_compiled_programs
+    from mjx_dher.tools import transfer
 
     policy = load_policy(folder)
     check_plain(policy, run, "the package")
@@ -134,11 +135,11 @@ def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) 
     env = envs.make(run.env, engine="native")
     check_fits(policy, env)
     here = {**summarize(*play(env, policy, episodes, seed)), "seed": seed, "physics": "native"}
-    if not originals.is_ready(python):
+    if not transfer.is_ready(python):
         return {"here": here, "original": None}
-    theirs = originals.play_apart(folder, python, episodes, seed, workers=usable_cores())
+    theirs = transfer.play_apart(folder, python, episodes, seed, workers=usable_cores())
     summary = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
-    about = {"seed": seed, "task": originals.ORIGINALS[run.env], "versions": list(originals.REQUIREMENTS)}
+    about = {"seed": seed, "task": transfer.ORIGINALS[run.env], "versions": list(transfer.REQUIREMENTS)}
     return {"here": here, "original": {**summary, **about}}
 
 
@@ -148,8 +149,8 @@ def publish(folder: Path, target: Path, facts: dict[str, Any], anyway: bool) -> 
     Raises:
       ValueError: the policy there is better, unless `anyway`, or all policies together are too large.
     """
-    if (target / policies.FACTS).exists() and not anyway:
-        before = policies.facts(target)["here"]["success_rate"]
+    if (target / bundled.FACTS).exists() and not anyway:
+        before = bundled.facts(target)["here"]["success_rate"]
         if before > facts["here"]["success_rate"]:
             raise ValueError(
                 f"the policy there scores {before:.3f}, this one {facts['here']['success_rate']:.3f}; see --anyway"
@@ -162,13 +163,13 @@ def publish(folder: Path, target: Path, facts: dict[str, Any], anyway: bool) -> 
     files.make_folder(target)
     for name in KEPT:
         shutil.copyfile(folder / name, target / name)
-    files.write_json(target / policies.FACTS, facts)
-    (target / policies.CARD).write_text(card(target))
+    files.write_json(target / bundled.FACTS, facts)
+    (target / bundled.CARD).write_text(card(target))
 
 
 def main(argv: Sequence[str]) -> None:
     """Publishes a run's policy."""
-    from mjx_dher.tools import originals
+    from mjx_dher.tools import transfer
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?")
@@ -177,12 +178,12 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--commit", help="that it was trained with")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--python", type=Path, default=originals.interpreter(originals.default_environment()))
+    parser.add_argument("--python", type=Path, default=transfer.interpreter(transfer.default_environment()))
     parser.add_argument("--anyway", action="store_true", help="also where the policy that is there is better")
     args = parser.parse_args(argv)
     if args.cards:
-        for name in policies.names():
-            (policies.FOLDER / name / policies.CARD).write_text(card(policies.FOLDER / name))
+        for name in bundled.names():
+            (bundled.FOLDER / name / bundled.CARD).write_text(card(bundled.FOLDER / name))
         return
     if None in (args.run, args.machine, args.commit):
         raise ValueError("a run, --machine and --commit are needed")
@@ -190,9 +191,9 @@ def main(argv: Sequence[str]) -> None:
     check(args.run, run)
     facts = {"machine": args.machine, "commit": args.commit, "date": datetime.date.today().isoformat()}
     facts |= measure(args.run, run, args.episodes, args.seed, args.python)
-    target = policies.FOLDER / run.env
+    target = bundled.FOLDER / run.env
     publish(args.run, target, facts, args.anyway)
-    print((target / policies.CARD).read_text())
+    print((target / bundled.CARD).read_text())
 
 
 if __name__ == "__main__":

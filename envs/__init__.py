@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.names import check_name, load_import_path
+from mjx_dher.lookup import check_name, load_import_path
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State

@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 
 from mjx_dher.config import check_count, check_number
+from mjx_dher.envs.arm_kinematics import Chain, integrate
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Physics, make_engine
-from mjx_dher.envs.kinematics import Chain, integrate
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second

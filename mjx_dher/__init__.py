@@ -6,17 +6,9 @@ Importing this package loads neither JAX nor MuJoCo; each name below loads what 
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
-
-# In a checkout that was not installed, the environments lie beside this package, not in it.
-_checkout = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
-if not os.path.isdir(os.path.join(_checkout, "mjx_dher", "envs")) and os.path.isfile(
-    os.path.join(_checkout, "envs", "fetch.py")
-):
-    __path__.append(_checkout)
 
 if TYPE_CHECKING:
     from mjx_dher import (
@@ -38,11 +30,11 @@ if TYPE_CHECKING:
     from mjx_dher.config import Config, HParams
     from mjx_dher.learners import ddpg
     from mjx_dher.policy import Policy
+    from mjx_dher.policy.load import load_policy
     from mjx_dher.presets import preset
     from mjx_dher.runs.driver import train_runs
-    from mjx_dher.runs.load import load_policy
-    from mjx_dher.runs.loop import train
     from mjx_dher.runs.options import Options
+    from mjx_dher.runs.program.loop import train
     from mjx_dher.spec import RunSpec
     from mjx_dher.trainer import TrainState, make_train
 
@@ -84,10 +76,10 @@ _HOME = {
     "RunSpec": "spec",
     "TrainState": "trainer",
     "ddpg": "learners.ddpg",
-    "load_policy": "runs.load",
+    "load_policy": "policy.load",
     "make_train": "trainer",
     "preset": "presets",
-    "train": "runs.loop",
+    "train": "runs.program.loop",
     "train_runs": "runs.driver",
 }
 

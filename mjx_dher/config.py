@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
-from mjx_dher.names import check_name
+from mjx_dher.lookup import check_name
 
 INT32_MAX = 2**31 - 1  # counters on the device are int32
 MAX_DEVICES = 1_000_000

@@ -16,11 +16,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import names
+from mjx_dher import lookup
+from mjx_dher.context import View, pick
 from mjx_dher.replay import ReplayState
 from mjx_dher.spec import GENERATORS
 from mjx_dher.types import Array, GoalObs, PRNGKey
-from mjx_dher.view import View, pick
 
 # generator(key, obs with leading [N], ring, view) -> goals [N, G]
 GenerateFn = Callable[[PRNGKey, GoalObs, ReplayState, View], Array]
@@ -51,10 +51,10 @@ def make(name: str | Generator | GenerateFn) -> Generator:
     """
     value: Any = name
     if isinstance(name, str):
-        names.check_name("generator", name, GENERATORS, own=True)
-        value = names.load_import_path("generator", GENERATORS.get(name, name))
+        lookup.check_name("generator", name, GENERATORS, own=True)
+        value = lookup.load_import_path("generator", GENERATORS.get(name, name))
     generator = value if isinstance(value, Generator) else Generator(value)
-    names.check_function("generator", generator.generate, ("key", "obs", "ring", "view"))
+    lookup.check_function("generator", generator.generate, ("key", "obs", "ring", "view"))
     return generator
 
 

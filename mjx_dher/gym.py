@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjx_dher.config import check_count
-from mjx_dher.names import check_name, missing_extra
+from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.tools import render
-from mjx_dher.tools.programs import Programs, programs
+from mjx_dher.tools.gym_cache import Programs, programs
 
 try:
     import gymnasium

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.spec import NETWORKS
 from mjx_dher.types import Array, PRNGKey, Sizes
 
@@ -139,7 +139,7 @@ def make(name: str | NetworksFn) -> NetworksFn:
     Raises:
       ValueError: no such networks, or no function of (action_size, hidden_sizes, dtype).
     """
-    return names.resolve("networks", name, NETWORKS, _PARAMETERS)
+    return lookup.resolve("networks", name, NETWORKS, _PARAMETERS)
 
 
 def check_heads(make_networks: NetworksFn, learner: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher.split import ALONE, Split
+from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.types import Array
 
 

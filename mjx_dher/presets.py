@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 from mjx_dher.config import Config, HParams
-from mjx_dher.names import check_name
+from mjx_dher.lookup import check_name
 from mjx_dher.spec import RunSpec
 
 Preset = Literal["cpu", "gpu", "frugal", "paper"]

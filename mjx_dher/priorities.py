@@ -17,12 +17,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import names, replay
+from mjx_dher import lookup, replay
 from mjx_dher.config import HParams
+from mjx_dher.context import View, pick
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.spec import PRIORITIES
 from mjx_dher.types import Array, Batch, Episode, PRNGKey, RewardFn
-from mjx_dher.view import View, pick
 
 CANDIDATES = 4  # transitions that are drawn for each that a priority of transitions chooses
 
@@ -66,10 +66,10 @@ def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
     """
     value: Any = name
     if isinstance(name, str):
-        names.check_name("priority", name, PRIORITIES, own=True)
-        value = names.load_import_path("priority", PRIORITIES.get(name, name))
+        lookup.check_name("priority", name, PRIORITIES, own=True)
+        value = lookup.load_import_path("priority", PRIORITIES.get(name, name))
     if not isinstance(value, Priority):
-        return names.check_function("priority", value, ("episode", "compute_reward", "hparams"))
+        return lookup.check_function("priority", value, ("episode", "compute_reward", "hparams"))
     given = {
         "weigh": (value.weigh, ("episode", "compute_reward", "hparams")),
         "renew": (value.renew, ("ring", "view")),
@@ -77,7 +77,7 @@ def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
     }
     for part, (function, parameters) in given.items():
         if function is not None:
-            names.check_function(f"priority: {part}", function, parameters)
+            lookup.check_function(f"priority: {part}", function, parameters)
     if all(function is None for function, _ in given.values()):
         raise ValueError("a Priority has weigh, renew or choose; this one has none of them")
     return value

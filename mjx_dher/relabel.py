@@ -12,11 +12,11 @@ import jax.numpy as jnp
 
 from mjx_dher import priorities, replay, samplers
 from mjx_dher.config import HParams
+from mjx_dher.context import View
 from mjx_dher.priorities import Priority
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
-from mjx_dher.view import View
 
 CHOOSE = 0x43686F69  # folded into a draw's key, for what chooses among transitions; no index of `jax.random.split`
 

@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import names, readings
+from mjx_dher import distance_normalization, lookup
 from mjx_dher.config import HParams
-from mjx_dher.readings import NormalizationFn
+from mjx_dher.context import pick
+from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.scores import LearnedMetric, ScoreFn, make_metric, score_of
 from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from mjx_dher.types import Array, Episode, PRNGKey
-from mjx_dher.view import pick
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; of a sampler with a score, (..., hparams, score [T+1])
 LogWeightsFn = Callable[..., Array]
@@ -139,7 +139,7 @@ def weighted(
     hparams: HParams,
     kernel: KernelFn,
     metric: MetricFn = position,
-    normalization: NormalizationFn = readings.by_mean,
+    normalization: NormalizationFn = distance_normalization.by_mean,
 ) -> Array:
     """Prefers future goals that are nearer to the desired goal (the paper's method 3).
 
@@ -169,7 +169,7 @@ def weighted(
     relative = _checked("a normalization gives relative distances", normalization, relative, mask.size)
     log_weights = _checked("a kernel gives log weights", kernel, kernel(relative, hparams.temperature), mask.size)
     log_weights = jnp.where(mask, log_weights, -jnp.inf)
-    if kernel is not linear or normalization in (readings.by_mean, readings.mirrored):
+    if kernel is not linear or normalization in (distance_normalization.by_mean, distance_normalization.mirrored):
         return log_weights  # by the mean, some candidate has r <= 1, and a weight
     beyond = jnp.all(log_weights == -jnp.inf)
     relative = jnp.where(mask, relative, jnp.inf)
@@ -223,11 +223,11 @@ def make(
     """
     if not isinstance(name, str):
         return _to_sampler(name)
-    names.check_name("sampler", name, SAMPLERS, own=True)
-    kernel = names.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
+    lookup.check_name("sampler", name, SAMPLERS, own=True)
+    kernel = lookup.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
     distance = make_metric(metric)
     parameters = ("distance", "candidates", "scale")
-    normalization = names.resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, parameters)
+    normalization = lookup.resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, parameters)
     by_distance: dict[str, LogWeightsFn] = {
         "closest": closest,
         "epsilon_closest": epsilon_closest,
@@ -237,7 +237,7 @@ def make(
         return _by_metric(by_distance[name], distance)
     if name in _PLAIN:
         return _PLAIN[name]
-    return _to_sampler(names.load_import_path("sampler", SAMPLERS_ELSEWHERE.get(name, name)))
+    return _to_sampler(lookup.load_import_path("sampler", SAMPLERS_ELSEWHERE.get(name, name)))
 
 
 def _by_metric(log_weights: LogWeightsFn, metric: MetricFn | LearnedMetric) -> Sampler:
@@ -255,9 +255,9 @@ def _to_sampler(sampler: Any) -> Sampler:
     if not isinstance(sampler, Sampler):
         sampler = Sampler(sampler)
     parameters = ("achieved", "desired", "step", "hparams")
-    names.check_function("sampler", sampler.log_weights, parameters if sampler.score is None else (*parameters, "score"))
+    lookup.check_function("sampler", sampler.log_weights, parameters if sampler.score is None else (*parameters, "score"))
     if sampler.score is not None:
-        names.check_function("sampler: score", sampler.score, ("episode", "view"))
+        lookup.check_function("sampler: score", sampler.score, ("episode", "view"))
         if sampler.cross_episode is True:
             raise ValueError("a sampler with a score takes goals of its own episode; this one has cross_episode, too")
     if not (isinstance(sampler.cross_episode, bool) or callable(sampler.cross_episode)):

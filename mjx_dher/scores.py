@@ -13,10 +13,10 @@ from typing import Any
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import names
+from mjx_dher import lookup
+from mjx_dher.context import View, of_each_episode
 from mjx_dher.spec import METRICS
 from mjx_dher.types import Array, Episode
-from mjx_dher.view import View, of_each_episode
 
 # score(episode, view) -> [T+1]
 ScoreFn = Callable[[Episode, View], Array]
@@ -37,12 +37,12 @@ def make_metric(metric: Any) -> Any:
     """
     value = metric
     if isinstance(metric, str):
-        names.check_name("metric", metric, METRICS, own=True)
-        value = names.load_import_path("metric", METRICS.get(metric, metric))
+        lookup.check_name("metric", metric, METRICS, own=True)
+        value = lookup.load_import_path("metric", METRICS.get(metric, metric))
     if isinstance(value, LearnedMetric):
-        names.check_function("metric: score", value.score, ("episode", "view"))
+        lookup.check_function("metric: score", value.score, ("episode", "view"))
         return value
-    return names.check_function("metric", value, ("achieved", "desired"))
+    return lookup.check_function("metric", value, ("achieved", "desired"))
 
 
 def score_of(score: ScoreFn, episode: Episode, view: View) -> Array:

@@ -10,16 +10,16 @@ from typing import Annotated, Any, Literal, get_args
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams, ReadBy
-from mjx_dher.names import check_name, is_import_path
+from mjx_dher.lookup import check_name, is_import_path
 
 Engine = Literal["auto", "native", "jax", "warp"]
 ENGINES = get_args(Engine)
 SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted", "next_future")
-SAMPLERS_ELSEWHERE = {"next_future": "mjx_dher.methods.goals:next_future"}  # the others are in mjx_dher.samplers
+SAMPLERS_ELSEWHERE = {"next_future": "mjx_dher.contrib.goals:next_future"}  # the others are in mjx_dher.samplers
 # Parts by name, and where they are; an own one is named by its place alone.
 WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
 WEIGHT_NORMALIZATIONS = {
-    name: f"mjx_dher.readings:{function}"
+    name: f"mjx_dher.distance_normalization:{function}"
     for name, function in {
         "mean": "by_mean",
         "sum": "by_sum",
@@ -32,20 +32,20 @@ WEIGHT_NORMALIZATIONS = {
 METRICS = {
     "position": "mjx_dher.samplers:position",
     **{
-        name: f"mjx_dher.methods.metrics:{name}"
+        name: f"mjx_dher.contrib.metrics:{name}"
         for name in ("velocity", "resting_point", "resting_point_rough", "time_to_goal")
     },
 }
 # Those that weigh whole episodes, and those that choose among transitions; lanes of a program can differ within either.
 EPISODE_PRIORITIES = {
     "eventful": "mjx_dher.priorities:eventful",
-    **{name: f"mjx_dher.methods.episodes:{name}" for name in ("energy", "max_entropy", "diversity")},
+    **{name: f"mjx_dher.contrib.episodes:{name}" for name in ("energy", "max_entropy", "diversity")},
 }
 TRANSITION_PRIORITIES = {
-    name: f"mjx_dher.methods.transitions:{name}" for name in ("dpp", "td_error", "curriculum", "not_misleading")
+    name: f"mjx_dher.contrib.transitions:{name}" for name in ("dpp", "td_error", "curriculum", "not_misleading")
 }
 PRIORITIES = {**EPISODE_PRIORITIES, **TRANSITION_PRIORITIES}
-GENERATORS = {"reset": "mjx_dher.generators:reset", "hgg": "mjx_dher.methods.goals:hgg"}
+GENERATORS = {"reset": "mjx_dher.generators:reset", "hgg": "mjx_dher.contrib.goals:hgg"}
 LEARNERS = {
     **{name: f"mjx_dher.learners.{name}:make" for name in ("ddpg", "td3", "sac", "redq", "tqc")},
     "dtqc": "mjx_dher.learners.tqc:make_deterministic",

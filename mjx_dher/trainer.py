@@ -19,17 +19,17 @@ from flax import struct
 from mjx_dher import config as config_lib
 from mjx_dher import evaluate, generators, learners, priorities, replay, samplers, scores
 from mjx_dher.config import Config, HParams
+from mjx_dher.context import View
 from mjx_dher.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
+from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.priorities import Priority, PriorityFn
 from mjx_dher.relabel import draw_batches, relabel_counted
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import env_sizes, episode_template, rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, check_env_parts
 from mjx_dher.updates import update_round
-from mjx_dher.view import View
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384

@@ -11,8 +11,11 @@ from jax.sharding import PartitionSpec
 from test_trainer import SMALL
 
 from mjx_dher import HParams, Options, RunSpec, envs, learners, make_train, normalizer, trainer
-from mjx_dher.runs import checkpoint, driver, loop, mesh, placed, sinks
-from mjx_dher.split import ALONE, Split
+from mjx_dher.parallel import mesh, sharded
+from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.runs import driver
+from mjx_dher.runs.folder import checkpoint, loggers
+from mjx_dher.runs.program import loop
 from mjx_dher.types import Batch, Sizes
 from probes import Explodes, PointMass
 
@@ -139,7 +142,7 @@ def train(folder, number=1, epoch=None, env=ENV, **options):
         **options,
     )
     times = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
-    rows = [sinks.read_rows(folder / str(seed) / "metrics.csv") for seed in range(number)]
+    rows = [loggers.read_rows(folder / str(seed) / "metrics.csv") for seed in range(number)]
     return [[{k: v for k, v in row.items() if k not in times} for row in run] for run in rows], states[-1]
 
 
@@ -184,8 +187,8 @@ def test_a_run_goes_on_with_any_number_of_devices(tmp_path):
         program = make_train(ENV, CONFIG, split=layout.split)
         template = loop.state_template(program)
         if number > 1:
-            init = placed.place_init(layout, program.init, False)
-            template = init.eval_shape(*placed.to_host(jax.random.key(0), trainer.as_arrays(HParams())))
+            init = sharded.place_init(layout, program.init, False)
+            template = init.eval_shape(*sharded.to_host(jax.random.key(0), trainer.as_arrays(HParams())))
         states[number] = checkpoint.restore(folder, template).state
     assert int(states[1].replay.size) == 24
     assert np.asarray(states[4].replay.size).tolist() == [6] * 4

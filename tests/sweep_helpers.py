@@ -8,9 +8,10 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, Options, RunSpec
-from mjx_dher.host import memory
-from mjx_dher.runs import driver, program
+from mjx_dher.runs import driver
+from mjx_dher.runs.program import program
 from mjx_dher.sweeps import grid, sweep, tables
+from mjx_dher.system import memory
 from probes import PointMass
 
 # An epoch of 240 steps.

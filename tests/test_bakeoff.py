@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT
 
 from mjx_dher import envs
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import GENERATORS, PRIORITIES, SAMPLERS, validate
 
 
@@ -66,7 +66,7 @@ def test_the_plan_fits_into_two_hours(arms):
 
 def changes(spec, base):
     """What differs between two runs, by field."""
-    mine, theirs = identity.settings(spec), identity.settings(base)
+    mine, theirs = fingerprint.settings(spec), fingerprint.settings(base)
     return {name: value for name, value in mine.items() if value != theirs[name]}
 
 

@@ -8,8 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from mjx_dher import envs, policies
-from mjx_dher.viewer import page, server, sources
+from mjx_dher import envs
+from mjx_dher.policy import bundled
+from mjx_dher.viewer import address, server, sources
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = [
@@ -35,8 +36,8 @@ def until(condition, what):
 @pytest.fixture(scope="module")
 def viewer():
     """A viewer that plays Push, in a thread, as the command runs it in the program's own."""
-    found = [sources.of_run(name, policies.FOLDER / name) for name in ("push", "reach")]
-    port, ended = page.check("127.0.0.1", 0), threading.Event()
+    found = [sources.of_run(name, bundled.FOLDER / name) for name in ("push", "reach")]
+    port, ended = address.check("127.0.0.1", 0), threading.Event()
     with server.Viewer(
         found, lambda source: envs.make(source.env, engine="native", num_threads=1), "127.0.0.1", port, 1
     ) as viewer:

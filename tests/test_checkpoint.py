@@ -17,10 +17,11 @@ from conftest import ROOT
 from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, cli, trainer
-from mjx_dher.host.files import write_json
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import checkpoint, identity, loop, run_folder
-from mjx_dher.runs.checkpoint import CheckpointError
+from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
+from mjx_dher.runs.folder.checkpoint import CheckpointError
+from mjx_dher.runs.program import loop
+from mjx_dher.system.files import write_json
 from probes import PointMass
 
 CONFIG = dataclasses.replace(SMALL, total_steps=480)  # 4 epochs
@@ -135,7 +136,7 @@ def cut(path):
 def change_manifest(path, **changes):
     content = json.loads((path / "manifest.json").read_text()) | changes
     del content["sha256"]
-    digest = identity.sha256_of(content)
+    digest = fingerprint.sha256_of(content)
     (path / "manifest.json").write_text(json.dumps({**content, "sha256": digest}))
 
 

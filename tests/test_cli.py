@@ -18,7 +18,7 @@ from mjx_dher import Options, RunSpec, cli, config, presets
 from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.cli import train as cli_train
-from mjx_dher.runs.loop import Progress
+from mjx_dher.runs.program.loop import Progress
 
 TINY = """
     --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200
@@ -223,7 +223,7 @@ def test_help_names_every_option(capsys):
 @pytest.mark.parametrize("chosen", [True, False])
 def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(tmp_path, chosen):
     code = (
-        "from mjx_dher.host import caches; caches.keep_compiled_programs(); import jax;"
+        "from mjx_dher.system import caches; caches.keep_compiled_programs(); import jax;"
         "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0); jax.jit(lambda x: x + 1)(1.0)"
     )
     clean = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}

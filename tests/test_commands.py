@@ -11,11 +11,12 @@ import pytest
 from conftest import EXAMPLES, ROOT
 
 import mjx_dher
-from mjx_dher import RunSpec, cli, envs, policies, presets, spec
+from mjx_dher import RunSpec, cli, envs, presets, spec
 from mjx_dher.cli import completion, listing
 from mjx_dher.cli import train as cli_train
 from mjx_dher.cli.commands import COMMANDS
-from mjx_dher.runs import identity, run_folder
+from mjx_dher.policy import bundled
+from mjx_dher.runs.folder import fingerprint, run_folder
 
 FLAGS = [
     *("--env", "point_mass:PointMass", "--preset", "cpu", "--num-envs", "2", "--hidden-sizes", "8", "--cycles-per-epoch", "2"),
@@ -59,7 +60,7 @@ def test_list_names_all_that_there_is(capsys):
         "generators": spec.GENERATORS,
         "learners": spec.LEARNERS,
         "networks": spec.NETWORKS,
-        "policies": policies.names(),
+        "policies": bundled.names(),
     }
     assert {kind: set(lines) for kind, lines in listing.KINDS.items()} == {kind: set(names) for kind, names in tables.items()}
     assert set(listing.OPTIONS) == set(tables)
@@ -247,12 +248,12 @@ def test_arguments_are_texts_in_one_form():
 
 def test_arguments_are_part_of_what_a_run_is_and_none_leave_it_as_it_was():
     plain, dense = RunSpec(), RunSpec(env_kwargs=("reward_type=dense",))
-    assert "env_kwargs" not in identity.identity(plain, "native", {})
-    assert identity.identity(dense, "native", {})["env_kwargs"] == ["reward_type=dense"]
-    assert identity.trial_name(plain) == "push-future-s0-22e3e56bd2"
-    assert identity.trial_name(dense) != identity.trial_name(plain)
+    assert "env_kwargs" not in fingerprint.identity(plain, "native", {})
+    assert fingerprint.identity(dense, "native", {})["env_kwargs"] == ["reward_type=dense"]
+    assert fingerprint.trial_name(plain) == "push-future-s0-22e3e56bd2"
+    assert fingerprint.trial_name(dense) != fingerprint.trial_name(plain)
     assert dense.program != plain.program
-    told = identity.differences(identity.identity(plain, "native", {}), identity.identity(dense, "native", {}))
+    told = fingerprint.differences(fingerprint.identity(plain, "native", {}), fingerprint.identity(dense, "native", {}))
     assert told == {"env_kwargs": "env_kwargs was () and is ['reward_type=dense']"}
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mjx_dher import RunSpec, stats
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import comparison
+from mjx_dher.system.files import FolderError
 
 
 def cell(sampler, seed, success, env="push", final=None, **numbers):
@@ -17,7 +17,7 @@ def cell(sampler, seed, success, env="push", final=None, **numbers):
         "success_rate": list(success),
     }
     final = {"success_rate": success[-1] if final is None else final, "reset_success_rate": 0.07}
-    settings = {**identity.settings(RunSpec(env=env, sampler=sampler)), **numbers}
+    settings = {**fingerprint.settings(RunSpec(env=env, sampler=sampler)), **numbers}
     return {
         "settings": settings,
         "seed": seed,

@@ -12,11 +12,11 @@ import pytest
 from test_plotting import texts
 
 from mjx_dher import Config, RunSpec, cli
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import curves, identity, run_folder, sinks
+from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.sweeps import grid, report
-from mjx_dher.tools import figures, page
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
+from mjx_dher.tools import curves, figures, html
 
 SPEC = RunSpec(env="reach", config=Config(eval_episodes=20, total_steps=12_000))
 PNG = b"\x89PNG"
@@ -26,7 +26,7 @@ def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", column
     """A run folder as `train` leaves it after so many epochs; status None: it has not ended."""
     run_folder.create(folder, spec, "native", {"lanes": 1})
     digest = run_folder.read_content(folder)["digest"]
-    sink = sinks.CsvSink(folder / "metrics.csv", digest=digest)
+    sink = loggers.CsvSink(folder / "metrics.csv", digest=digest)
     for epoch in range(1, epochs + 1):
         rate = min(1.0, epoch / 10)
         metrics = {"success_rate": rate, "return_mean": -50 + 40 * rate, "reset_success_rate": 0.05}
@@ -241,13 +241,13 @@ def test_a_page_about_a_run_that_failed_says_why_without_markup_of_its_own(tmp_p
     assert "&lt;script&gt;" in text
     assert "<script" not in text
     assert curve.status == "failed"
-    assert page.text(spec.env) == "&lt;b&gt;:x"
+    assert html.text(spec.env) == "&lt;b&gt;:x"
 
 
 def test_a_film_that_is_too_large_is_left_out_and_named(tmp_path, monkeypatch):
     run = write_run(tmp_path / "run")
     (run / "large.gif").write_bytes(b"12345")
-    monkeypatch.setattr(page, "LARGEST", 4)
+    monkeypatch.setattr(html, "LARGEST", 4)
     told = []
     assert "data:" not in report.of_run(run, told.append)
     assert told == [f"{run / 'large.gif'} is larger than 0 MB, and left out"]
@@ -260,7 +260,7 @@ def sweep(tmp_path):
             spec = dataclasses.replace(SPEC, sampler=sampler, seed=seed)
             bad = sampler == "weighted" and seed == 1
             made = {"status": "failed", "reason": "the learner is not finite", "epochs": 5} if bad else {}
-            write_run(tmp_path / "sweep" / grid.CELLS / identity.trial_name(spec), spec, **made)
+            write_run(tmp_path / "sweep" / grid.CELLS / fingerprint.trial_name(spec), spec, **made)
     return tmp_path / "sweep"
 
 

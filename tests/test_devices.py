@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher.runs.regroup import regroup
+from mjx_dher.parallel.reshard import regroup
 
 
 def run_on_four_devices(marker, seconds):

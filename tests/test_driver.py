@@ -13,10 +13,11 @@ from conftest import EXAMPLES, ROOT
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
-from mjx_dher.host.files import FolderError
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import checkpoint, driver, identity, run_folder
+from mjx_dher.runs import driver
+from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
 from mjx_dher.sweeps import comparison, grid, tables
+from mjx_dher.system.files import FolderError
 from point_mass import PointMass
 from probes import held
 
@@ -91,7 +92,7 @@ def trained(tmp_path_factory):
         results = mjx_dher.train_runs(
             PointMass(),
             specs,
-            [folder / "cells" / identity.trial_name(spec) for spec in specs],
+            [folder / "cells" / fingerprint.trial_name(spec) for spec in specs],
             options=Options(final_episodes=20, log=("jsonl",)),
             lanes=3,
             report=said.append,
@@ -137,7 +138,7 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
 def test_a_lane_that_had_failed_when_the_others_were_stopped_costs_them_nothing(trained, tmp_path, monkeypatch):
     """They go on from their checkpoint, and all end as those that were not stopped."""
     monkeypatch.setattr(ddpg.DDPG, "update", breaking())
-    folders, seen = [tmp_path / "cells" / identity.trial_name(spec) for spec in THREE], []
+    folders, seen = [tmp_path / "cells" / fingerprint.trial_name(spec) for spec in THREE], []
     arguments = {"options": Options(final_episodes=20, log=("jsonl",)), "lanes": 3, "sweep": True}
     arguments |= {"on_epoch": lambda specs, progress: seen.append(progress.epoch), "should_stop": lambda: seen == [1, 2]}
     results = mjx_dher.train_runs(PointMass(), THREE, folders, **arguments)

@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 import mjx_dher
 from mjx_dher import RunSpec, cli
 from mjx_dher.policy import Policy
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.tools import export
 
 D, G, A = 7, 3, 4

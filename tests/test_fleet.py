@@ -9,7 +9,7 @@ import pytest
 from sweep_helpers import CONFIG, make_grid
 
 import mjx_dher
-from mjx_dher import Options, cli, names
+from mjx_dher import Options, cli, lookup
 from mjx_dher.cli import fleet
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.cli.fleet_screen import FleetScreen
@@ -149,8 +149,8 @@ def test_wishes_that_cannot_be_met_are_refused_at_once(tmp_path, arguments, said
 
 
 def test_without_the_extra_the_refusal_names_it(monkeypatch):
-    find = names.importlib.util.find_spec
-    monkeypatch.setattr(names.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
+    find = lookup.importlib.util.find_spec
+    monkeypatch.setattr(lookup.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
     with pytest.raises(ValueError, match=r'--ray needs ray, which the extra "ray" installs: pip install -e ".\[ray\]"'):
         request_of(FleetArgs(ray="local"), "1/1")
 

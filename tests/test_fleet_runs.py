@@ -17,9 +17,9 @@ from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.fleet.cluster import Flying, Outcome
 from mjx_dher.fleet.ledger import Ledger
 from mjx_dher.fleet.plan import Kind
-from mjx_dher.host.files import BusyError, FolderError
-from mjx_dher.runs import results
+from mjx_dher.runs.folder import results
 from mjx_dher.sweeps import grid, tables
+from mjx_dher.system.files import BusyError, FolderError
 from probes import PointMass, held
 
 OPTIONS = Options(final_episodes=15, checkpoint_every=1)

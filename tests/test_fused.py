@@ -14,7 +14,7 @@ from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
 from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps, unsupported
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
 NUM = 48  # environments

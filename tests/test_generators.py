@@ -9,15 +9,15 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, generators, learners, make_train, priorities, replay, samplers, testing
-from mjx_dher.methods import goals, metrics
+from mjx_dher.context import View
+from mjx_dher.contrib import goals, metrics
 from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
-from mjx_dher.runs import identity
-from mjx_dher.runs.loop import state_template
+from mjx_dher.runs.folder import fingerprint
+from mjx_dher.runs.program.loop import state_template
 from mjx_dher.scores import LearnedMetric
 from mjx_dher.spec import GENERATORS, METRICS, PRIORITIES, SAMPLERS
 from mjx_dher.testing import PartError
-from mjx_dher.view import View
 from point_mass import PointMass
 
 ENV = PointMass()
@@ -81,7 +81,7 @@ def test_goals_of_the_wrong_shape_are_refused(gives, generate):
 
 def test_make_takes_a_name_a_place_or_a_function():
     assert generators.make("reset") is generators.reset
-    assert generators.make("mjx_dher.methods.goals:hgg") is generators.make("hgg") is goals.hgg
+    assert generators.make("mjx_dher.contrib.goals:hgg") is generators.make("hgg") is goals.hgg
     assert generators.make(corner).generate is corner
     for wrong in ("hggg", "mjx_dher.generators:rset", lambda obs: obs, 3):
         with pytest.raises(ValueError, match="generator"):
@@ -208,10 +208,10 @@ def test_every_part_by_name_shares_a_program_with_its_kind():
 
 def test_settings_that_are_new_change_no_name_of_a_trial():
     """As version 0.1.0 had it; tests/test_identity.py has more of them."""
-    assert not {"generator", "hindsight_reward"} & set(identity.identity(RunSpec(), "native", {}))
-    named = {identity.trial_name(RunSpec(generator=name)) for name in GENERATORS}
+    assert not {"generator", "hindsight_reward"} & set(fingerprint.identity(RunSpec(), "native", {}))
+    named = {fingerprint.trial_name(RunSpec(generator=name)) for name in GENERATORS}
     assert len(named) == len(GENERATORS)
-    assert identity.trial_name(RunSpec(hparams=HParams(hindsight_reward=0.5))) != identity.trial_name(RunSpec())
+    assert fingerprint.trial_name(RunSpec(hparams=HParams(hindsight_reward=0.5))) != fingerprint.trial_name(RunSpec())
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_lanes_learn_as_runs_alone_do():
             state, _ = program.epoch(state)
         return state.learner.params
 
-    from mjx_dher.runs.program import Lane
+    from mjx_dher.runs.program.program import Lane
 
     names = list(dict.fromkeys(name for name, _ in kinds)), ["reset", "hgg"]
     together = make_train(

@@ -13,8 +13,8 @@ from test_mistakes import SMALL
 from mjx_dher import HParams, make_train, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.learners import RESERVED, ddpg
 from mjx_dher.rollout import rollout
-from mjx_dher.runs import sinks
-from mjx_dher.runs.loop import Progress
+from mjx_dher.runs.folder import loggers
+from mjx_dher.runs.program.loop import Progress
 from mjx_dher.samplers import Sampler, future
 from point_mass import PointMass
 
@@ -295,7 +295,7 @@ def test_the_names_that_learners_may_not_use_are_those_of_the_log():
     train = make_train(ENV, SMALL)
     _, metrics = trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
     progress = Progress(*(1 for _ in Progress._fields))
-    logged = sinks.row(progress, dict.fromkeys(metrics, 0.0))
+    logged = loggers.row(progress, dict.fromkeys(metrics, 0.0))
     losses = {"critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"}
     assert set(logged) - losses == RESERVED
 

@@ -9,9 +9,9 @@ import pytest
 from conftest import ROOT
 from rich.console import Console
 
-from mjx_dher import RunSpec, cli, names
+from mjx_dher import RunSpec, cli, lookup
 from mjx_dher.cli import common
-from mjx_dher.runs.loop import Progress
+from mjx_dher.runs.program.loop import Progress
 
 
 def test_a_polyak_that_is_likely_a_tau_is_explained():
@@ -59,9 +59,9 @@ def test_nothing_of_the_progress_is_cut_on_a_narrow_terminal(width):
 
 
 def test_messages_name_the_program_that_was_started(monkeypatch):
-    assert names.program() == "train.py"
+    assert lookup.program() == "train.py"
     monkeypatch.setattr(sys, "argv", [os.path.join("bin", "mjx-dher")])
-    assert names.program() == "mjx-dher"
+    assert lookup.program() == "mjx-dher"
 
 
 HUGE = str(10**20)

@@ -17,7 +17,7 @@ from mjx_dher import HParams, envs, learners, presets
 from mjx_dher.hopper import gradients as hopper
 from mjx_dher.learners import ddpg
 from mjx_dher.networks import Networks, mlp
-from mjx_dher.runs.loop import state_template
+from mjx_dher.runs.program.loop import state_template
 from mjx_dher.trainer import make_train
 from mjx_dher.types import Batch, Sizes
 

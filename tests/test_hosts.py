@@ -10,9 +10,9 @@ import pytest
 from conftest import free_port
 
 from mjx_dher.cli import main
-from mjx_dher.cli.hosts import Hosts, first_node
-from mjx_dher.host import line
-from mjx_dher.runs import team
+from mjx_dher.cli.processes import Hosts, first_node
+from mjx_dher.parallel import processes
+from mjx_dher.system import line
 
 JAX = {"JAX_COORDINATOR_ADDRESS": "gpu1:8000", "JAX_NUM_PROCESSES": "4", "JAX_PROCESS_ID": "3"}
 SLURM = {
@@ -84,29 +84,29 @@ def test_an_address_at_which_nobody_answers_is_refused():
     with pytest.raises(
         ValueError, match=f"coordinator: nobody answers at 127.0.0.1:{port} .*for 0.5 s; it must be the address"
     ):
-        team.connect(f"127.0.0.1:{port}", 2, 1, {}, wait=0.5)
+        processes.connect(f"127.0.0.1:{port}", 2, 1, {}, wait=0.5)
     with pytest.raises(ValueError, match=r"coordinator: there is no host 'no-such-host\.invalid'"):
-        team.connect("no-such-host.invalid:80", 2, 1, {}, wait=0.5)
+        processes.connect("no-such-host.invalid:80", 2, 1, {}, wait=0.5)
     with pytest.raises(ValueError, match=r"num_processes is 3, and of these processes 1, 2 did not come within 0\.3 s"):
-        team.connect(f"127.0.0.1:{port}", 3, 0, {}, wait=0.3)
+        processes.connect(f"127.0.0.1:{port}", 3, 0, {}, wait=0.3)
 
 
 def test_a_port_that_is_taken_is_refused():
     with socket.create_server(("", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ValueError, match=f"coordinator: process 0 cannot listen at port {port}"):
-            team.connect(f"127.0.0.1:{port}", 2, 0, {}, wait=0.3)
+            processes.connect(f"127.0.0.1:{port}", 2, 0, {}, wait=0.3)
 
 
 @contextlib.contextmanager
 def started(monkeypatch, *others, described=None, size=2):
     """Processes that connect, as threads, without JAX: yields the teams, or errors, the first process's first."""
-    monkeypatch.setattr(team, "_start_jax", lambda *arguments: None)
+    monkeypatch.setattr(processes, "_start_jax", lambda *arguments: None)
     address, results = f"127.0.0.1:{free_port()}", {}
 
     def connect(place, *arguments):
         try:
-            results[place] = team.connect(address, *arguments, wait=5.0)
+            results[place] = processes.connect(address, *arguments, wait=5.0)
         except ValueError as error:
             results[place] = str(error)
 
@@ -119,7 +119,7 @@ def started(monkeypatch, *others, described=None, size=2):
     teams = [results[place] for place in sorted(results)]
     yield teams
     for made in teams:
-        if isinstance(made, team.Team):
+        if isinstance(made, processes.Team):
             made.close()
 
 
@@ -191,10 +191,10 @@ def test_what_the_first_process_decides_holds_in_all(monkeypatch):
 
 
 def test_one_alone_asks_nobody():
-    assert team.ALONE.share(lambda: 3) == 3
-    assert team.ALONE.any(True)
-    assert not team.ALONE.any(False)
-    assert team.ALONE.fetch([np.ones(1)])[0] == 1.0
+    assert processes.ALONE.share(lambda: 3) == 3
+    assert processes.ALONE.any(True)
+    assert not processes.ALONE.any(False)
+    assert processes.ALONE.fetch([np.ones(1)])[0] == 1.0
 
 
 @pytest.mark.parametrize("how", ["closed", "silent", "told"])
@@ -225,16 +225,16 @@ def test_who_is_gone_ends_the_others(monkeypatch, how):
 
 def test_who_calls_by_mistake_is_left_out(monkeypatch):
     """Somebody who speaks another language does not keep the others from meeting."""
-    monkeypatch.setattr(team, "_start_jax", lambda *arguments: None)
+    monkeypatch.setattr(processes, "_start_jax", lambda *arguments: None)
     port, results = free_port(), []
-    first = threading.Thread(target=lambda: results.append(team.connect(f"127.0.0.1:{port}", 2, 0, {}, wait=10.0)))
+    first = threading.Thread(target=lambda: results.append(processes.connect(f"127.0.0.1:{port}", 2, 0, {}, wait=10.0)))
     first.start()
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline:
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=5) as stranger:
             stranger.sendall(b"GET / HTTP/1.1\r\n\r\n" * 10)
             break
-    second = team.connect(f"127.0.0.1:{port}", 2, 1, {}, wait=5.0)
+    second = processes.connect(f"127.0.0.1:{port}", 2, 1, {}, wait=5.0)
     first.join(10)
     assert results[0].size == 2
     second.close()

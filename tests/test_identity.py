@@ -12,10 +12,10 @@ from test_driver import CONFIG, rows_of
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, cli, envs
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import checkpoint, identity, run_folder, sinks
+from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
 from mjx_dher.sweeps import grid, tables
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 SPEC = RunSpec(env="point_mass:PointMass", config=dataclasses.replace(CONFIG, total_steps=240))  # 6 epochs
 
@@ -78,17 +78,17 @@ def test_all_files_of_a_run_carry_one_digest(made):
     for folder in (made / "run", made / "whole"):
         content, spec = run_folder.read(folder)
         assert spec == SPEC
-        digests |= {content["digest"], identity.digest(run_folder.identity_of(content, spec))}
-        digests |= {row["digest"] for row in sinks.read_rows(folder / "metrics.csv")}
+        digests |= {content["digest"], fingerprint.digest(run_folder.identity_of(content, spec))}
+        digests |= {row["digest"] for row in loggers.read_rows(folder / "metrics.csv")}
         with np.load(folder / "policy.npz") as arrays:
-            digests.add(identity.digest(json.loads(arrays["settings"].tobytes())))
+            digests.add(fingerprint.digest(json.loads(arrays["settings"].tobytes())))
     digests.add(json.loads((made / "whole" / "result.json").read_text())["digest"])
     for path in run_folder.checkpoints(made / "run"):
         (run,) = json.loads((path / "manifest.json").read_text())["runs"]
-        digests.add(identity.digest(run))
+        digests.add(fingerprint.digest(run))
     assert len(digests) == 1
     other = dataclasses.replace(SPEC, hparams=HParams(gamma=0.97))
-    assert identity.digest(identity.identity(other, "none", identity.sources(other))) not in digests
+    assert fingerprint.digest(fingerprint.identity(other, "none", fingerprint.sources(other))) not in digests
 
 
 # Of each field, another value that is allowed. `wrong` below makes one of another type.
@@ -301,7 +301,9 @@ def test_lanes_share_a_checkpoint_of_their_own_settings(tmp_path):
     cut_short(tmp_path, trials, 2, lanes=2)
     (manifest,) = tmp_path.glob("unfinished/*/checkpoints/*/manifest.json")
     runs = json.loads(manifest.read_text())["runs"]
-    assert [identity.digest(run) for run in runs] == [identity.digest(identity.identity(trial, "none", {})) for trial in trials]
+    assert [fingerprint.digest(run) for run in runs] == [
+        fingerprint.digest(fingerprint.identity(trial, "none", {})) for trial in trials
+    ]
     (tmp_path / grid.CELLS / "stray").mkdir()
     (tmp_path / "unfinished" / "stray").mkdir()
     (tmp_path / "unfinished" / "stray" / "cells.json").write_text("")  # as a kill leaves it

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mjx_dher import envs
-from mjx_dher.envs.kinematics import Chain
+from mjx_dher.envs.arm_kinematics import Chain
 
 
 @pytest.mark.parametrize("name", envs.list_envs())

@@ -13,10 +13,10 @@ import pytest
 
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
-from mjx_dher.learners import common, ddpg, stored
+from mjx_dher.learners import common, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
-from mjx_dher.policy import Policy
-from mjx_dher.runs import run_folder
+from mjx_dher.policy import Policy, learner_policy
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.types import Sizes
 from point_mass import PointMass
 
@@ -255,7 +255,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
     run_folder.create(tmp_path / "run", SPEC, "none", {})
-    stored.StoredPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    learner_policy.StoredPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from mjx_dher import envs, learners, presets, samplers, trainer
 from mjx_dher.runs import play
-from mjx_dher.runs.loop import train
+from mjx_dher.runs.program.loop import train
 
 
 @pytest.mark.slow  # tests/test_trainer.py trains the point mass

@@ -10,7 +10,7 @@ from test_driver import result_of, rows_of
 
 import mjx_dher
 from mjx_dher import Options, RunSpec, cli
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 from point_mass import PointMass
 
 

@@ -8,14 +8,14 @@ import jax
 import pytest
 from conftest import ROOT
 
-from mjx_dher.host import memory
+from mjx_dher.system import memory
 
 pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="not glibc")
 
 # Blocks that are freed while a smaller one on top of each stays: a hole each, which the heap cannot give back by itself.
 HOLES = """
 import ctypes
-from mjx_dher.host import memory
+from mjx_dher.system import memory
 c = ctypes.CDLL("libc.so.6")
 c.malloc.restype, c.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
 {before}
@@ -48,7 +48,7 @@ def test_blocks_of_some_megabytes_go_back_to_the_system_when_they_are_freed():
 
 THREADS = """
 import ctypes, threading
-from mjx_dher.host import memory
+from mjx_dher.system import memory
 c = ctypes.CDLL("libc.so.6")
 {before}
 together = threading.Barrier({threads})

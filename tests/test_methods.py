@@ -11,10 +11,10 @@ from scipy.optimize import linear_sum_assignment
 
 from mjx_dher import priorities, relabel, replay, samplers, scores
 from mjx_dher.config import HParams
-from mjx_dher.methods import episodes, goals, metrics, transitions
+from mjx_dher.context import Values, View
+from mjx_dher.contrib import episodes, goals, metrics, transitions
 from mjx_dher.replay import Sample
 from mjx_dher.types import Batch, Episode
-from mjx_dher.view import Values, View
 from probes import Clock
 
 HP = HParams()

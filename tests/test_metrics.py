@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import pytest
 
 from mjx_dher import HParams, RunSpec, trainer
-from mjx_dher.host import memory
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import loop, run_folder, sinks
+from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.program import loop
+from mjx_dher.system import memory
+from mjx_dher.system.files import FolderError
 
 
 def row(epoch, **more):
@@ -26,9 +27,9 @@ def write(sink, epochs):
 
 def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
     path = tmp_path / "metrics.csv"
-    write(sinks.CsvSink(path), [1, 2, 3, 4])
+    write(loggers.CsvSink(path), [1, 2, 3, 4])
     in_one_go = path.read_bytes()
-    write(sinks.CsvSink(path, epochs=2), [3, 4])
+    write(loggers.CsvSink(path, epochs=2), [3, 4])
     assert path.read_bytes() == in_one_go
     with path.open() as file:
         assert [r["epoch"] for r in csv.DictReader(file)] == ["1", "2", "3", "4"]
@@ -37,17 +38,17 @@ def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
 @pytest.mark.parametrize("damage", [lambda b: b[:-20], lambda b: b.replace(b"\n2,", b"\n7,"), lambda b: b""])
 def test_csv_without_the_epochs_that_had_ended_is_refused(tmp_path, damage):
     path = tmp_path / "metrics.csv"
-    write(sinks.CsvSink(path), [1, 2, 3])
+    write(loggers.CsvSink(path), [1, 2, 3])
     path.write_bytes(damaged := damage(path.read_bytes()))
     with pytest.raises(FolderError, match=r"metrics.csv is damaged"):
-        sinks.CsvSink(path, epochs=3)
+        loggers.CsvSink(path, epochs=3)
     assert path.read_bytes() == damaged
 
 
 def test_jsonl_has_an_object_a_line_and_goes_on(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    write(sinks.JsonlSink(path), [1, 2, 3])
-    write(sinks.JsonlSink(path, epochs=2), [3, 4])
+    write(loggers.JsonlSink(path), [1, 2, 3])
+    write(loggers.JsonlSink(path, epochs=2), [3, 4])
     found = [json.loads(line) for line in path.read_text().splitlines()]
     assert found == [row(epoch, q_mean=None) for epoch in (1, 2, 3, 4)]
 
@@ -68,17 +69,17 @@ def events(folder):
 
 
 def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
-    write(sinks.TensorBoardSink(tmp_path / "tb"), [1, 2])
+    write(loggers.TensorBoardSink(tmp_path / "tb"), [1, 2])
     found = events(tmp_path / "tb")
     assert (200, "success_rate", pytest.approx(0.2)) in found
     assert (100, "return_mean", -49.0) in found
-    assert {name for _, name, _ in found} == set(row(1)) - set(sinks.COUNTS)
+    assert {name for _, name, _ in found} == set(row(1)) - set(loggers.COUNTS)
 
 
 def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     run_folder.create(tmp_path / "run", RunSpec(seed=3, sampler="closest"), "native", {})
-    sink = sinks.open_sinks(tmp_path / "run", ["wandb"])[1]
+    sink = loggers.open_sinks(tmp_path / "run", ["wandb"])[1]
     run = sink._run
     sink.write(row(1))
     sink.write(row(2))
@@ -89,23 +90,23 @@ def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_pa
     (kept,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
     assert kept.name.endswith(run.id)
     assert any(kept.glob("*.wandb"))
-    again = sinks.open_sinks(tmp_path / "run", ["wandb"])[1]
+    again = loggers.open_sinks(tmp_path / "run", ["wandb"])[1]
     assert again._run.id == run.id
     again.close()
 
 
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
     with pytest.raises(ValueError, match=r"log must be one of jsonl, tensorboard, wandb; got 'tensorbord' \(did you mean"):
-        sinks.check(["jsonl", "tensorbord"])
-    monkeypatch.setitem(sinks.EXTRAS, "wandb", "no_such_package")
+        loggers.check(["jsonl", "tensorbord"])
+    monkeypatch.setitem(loggers.EXTRAS, "wandb", "no_such_package")
     with pytest.raises(ValueError, match=r'log wandb needs no_such_package, .*pip install -e "\.\[wandb\]"'):
-        sinks.check(["wandb"])
-    sinks.check(["jsonl"])
+        loggers.check(["wandb"])
+    loggers.check(["jsonl"])
 
 
 def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):
-    opened = sinks.open_sinks(tmp_path, ["jsonl", "jsonl"])
-    assert [type(sink) for sink in opened] == [sinks.CsvSink, sinks.JsonlSink]
+    opened = loggers.open_sinks(tmp_path, ["jsonl", "jsonl"])
+    assert [type(sink) for sink in opened] == [loggers.CsvSink, loggers.JsonlSink]
 
 
 def test_what_was_relabelled_by_hand():
@@ -126,5 +127,5 @@ def test_every_metric_is_documented():
     program = trainer.make_train(ENV, SMALL)
     found = jax.eval_shape(lambda state: program.epoch(state)[1], loop.state_template(program))
     text = (run_folder.Path(__file__).parent.parent / "docs" / "logs.md").read_text()
-    for name in (*sinks.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
+    for name in (*loggers.COUNTS, *found, "steps_per_second", "updates_per_second", "memory_bytes"):
         assert f"| `{name}` |" in text, name

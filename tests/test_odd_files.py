@@ -8,8 +8,8 @@ from test_export import random_policy, save_run
 import mjx_dher
 from mjx_dher import cli
 from mjx_dher.config import Config, HParams, validate
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import results
+from mjx_dher.runs.folder import results
+from mjx_dher.system.files import FolderError
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mjx_dher import RunSpec, cli, policy
-from mjx_dher.runs import run_folder
-from mjx_dher.tools import originals
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.tools import transfer
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_a_python_without_the_originals_is_refused(run, capsys):
 
 def test_a_task_without_an_original_is_refused():
     with pytest.raises(ValueError, match="point_mass has no original to transfer to; the tasks that have: push, "):
-        originals.check("point_mass", Path(sys.executable))
+        transfer.check("point_mass", Path(sys.executable))
 
 
 @pytest.mark.parametrize(
@@ -66,9 +66,9 @@ def test_a_policy_is_played_in_the_original(run, tmp_path, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "FetchReach-v4, 5 episodes" in shown
     assert "there minus here" in shown
-    python = originals.interpreter(originals.default_environment())
-    alone = originals.play_apart(run, python, 5, seed=3, workers=1)
-    shared = originals.play_apart(run, python, 5, seed=3, workers=2)
+    python = transfer.interpreter(transfer.default_environment())
+    alone = transfer.play_apart(run, python, 5, seed=3, workers=1)
+    shared = transfer.play_apart(run, python, 5, seed=3, workers=2)
     assert alone.keys() == {"success", "reset_success", "ret"}
     for name in alone:
         np.testing.assert_array_equal(alone[name], shared[name])

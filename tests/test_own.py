@@ -12,7 +12,8 @@ import pytest
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
 from mjx_dher.cli import sweep as cli_sweep
-from mjx_dher.runs import identity, play, run_folder
+from mjx_dher.runs import play
+from mjx_dher.runs.folder import fingerprint, run_folder
 from point_mass import PointMass, soon
 
 TINY = """
@@ -198,7 +199,7 @@ def test_a_sweep_takes_them(folder, monkeypatch):
     monkeypatch.chdir(folder)
     _, (trial,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
     assert (trial.env, trial.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
-    assert identity.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
+    assert fingerprint.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
     _, trials = cli_sweep.parse_sweep_args(
         [*OWN_PARTS, "--learner", "ddpg", "my_tasks:learner", "--seeds", "1", "--out", "sweep"]
     )

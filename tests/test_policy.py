@@ -11,8 +11,8 @@ from conftest import ROOT
 import mjx_dher
 from mjx_dher import RunSpec, learners
 from mjx_dher.config import Config, HParams
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.system.files import FolderError
 from mjx_dher.types import Sizes
 
 HP = HParams(norm_clip=3.0)

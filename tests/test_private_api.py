@@ -18,8 +18,8 @@ import pytest
 from conftest import ROOT
 from mujoco import mjx
 
-from mjx_dher.host import private_api
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system import private_api
+from mjx_dher.system.warp_setup import wp
 
 
 def no_longer_needed(what, name):
@@ -28,7 +28,7 @@ def no_longer_needed(what, name):
 
 def test_importing_it_imports_no_library():
     code = (
-        "import sys; from mjx_dher.host import private_api;"
+        "import sys; from mjx_dher.system import private_api;"
         "print({'jax', 'mujoco', 'warp', 'orbax', 'numpy'} & set(sys.modules))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -161,7 +161,7 @@ def test_orbax_still_warns_in_the_older_format(tmp_path):
 GROWTH = """
 import logging, shutil, sys
 import numpy as np, orbax.checkpoint
-from mjx_dher.host import memory
+from mjx_dher.system import memory
 memory.keep_heap_small()
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 held = []

@@ -11,8 +11,8 @@ import time
 import pytest
 from conftest import ROOT, free_port
 
-from mjx_dher.host import line
-from mjx_dher.runs import sinks
+from mjx_dher.runs.folder import loggers
+from mjx_dher.system import line
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +43,7 @@ def call(number, port, *arguments, processes=2):
 
 
 def rows_of(folder):
-    return sinks.read_rows(folder / "metrics.csv")
+    return loggers.read_rows(folder / "metrics.csv")
 
 
 @pytest.mark.parametrize("victim", [0, 1])

@@ -12,8 +12,8 @@ from test_trainer import SMALL
 
 from mjx_dher import envs, generators, make_train, priorities, replay, samplers, spec
 from mjx_dher.learners import common
-from mjx_dher.runs.loop import state_template
-from mjx_dher.runs.program import Lane
+from mjx_dher.runs.program.loop import state_template
+from mjx_dher.runs.program.program import Lane
 from mjx_dher.spec import GENERATORS, METRICS, SAMPLERS, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from point_mass import PointMass
 from probes import Explodes

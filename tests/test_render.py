@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT
 
 from mjx_dher import RunSpec, cli, envs, policy
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.tools import render
 
 NO_GL = 77  # exit status of SCRIPT where nothing can draw

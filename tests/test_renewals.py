@@ -10,9 +10,9 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, make_train, priorities, replay, testing
-from mjx_dher.methods import episodes, transitions
+from mjx_dher.context import View
+from mjx_dher.contrib import episodes, transitions
 from mjx_dher.priorities import Priority
-from mjx_dher.view import View
 from point_mass import PointMass
 
 ENV = PointMass()

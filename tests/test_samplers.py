@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import names, readings, samplers, spec
+from mjx_dher import distance_normalization, lookup, samplers, spec
 from mjx_dher.config import HParams
-from mjx_dher.methods import metrics
+from mjx_dher.contrib import metrics
 from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS, RunSpec
 
 HP = HParams()
@@ -124,13 +124,19 @@ def test_every_name_makes_a_sampler_and_random_alone_crosses_episodes(name):
 def test_names_are_those_of_functions(field, known):
     for name, place in known.items():
         module = metrics if "methods" in place else samplers
-        assert names.load_import_path(field, place) is getattr(module, name)
+        assert lookup.load_import_path(field, place) is getattr(module, name)
 
 
 def test_normalizations_are_those_of_the_module():
-    functions = [names.load_import_path("weight_normalization", place) for place in WEIGHT_NORMALIZATIONS.values()]
-    by = readings.by_mean, readings.by_sum, readings.by_max, readings.by_range, readings.by_scale
-    assert functions == [*by, readings.mirrored]
+    functions = [lookup.load_import_path("weight_normalization", place) for place in WEIGHT_NORMALIZATIONS.values()]
+    by = (
+        distance_normalization.by_mean,
+        distance_normalization.by_sum,
+        distance_normalization.by_max,
+        distance_normalization.by_range,
+        distance_normalization.by_scale,
+    )
+    assert functions == [*by, distance_normalization.mirrored]
 
 
 def first(achieved, desired, step, hparams):

@@ -10,7 +10,7 @@ from test_driver import FLAGS
 from test_identity import SPEC, edit, resume, train
 
 from mjx_dher import cli
-from mjx_dher.runs import identity, run_folder
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.sweeps import tables
 
 TASK = """
@@ -32,11 +32,11 @@ def own(tmp_path, monkeypatch):
 
     def write(text):
         (tmp_path / "own_task.py").write_text(TASK + text)
-        identity._source.cache_clear()
+        fingerprint._source.cache_clear()
 
     write("")
     yield write
-    identity._source.cache_clear()
+    fingerprint._source.cache_clear()
 
 
 def flags_of(out):
@@ -83,7 +83,7 @@ def test_trials_of_a_version_that_did_not_look_at_own_code_stay(own, tmp_path, c
     with np.load(cell / "policy.npz") as arrays:
         kept = {name: arrays[name] for name in arrays.files if name != "settings"}
     np.savez(cell / "policy.npz", **kept)
-    cell.rename(cell.with_name(identity.trial_name(spec, {})))
+    cell.rename(cell.with_name(fingerprint.trial_name(spec, {})))
     capsys.readouterr()
     assert cli.main(command) == 0
     text = capsys.readouterr().out

@@ -11,7 +11,7 @@ PROGRAM = """
 import signal, sys
 from pathlib import Path
 from rich.console import Console
-from mjx_dher.runs.stopping import Stop
+from mjx_dher.runs.signals import Stop
 before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 stop = Stop(Console(), Path("runs/here"))
 with stop:

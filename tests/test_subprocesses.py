@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from mjx_dher.host import subprocesses
+from mjx_dher.system import subprocesses
 
 
 def ask(code, **options):

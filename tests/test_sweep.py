@@ -14,11 +14,12 @@ from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_shor
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, config
-from mjx_dher.host import memory
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import driver, loop, program
-from mjx_dher.runs.identity import trial_name
+from mjx_dher.runs import driver
+from mjx_dher.runs.folder.fingerprint import trial_name
+from mjx_dher.runs.program import loop, program
 from mjx_dher.sweeps import grid, tables
+from mjx_dher.system import memory
+from mjx_dher.system.files import FolderError
 from probes import PointMass, held
 
 OLD_NAMES = {"future": "ae61a35cbf", "weighted": "56c3ede079"}

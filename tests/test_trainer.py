@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mjx_dher import Config, HParams, learners, make_train, relabel, replay, samplers, trainer
-from mjx_dher.host import memory
 from mjx_dher.rollout import rollout
-from mjx_dher.runs import loop
+from mjx_dher.runs.program import loop
+from mjx_dher.system import memory
 from probes import Explodes, PointMass
 
 ENV = PointMass()

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher import cli, envs, policies
-from mjx_dher.viewer import page, server, sources
+from mjx_dher import cli, envs
+from mjx_dher.policy import bundled
+from mjx_dher.viewer import address, server, sources
 
 
 def reach():
@@ -23,19 +24,19 @@ def reach():
 
 
 def of_package(name):
-    return sources.of_run(name, policies.FOLDER / name)
+    return sources.of_run(name, bundled.FOLDER / name)
 
 
 @pytest.fixture
 def port():
-    return page.check("127.0.0.1", 0)
+    return address.check("127.0.0.1", 0)
 
 
 # The page
 
 
 def test_a_port_that_is_free_is_given(port):
-    assert page.check("127.0.0.1", port) == port
+    assert address.check("127.0.0.1", port) == port
 
 
 def test_a_port_in_use_is_refused():
@@ -44,7 +45,7 @@ def test_a_port_in_use_is_refused():
         taken.listen()
         number = taken.getsockname()[1]
         with pytest.raises(ValueError, match=rf"port {number} of 127\.0\.0\.1 cannot be used \(.*in use.*--port, or 0"):
-            page.check("127.0.0.1", number)
+            address.check("127.0.0.1", number)
 
 
 @pytest.mark.parametrize(
@@ -59,19 +60,19 @@ def test_a_port_in_use_is_refused():
 )
 def test_a_bad_address_is_refused(host, port, message):
     with pytest.raises(ValueError, match=message):
-        page.check(host, port)
+        address.check(host, port)
 
 
 def test_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(ValueError, match=r"the viewer needs viser.*\[view\]"):
-        page.check("127.0.0.1", 0)
+        address.check("127.0.0.1", 0)
 
 
 def test_addresses_are_those_for_a_browser_here():
-    assert page.address("127.0.0.1", 80) == "http://127.0.0.1:80"
-    assert page.address("0.0.0.0", 80) == "http://127.0.0.1:80"
-    assert page.address("::1", 80) == "http://[::1]:80"
+    assert address.address("127.0.0.1", 80) == "http://127.0.0.1:80"
+    assert address.address("0.0.0.0", 80) == "http://127.0.0.1:80"
+    assert address.address("::1", 80) == "http://[::1]:80"
 
 
 def test_only_a_browser_with_a_screen_is_opened(monkeypatch):
@@ -87,17 +88,17 @@ def test_only_a_browser_with_a_screen_is_opened(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(webbrowser, "get", lambda: Screen("screen"))
     monkeypatch.setattr(webbrowser, "open", Screen("screen").open)
-    assert not page.open_browser("http://x")  # no display
+    assert not address.open_browser("http://x")  # no display
     monkeypatch.setenv("DISPLAY", ":0")
-    assert page.open_browser("http://x")
+    assert address.open_browser("http://x")
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
-    assert not page.open_browser("http://x")  # it would take the terminal
+    assert not address.open_browser("http://x")  # it would take the terminal
 
     def none():
         raise webbrowser.Error("could not locate runnable browser")
 
     monkeypatch.setattr(webbrowser, "get", none)
-    assert not page.open_browser("http://x")
+    assert not address.open_browser("http://x")
     assert opened == ["http://x"]
 
 
@@ -113,7 +114,7 @@ def test_the_page_is_served_and_the_port_is_free_afterwards(port, capsys):
             assert answer.status == 200
             assert b"<html" in answer.read(2000).lower()
         with pytest.raises(ValueError, match="cannot be used"):
-            page.check("127.0.0.1", port)
+            address.check("127.0.0.1", port)
         ends = time.monotonic() + 0.2
         viewer.run(lambda: time.monotonic() > ends)
         assert viewer.player.clock == 0  # nobody looks
@@ -122,7 +123,7 @@ def test_the_page_is_served_and_the_port_is_free_afterwards(port, capsys):
         assert viewer._panel._critic.content == "Random actions have no critic."
         viewer.take("object")  # Reach has none
         assert viewer._handle is None
-    assert page.check("127.0.0.1", port) == port
+    assert address.check("127.0.0.1", port) == port
     assert capsys.readouterr().out == ""  # what viser prints is not for users
 
 
@@ -196,7 +197,7 @@ assert not {{"jax", "mujoco", "viser"}} & set(sys.modules)
 def test_a_policy_of_another_environment_ends_the_command(capsys, port):
     assert cli.main(["view", "push", "--env", "reach", "--port", str(port), "--no-open"]) == 2
     assert "error: push cannot be played in reach" in capsys.readouterr().err
-    assert page.check("127.0.0.1", port) == port
+    assert address.check("127.0.0.1", port) == port
 
 
 def begun(*argv, **variables):
@@ -230,7 +231,7 @@ def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
         process.send_signal(signal.SIGABRT)  # with what each thread was at
         pytest.fail(process.communicate()[1])
     assert (process.returncode, out, err) == (0, "the viewer has ended\n", "")
-    assert page.check("127.0.0.1", port) == port
+    assert address.check("127.0.0.1", port) == port
 
 
 @pytest.mark.slow

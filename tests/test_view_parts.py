@@ -8,11 +8,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_dher import Options, RunSpec, envs, policies
+from mjx_dher import Options, RunSpec, envs
 from mjx_dher.config import Config
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import critic, driver, run_folder
-from mjx_dher.viewer import scene, sources
+from mjx_dher.policy import bundled
+from mjx_dher.runs import driver
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.system.files import FolderError
+from mjx_dher.viewer import critic, scene, sources
 
 TINY = Config(
     num_envs=2,
@@ -41,7 +43,7 @@ def reach():
 
 
 def of_package(name):
-    return sources.of_run(name, policies.FOLDER / name)
+    return sources.of_run(name, bundled.FOLDER / name)
 
 
 # The scene
@@ -128,7 +130,7 @@ def test_a_critic_is_in_a_checkpoint(stopped):
     obs = {"observation": np.zeros(10, np.float32), "achieved_goal": np.zeros(3), "desired_goal": np.ones(3, np.float32)}
     assert loaded.value(obs, np.zeros(4, np.float32)) != loaded.value(obs, np.ones(4, np.float32))
     with pytest.raises(FolderError, match="has no checkpoint"):
-        critic.load(policies.FOLDER / "reach", dataclasses.replace(run), reach())
+        critic.load(bundled.FOLDER / "reach", dataclasses.replace(run), reach())
 
 
 # What is played
@@ -168,7 +170,7 @@ def test_an_environment_has_the_arguments_of_its_run_or_those_given(stopped, tmp
 
 def test_a_policy_of_another_environment_is_refused():
     with pytest.raises(ValueError, match=r"push cannot be played in reach: the policy takes observations of 25"):
-        sources.Cast(sources.of_run("push", policies.FOLDER / "push", "reach"), reach())
+        sources.Cast(sources.of_run("push", bundled.FOLDER / "push", "reach"), reach())
 
 
 def test_a_run_without_a_policy_is_refused(tmp_path, stopped):

@@ -7,13 +7,13 @@ import sys
 import pytest
 from conftest import ROOT
 
-from mjx_dher.host.warp_setup import load, wp
+from mjx_dher.system.warp_setup import load, wp
 
 
 def test_without_a_folder_to_keep_kernels_in_a_warning_says_what_it_costs(tmp_path):
     (tmp_path / "file").touch()
     code = (
-        "from mjx_dher.host.warp_setup import prepare, wp; import os; prepare();"
+        "from mjx_dher.system.warp_setup import prepare, wp; import os; prepare();"
         "print(os.path.isdir(wp.config.kernel_cache_dir), wp.config.kernel_cache_dir)"
     )
     run = subprocess.run(

@@ -17,8 +17,8 @@ from test_driver import CONFIG
 
 import mjx_dher
 from mjx_dher import Options, cli, envs
-from mjx_dher.host.files import FolderError
 from mjx_dher.runs.play import play
+from mjx_dher.system.files import FolderError
 from mjx_dher.testing import check_env
 from point_mass import PointMass
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import HParams
+from mjx_dher.context import View
 from mjx_dher.replay import ReplayState
 from mjx_dher.types import Array, Episode, GoalObs, PRNGKey, RewardFn
-from mjx_dher.view import View
 
 
 def travelled(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:

@@ -33,7 +33,7 @@ include_patterns = [
     "docs/*.ipynb",
     "docs/api/*.md",
     "bench/*.md",
-    "mjx_dher/policies/*/*.md",
+    "mjx_dher/policy/bundled/*/*.md",
 ]
 html_theme = "furo"
 html_title = f"mjx-dher {release}"

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 
 from mjx_dher.envs.engines.base import Engine, Physics
-from mjx_dher.names import check_name, missing_extra
+from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.spec import ENGINES
 
 __all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]

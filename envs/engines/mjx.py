@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from mjx_dher.config import check_count
+from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines.base import Physics
-from mjx_dher.envs.kinematics import quat_multiply
-from mjx_dher.host import private_api
+from mjx_dher.system import private_api
 from mjx_dher.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed

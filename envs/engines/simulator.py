@@ -15,7 +15,7 @@ from mujoco.batch import DATA_FIELDS
 from mjx_dher.config import check_number
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.native import BatchedModel, digest
-from mjx_dher.names import check_name
+from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 
 

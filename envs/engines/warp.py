@@ -16,8 +16,8 @@ import mujoco
 from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Physics
 from mjx_dher.envs.engines.fused import simulation
-from mjx_dher.host import private_api
-from mjx_dher.host.warp_setup import load, prepare, wp
+from mjx_dher.system import private_api
+from mjx_dher.system.warp_setup import load, prepare, wp
 from mjx_dher.types import Array
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from mjx_dher import __version__, names
+from mjx_dher import __version__, lookup
 from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS
 
@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(name: str, argv: list[str]) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
-            names.check_name("command", argv[0], COMMANDS)
+            lookup.check_name("command", argv[0], COMMANDS)
         module, function = COMMANDS[name].split(":")
         command = getattr(importlib.import_module(module), function)
         return int(command(argv, Console(highlight=False, markup=False, emoji=False)))

@@ -7,10 +7,10 @@ import dataclasses
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, names, presets, spec
+from mjx_dher import envs, lookup, presets, spec
 from mjx_dher.cli.common import make_env
-from mjx_dher.host.caches import prepare
 from mjx_dher.spec import Engine
+from mjx_dher.system.caches import prepare
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class CheckArgs:
 
 def check_command(argv: list[str], console: Console) -> int:
     """Tries out parts of the user's own."""
-    args = tyro.cli(CheckArgs, prog=f"{names.program()} check", args=argv)
+    args = tyro.cli(CheckArgs, prog=f"{lookup.program()} check", args=argv)
     run = presets.preset("cpu", args.env, **{name: getattr(args, name) for name in ("engine", "env_kwargs", *spec.PARTS)})
     spec.validate(run, envs.list_envs())
     if not spec.own_parts(run):

@@ -16,10 +16,11 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
-from mjx_dher import envs, policies
+from mjx_dher import envs
 from mjx_dher.config import check_count, check_number
-from mjx_dher.names import check_name
-from mjx_dher.runs import run_folder
+from mjx_dher.lookup import check_name
+from mjx_dher.policy import bundled
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, own_parts, to_arguments, to_texts
 
 CURVE_WIDTH = 24  # characters of the live curve
@@ -135,10 +136,10 @@ def find_run(run: Path, console: Console) -> Path:
     Raises:
       FolderError: there is none.
     """
-    path = policies.find(run)
-    if policies.is_shipped(path):
-        console.print(f"{run}: the policy of the package; its card is {path / policies.CARD}", soft_wrap=True)
-    elif str(run) in policies.names():
+    path = bundled.find(run)
+    if bundled.is_shipped(path):
+        console.print(f"{run}: the policy of the package; its card is {path / bundled.CARD}", soft_wrap=True)
+    elif str(run) in bundled.names():
         console.print(f"{run}: the run in the current folder, not the policy of the package by that name", soft_wrap=True)
     return path
 

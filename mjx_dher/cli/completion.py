@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.cli.commands import COMMANDS
 
 Shell = Literal["bash", "zsh", "tcsh"]
@@ -33,8 +33,8 @@ class CompletionArgs:
 
 def completion_command(argv: list[str], console: Console) -> int:
     """Prints a shell's completion."""
-    args = tyro.cli(CompletionArgs, prog=f"{names.program()} completion", args=argv)
-    names.check_name("shell", args.shell, get_args(Shell))
+    args = tyro.cli(CompletionArgs, prog=f"{lookup.program()} completion", args=argv)
+    lookup.check_name("shell", args.shell, get_args(Shell))
     print(script(args.shell), end="")
     return 0
 

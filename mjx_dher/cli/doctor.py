@@ -8,7 +8,7 @@ import json
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ def doctor_command(argv: list[str], console: Console) -> int:
     """Says what works on this machine."""
     from mjx_dher.tools import doctor
 
-    args = tyro.cli(DoctorArgs, prog=f"{names.program()} doctor", args=argv)
+    args = tyro.cli(DoctorArgs, prog=f"{lookup.program()} doctor", args=argv)
     doctor.check(args.seconds)
     if not args.json:
         console.print("trying the engines and the ways to draw ...")

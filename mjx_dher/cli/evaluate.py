@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.cli.common import (
     changed_arguments,
     check_engine,
@@ -22,9 +22,9 @@ from mjx_dher.cli.common import (
     read_run,
     settle_compiler,
 )
-from mjx_dher.host.caches import keep_compiled_programs
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import RunSpec, to_arguments
+from mjx_dher.system.caches import keep_compiled_programs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +47,7 @@ class EvalArgs:
 
 def eval_command(argv: list[str], console: Console) -> int:
     """Evaluates the policies of run folders."""
-    args = tyro.cli(EvalArgs, prog=f"{names.program()} eval", args=argv)
+    args = tyro.cli(EvalArgs, prog=f"{lookup.program()} eval", args=argv)
     if not args.runs:
         raise ValueError("eval takes one or more run folders, or policies of the package; got none")
     check_episodes(args.episodes, args.seed)
@@ -58,7 +58,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:
         settle_compiler(args.engine or run.engine)
-    from mjx_dher.runs.load import load_policy
+    from mjx_dher.policy.load import load_policy
 
     policies = [load_policy(folder) for folder in folders]  # all of them, before any is played
     keep_compiled_programs()
@@ -69,7 +69,7 @@ def eval_command(argv: list[str], console: Console) -> int:
 
 def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Console) -> None:
     """Plays the policy of one run, and prints how it went."""
-    from mjx_dher.runs.load import check_fits
+    from mjx_dher.policy.load import check_fits
     from mjx_dher.runs.play import play, summarize
 
     env = make_env(run, args.engine)

@@ -8,9 +8,10 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import names, policies
+from mjx_dher import lookup
 from mjx_dher.cli.common import find_run
-from mjx_dher.runs import run_folder
+from mjx_dher.policy import bundled
+from mjx_dher.runs.folder import run_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +34,14 @@ class ExportArgs:
 
 def export_command(argv: list[str], console: Console) -> int:
     """Writes the policy of a run folder for other programs."""
-    from mjx_dher.runs.load import check_plain, load_policy
+    from mjx_dher.policy.load import check_plain, load_policy
     from mjx_dher.tools import export
 
-    args = tyro.cli(ExportArgs, prog=f"{names.program()} export", args=argv)
-    names.check_name("format", args.format, export.FORMATS)
+    args = tyro.cli(ExportArgs, prog=f"{lookup.program()} export", args=argv)
+    lookup.check_name("format", args.format, export.FORMATS)
     folder = find_run(args.run, console)
     run = run_folder.read_spec(folder)
-    beside = Path(f"{folder.name}.{args.format}") if policies.is_shipped(folder) else folder / f"policy.{args.format}"
+    beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside
     export.check(args.format, out, args.overwrite)
     policy = load_policy(folder)

@@ -18,13 +18,13 @@ from mjx_dher.fleet import chunks, cluster, driver, own_code, parcels, plan
 from mjx_dher.fleet.chunks import Chunk, Tell
 from mjx_dher.fleet.ledger import Ledger
 from mjx_dher.fleet.plan import Kind, Node, Request
-from mjx_dher.host import files
-from mjx_dher.host.caches import prepare
-from mjx_dher.runs.claims import Claims
+from mjx_dher.runs.folder.locks import Claims
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.stopping import Stop
+from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
+from mjx_dher.system import files
+from mjx_dher.system.caches import prepare
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,6 +207,6 @@ class _Sizes:
 
 
 def _ring_bytes(run: RunSpec) -> int:
-    from mjx_dher.runs import program
+    from mjx_dher.runs.program import program
 
     return program.make_loop(_env_here(run), run, program.choices_of([run])).replay_bytes

@@ -8,7 +8,8 @@ import json
 import tyro
 from rich.console import Console
 
-from mjx_dher import names, policies
+from mjx_dher import lookup
+from mjx_dher.policy import bundled
 
 # By kind, each name and what it is, in a line. A test holds the names to the tables in spec.py, presets.py and envs.
 KINDS: dict[str, dict[str, str]] = {
@@ -89,8 +90,8 @@ KINDS: dict[str, dict[str, str]] = {
         "fan_in": "mlp with first weights and biases as PyTorch's",
     },
     "policies": {
-        name: f"of the package: success {policies.facts(policies.FOLDER / name)['here']['success_rate']:.3f}"
-        for name in policies.names()
+        name: f"of the package: success {bundled.facts(bundled.FOLDER / name)['here']['success_rate']:.3f}"
+        for name in bundled.names()
     },
 }
 # The option that takes a name of each kind; those with "module:attribute" take a part of the user's own, too.
@@ -125,9 +126,9 @@ class ListArgs:
 
 def list_command(argv: list[str], console: Console) -> int:
     """Names all tasks and parts."""
-    args = tyro.cli(ListArgs, prog=f"{names.program()} list", args=argv)
+    args = tyro.cli(ListArgs, prog=f"{lookup.program()} list", args=argv)
     for kind in args.kinds:
-        names.check_name("kind", kind, KINDS)
+        lookup.check_name("kind", kind, KINDS)
     chosen = {kind: KINDS[kind] for kind in args.kinds or KINDS}
     if args.json:
         print(json.dumps(chosen, indent=2))

@@ -8,15 +8,15 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.cli.common import print_table
 from mjx_dher.cli.sweep import compare
 from mjx_dher.config import check_number
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import curves, run_folder
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
-from mjx_dher.tools import figures
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
+from mjx_dher.tools import curves, figures
 
 TOGETHER = "curves"  # the picture of several runs, without its ending
 
@@ -43,7 +43,7 @@ class PlotArgs:
 
 def plot_command(argv: list[str], console: Console) -> int:
     """Draws runs, or a sweep."""
-    args = tyro.cli(PlotArgs, prog=f"{names.program()} plot", args=argv)
+    args = tyro.cli(PlotArgs, prog=f"{lookup.program()} plot", args=argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(args.formats)
     if is_sweep(args.folders):

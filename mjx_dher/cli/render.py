@@ -9,12 +9,12 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, names
+from mjx_dher import envs, lookup
 from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, find_run, make_env, read_run
-from mjx_dher.host.caches import check_platform
-from mjx_dher.names import check_name
-from mjx_dher.runs import run_folder
+from mjx_dher.lookup import check_name
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import RunSpec, to_arguments
+from mjx_dher.system.caches import check_platform
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +48,10 @@ class RenderArgs:
 
 def render_command(argv: list[str], console: Console) -> int:
     """Draws episodes of a run's policy, or of random actions."""
-    from mjx_dher.runs.load import load_policy
+    from mjx_dher.policy.load import load_policy
     from mjx_dher.tools import render
 
-    args = tyro.cli(RenderArgs, prog=f"{names.program()} render", args=argv)
+    args = tyro.cli(RenderArgs, prog=f"{lookup.program()} render", args=argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
@@ -75,14 +75,14 @@ def draw_run(folder: Path, out: Path, episodes: int, console: Console) -> None:
       FolderError: no run folder, or it has no policy.
       ValueError: the environment cannot be drawn, or not on this machine.
     """
-    from mjx_dher.runs.load import load_policy
+    from mjx_dher.policy.load import load_policy
 
     _draw(read_run(folder, console), load_policy(folder), RenderArgs(out=out, run=folder, episodes=episodes), console)
 
 
 def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> None:
     """Plays episodes and writes their pictures; random ones where there is no policy."""
-    from mjx_dher.runs.load import check_fits
+    from mjx_dher.policy.load import check_fits
     from mjx_dher.tools import render
 
     render.ffmpeg()

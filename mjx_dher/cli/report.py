@@ -9,12 +9,12 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.cli import render as cli_render
 from mjx_dher.cli.plot import is_sweep
 from mjx_dher.config import check_number
-from mjx_dher.host import files
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.system import files
 from mjx_dher.tools import figures
 
 EPISODES = 3  # of a video
@@ -43,7 +43,7 @@ class ReportArgs:
 
 def report_command(argv: list[str], console: Console) -> int:
     """Writes a page about a run or a sweep."""
-    args = tyro.cli(ReportArgs, prog=f"{names.program()} report", args=argv)
+    args = tyro.cli(ReportArgs, prog=f"{lookup.program()} report", args=argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(("svg",), "report")
     sweep = is_sweep((args.folder,))

@@ -11,11 +11,11 @@ from typing import Any
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity, run_folder
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, reads
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 
 def read(path: Path) -> tuple[RunSpec, Options, list[str]]:
@@ -44,7 +44,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     """Returns where settings come from: the run, the version that wrote them, and whether they were edited since."""
     versions = content.get("versions", {})
     version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
-    now = identity.digest(run_folder.identity_of(content, run))
+    now = fingerprint.digest(run_folder.identity_of(content, run))
     edited = "; edited since" if content.get("digest", now) != now else ""
     return (
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
@@ -54,7 +54,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
 
 def changes(before: RunSpec, now: RunSpec) -> str:
     """Returns which settings were given beside those of a file: "gamma 0.9 (0.98 in the file)"."""
-    old, new = ({**identity.settings(spec), "seed": spec.seed} for spec in (before, now))
+    old, new = ({**fingerprint.settings(spec), "seed": spec.seed} for spec in (before, now))
     told = [f"{name} {text(new[name])} ({text(old[name])} in the file)" for name in new if new[name] != old[name]]
     return "given beside it: " + (", ".join(told) or "nothing")
 
@@ -94,7 +94,7 @@ def check_writable(out: Path) -> None:
 
 def groups(run: RunSpec) -> Iterator[tuple[str, str]]:
     """Yields the settings that a run reads, in three groups with a heading each."""
-    values = {**identity.settings(run), "seed": run.seed}
+    values = {**fingerprint.settings(run), "seed": run.seed}
     sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
     parts = [name for name in values if name not in (*sizes, *numbers)]
     for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
@@ -123,8 +123,8 @@ def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
     """
     import jax
 
-    from mjx_dher.host import memory
-    from mjx_dher.runs import loop, program
+    from mjx_dher.runs.program import loop, program
+    from mjx_dher.system import memory
 
     train = program.make_loop(env, specs[0], program.choices_of(specs))
     loop.check_memory(train, specs[0].config)

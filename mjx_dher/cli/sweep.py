@@ -13,21 +13,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, names, presets, spec
+from mjx_dher import envs, lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import Devices, Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
-from mjx_dher.cli.hosts import Hosts, joined, refuse_with_ray
+from mjx_dher.cli.processes import Hosts, joined, refuse_with_ray
 from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
 from mjx_dher.fleet.plan import Request
-from mjx_dher.host import files
-from mjx_dher.host.caches import check_platform, prepare
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.stopping import Stop
+from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import Engine, RunSpec
 from mjx_dher.sweeps import grid
+from mjx_dher.system import files
+from mjx_dher.system.caches import check_platform, prepare
+from mjx_dher.system.files import FolderError
 
 if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
@@ -131,7 +131,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
             dashed = name.replace("_", "-")
             raise ValueError(f"--{dashed} is called --sweep.{dashed} here, and takes one or more values to try")
     default = SweepArgs(tyro.MISSING, changes=_Changes(), sweep=_Axes())
-    args = tyro.cli(SweepArgs, prog=f"{names.program()} sweep", args=argv, default=default)
+    args = tyro.cli(SweepArgs, prog=f"{lookup.program()} sweep", args=argv, default=default)
     _check(args)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
     if args.fleet.ray is not None:
@@ -205,7 +205,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
         return _sweep_fleet(args, request, console)
     settle_compiler(args.engine)
     described = {name: value for name, value in dataclasses.asdict(args).items() if name not in ("hosts", "out")}
-    with joined(args.hosts, {**described, "trials": [*map(identity.trial_name, trials)]}, console) as (team, own_console):
+    with joined(args.hosts, {**described, "trials": [*map(fingerprint.trial_name, trials)]}, console) as (team, own_console):
         return _sweep(args, trials, own_console, team)
 
 

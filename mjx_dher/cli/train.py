@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, names, presets, spec
+from mjx_dher import envs, lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import (
     Devices,
@@ -27,20 +27,20 @@ from mjx_dher.cli.common import (
     try_parts,
     warn_of_tau,
 )
-from mjx_dher.cli.hosts import Hosts, check_out, claim, joined
+from mjx_dher.cli.processes import Hosts, check_out, claim, joined
 from mjx_dher.cli.view import PORT, Beside, Page
 from mjx_dher.config import check_devices
-from mjx_dher.host import files
-from mjx_dher.host.caches import check_platform, prepare
-from mjx_dher.host.files import FolderError
-from mjx_dher.names import check_name
+from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
-from mjx_dher.runs import curves, identity, results, run_folder, sinks
+from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.stopping import Stop
+from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec
-from mjx_dher.tools import figures
-from mjx_dher.viewer import page
+from mjx_dher.system import files
+from mjx_dher.system.caches import check_platform, prepare
+from mjx_dher.system.files import FolderError
+from mjx_dher.tools import curves, figures
+from mjx_dher.viewer import address
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,10 +118,10 @@ def train_command(argv: list[str], console: Console) -> int:
             console.print(line, soft_wrap=True)
     if args.dry_run:
         return _dry_run(args, console)
-    port = page.check(Page().host, args.view_port) if args.view else None
+    port = address.check(Page().host, args.view_port) if args.view else None
     settle_compiler(args.spec.engine)
-    own = {"seed": args.spec.seed, "sources": identity.sources(args.spec), "devices": args.devices}
-    described = {**identity.settings(args.spec), **dataclasses.asdict(args.options), **own}
+    own = {"seed": args.spec.seed, "sources": fingerprint.sources(args.spec), "devices": args.devices}
+    described = {**fingerprint.settings(args.spec), **dataclasses.asdict(args.options), **own}
     with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
         folder = Path(team.share(lambda: str(claim(stack, args.out, args.spec, goes_on=team.size > 1))))
         prepare()
@@ -177,7 +177,7 @@ def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> t
     """
     run = run_folder.to_spec(args.run, content)
     edits = run_folder.edited(args.run, content, run)
-    if refused := [text for name, text in edits.items() if name not in identity.MAY_CHANGE]:
+    if refused := [text for name, text in edits.items() if name not in fingerprint.MAY_CHANGE]:
         raise FolderError(
             f"{args.run / run_folder.CONFIG_FILE} is not as the run wrote it, and a run goes on with what it began with:"
             f" {'; '.join(refused)}"
@@ -209,7 +209,7 @@ def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[
     if not run_folder.checkpoints(args.run):
         raise FolderError(
             f"{args.run} has ended; there is nothing to go on with: --keep-end would have kept a checkpoint of its end."
-            f" `{names.program()} --config {args.run} --total-steps N` trains a longer one from the start"
+            f" `{lookup.program()} --config {args.run} --total-steps N` trains a longer one from the start"
         )
     if not results.can_go_on(args.run, run.config.total_steps):
         raise FolderError(
@@ -258,7 +258,7 @@ def _parse_preset(argv: list[str], preset: Any, chosen: argparse.Namespace) -> T
 def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     head = f"{inspect.getdoc(TrainArgs)}\n\nDefaults below are {origin}."
     args = tyro.cli(
-        TrainArgs, prog=names.program(), description=head, args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,)
+        TrainArgs, prog=lookup.program(), description=head, args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,)
     )
     problems = []
     settled = (args.options.check, lambda: check_devices(args.devices), lambda: check_out(args.hosts, args.out))
@@ -285,10 +285,10 @@ def _train(
 ) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
     from mjx_dher.runs import driver
-    from mjx_dher.runs.claims import last_checkpoint
+    from mjx_dher.runs.folder.locks import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
-    before = [row["success_rate"] for row in sinks.read_rows(folder / run_folder.METRICS_FILE)]
+    before = [row["success_rate"] for row in loggers.read_rows(folder / run_folder.METRICS_FILE)]
     stop, screen = Stop(console, folder), Screen(console, [run], before)
     curve = curve and team.leads
 
@@ -317,7 +317,7 @@ def _train(
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
-            f" `{names.program()} resume {folder}` goes on",
+            f" `{lookup.program()} resume {folder}` goes on",
             soft_wrap=True,
         )
         return 128 + (stop.asked or 0)
@@ -332,7 +332,7 @@ def _train(
 
 def _draw(folder: Path, curve: bool, console: Console) -> None:
     """Draws the curve of a run that has ended. A picture that cannot be drawn costs a line, and nothing else."""
-    if not (curve and figures.is_there() and sinks.whole_epochs(folder)):
+    if not (curve and figures.is_there() and loggers.whole_epochs(folder)):
         return
     picture = folder / f"{curves.CURVE}.png"
     try:

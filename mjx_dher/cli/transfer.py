@@ -8,10 +8,10 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.cli.common import check_engine, check_episodes, find_run, make_env, print_summary, read_run, settle_compiler
-from mjx_dher.host.caches import keep_compiled_programs
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.system.caches import keep_compiled_programs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,33 +37,33 @@ class TransferArgs:
 
 def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
-    args = tyro.cli(TransferArgs, prog=f"{names.program()} transfer", args=argv)
+    args = tyro.cli(TransferArgs, prog=f"{lookup.program()} transfer", args=argv)
     check_engine(args.engine)
     check_episodes(args.episodes, args.seed)
     folder = find_run(args.run, console)
     run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)
     from mjx_dher.envs.engines.native import usable_cores
-    from mjx_dher.runs.load import check_fits, check_plain, load_policy
+    from mjx_dher.policy.load import check_fits, check_plain, load_policy
     from mjx_dher.runs.play import play, summarize
     from mjx_dher.stats import difference_interval
-    from mjx_dher.tools import originals
+    from mjx_dher.tools import transfer
 
     policy = load_policy(folder)
     check_plain(policy, run, "transfer")
-    environment = originals.default_environment()
+    environment = transfer.default_environment()
     if args.set_up:
         console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
-        originals.set_up(environment)
-    python = args.python or originals.interpreter(environment)
-    name = originals.check(run.env, python)
+        transfer.set_up(environment)
+    python = args.python or transfer.interpreter(environment)
+    name = transfer.check(run.env, python)
     keep_compiled_programs()
     if run.env_kwargs:
         console.print(f"trained with {' '.join(run.env_kwargs)}; played without them, there and here", soft_wrap=True)
     env = make_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
-    theirs = originals.play_apart(folder, python, args.episodes, args.seed, workers=usable_cores())
+    theirs = transfer.play_apart(folder, python, args.episodes, args.seed, workers=usable_cores())
     summary_original = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
     print_summary(summary_original, console)
     console.print(f"{run.env} here, {args.episodes} episodes, physics {run_folder.engine_name(env)} ...")

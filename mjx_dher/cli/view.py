@@ -16,12 +16,13 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, names, policies
+from mjx_dher import envs, lookup
 from mjx_dher.cli.common import check_engine, check_episodes, find_run, read_run
-from mjx_dher.host import subprocesses
-from mjx_dher.host.caches import keep_compiled_programs
-from mjx_dher.names import check_name
+from mjx_dher.lookup import check_name
+from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments
+from mjx_dher.system import subprocesses
+from mjx_dher.system.caches import keep_compiled_programs
 
 PORT = 8080
 PARENT = "MJX_DHER_VIEWER_OF"  # variable with the number of the process that a viewer ends with, where one has started it
@@ -69,20 +70,20 @@ class DemoArgs:
 
 def demo_command(argv: list[str], console: Console) -> int:
     """Shows a policy of the package."""
-    args = tyro.cli(DemoArgs, prog=f"{names.program()} demo", args=argv)
-    first = "push" if "push" in policies.names() else policies.names()[0]
+    args = tyro.cli(DemoArgs, prog=f"{lookup.program()} demo", args=argv)
+    first = "push" if "push" in bundled.names() else bundled.names()[0]
     return _view(ViewArgs(runs=(Path(first),), page=args.page), console)
 
 
 def view_command(argv: list[str], console: Console) -> int:
     """Shows policies at play."""
-    return _view(tyro.cli(ViewArgs, prog=f"{names.program()} view", args=argv), console)
+    return _view(tyro.cli(ViewArgs, prog=f"{lookup.program()} view", args=argv), console)
 
 
 def _view(args: ViewArgs, console: Console) -> int:
     """Serves the page until Ctrl-C, which is how it is meant to end: status 0."""
     if not args.runs and args.env is None:
-        raise ValueError(f"view takes run folders, policies of the package ({', '.join(policies.names())}), or --env")
+        raise ValueError(f"view takes run folders, policies of the package ({', '.join(bundled.names())}), or --env")
     if args.env is not None:
         check_name("env", args.env, envs.list_envs(), own=True)
     check_engine(args.engine)
@@ -91,9 +92,9 @@ def _view(args: ViewArgs, console: Console) -> int:
     folders = [(str(run), find_run(run, console)) for run in args.runs]
     for _, folder in folders:
         read_run(folder, console)
-    from mjx_dher.viewer import page
+    from mjx_dher.viewer import address
 
-    port = page.check(args.page.host, args.page.port)
+    port = address.check(args.page.host, args.page.port)
     if args.engine in (None, "native"):
         os.environ.setdefault("JAX_PLATFORMS", "cpu")  # one state at a time is slower on a GPU
     from mjx_dher.viewer import server, sources
@@ -108,9 +109,9 @@ def _view(args: ViewArgs, console: Console) -> int:
             _until_ctrl_c() as stopped,
         ):
             console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)", soft_wrap=True)
-            if args.page.host not in page.LOOPBACK:
+            if args.page.host not in address.LOOPBACK:
                 console.print(f"whoever can reach {args.page.host} can see it, and move things", soft_wrap=True)
-            if args.page.open and not page.open_browser(viewer.address):
+            if args.page.open and not address.open_browser(viewer.address):
                 console.print("there is no browser here that could be opened: open that address in one", soft_wrap=True)
             sys.stdout.flush()
             viewer.run(lambda: stopped.is_set() or (PARENT in os.environ and os.environ[PARENT] != str(os.getppid())))
@@ -144,7 +145,7 @@ class Beside:
 
     Args:
       folder: of the run.
-      port: where the page is served, as `page.check` gave it; None for no viewer.
+      port: where the page is served, as `address.check` gave it; None for no viewer.
       console: to print to.
     """
 
@@ -164,14 +165,16 @@ class Beside:
         if self._port is None:
             return
         if self._process is None:
-            from mjx_dher.viewer import page
+            from mjx_dher.viewer import address
 
             place = str(subprocesses.PACKAGE.parent)  # of this package, which need not be installed
             code = f"import sys; sys.path.append({place!r}); from mjx_dher.cli import main; sys.exit(main())"
             command = (sys.executable, "-c", code, "view", str(self._folder), "--port", str(self._port))
             variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
             self._process = self._stack.enter_context(subprocesses.started(command, variables))
-            self._console.print(f"the run is to be seen at {page.address(Page().host, self._port)} in a moment", soft_wrap=True)
+            self._console.print(
+                f"the run is to be seen at {address.address(Page().host, self._port)} in a moment", soft_wrap=True
+            )
         elif self._process.poll() is not None:
             failure = subprocesses.answer(self._process).failure or "it was closed"
             self._console.print(f"the viewer has ended ({failure}); the run goes on", soft_wrap=True)

@@ -27,12 +27,12 @@ from mjx_dher import __version__
 from mjx_dher.fleet import parcels
 from mjx_dher.fleet.parcels import Storage
 from mjx_dher.fleet.plan import Node
-from mjx_dher.host import files
-from mjx_dher.runs import identity, results
-from mjx_dher.runs.loop import Progress
+from mjx_dher.runs.folder import fingerprint, results
 from mjx_dher.runs.options import Options
+from mjx_dher.runs.program.loop import Progress
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid, sweep
+from mjx_dher.system import files
 from mjx_dher.types import Env
 
 SCRATCH = "mjx-dher-fleet-"
@@ -271,7 +271,7 @@ def inspect(
     """
     sources: dict[str, str] = {}
     for spec in specs:
-        for field, source in identity.sources(spec).items():
+        for field, source in fingerprint.sources(spec).items():
             sources[f"{field} {getattr(spec, field)}"] = source
     wrong = parcels.probe(storage, sweep_id, token) if storage is not None else None
     gpus = _gpus() if resources.get("GPU", 0) else []

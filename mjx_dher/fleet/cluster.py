@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 from mjx_dher.fleet import chunks, plan
 from mjx_dher.fleet.chunks import Chunk, Told
 from mjx_dher.fleet.plan import LOCAL, Kind, Node, Request
-from mjx_dher.host import subprocesses
 from mjx_dher.spec import RunSpec
+from mjx_dher.system import subprocesses
 
 RETRIES = 5  # of a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # that a cluster has

@@ -13,10 +13,10 @@ from mjx_dher.fleet.chunks import Chunk, Told
 from mjx_dher.fleet.cluster import Flying, Outcome, Work
 from mjx_dher.fleet.ledger import Ledger
 from mjx_dher.fleet.plan import Kind
-from mjx_dher.host.files import BusyError
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
+from mjx_dher.system.files import BusyError
 
 SECONDS_TO_WAIT = 0.5  # for a chunk to end, between looks at all else
 

@@ -11,10 +11,10 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 FILE = "fleet.json"
 
@@ -29,7 +29,7 @@ class Ledger:
 
     def __init__(self, folder: Path, specs: Iterable[RunSpec]):
         self._path = folder / FILE
-        waiting = {identity.trial_name(spec): spec for spec in specs}
+        waiting = {fingerprint.trial_name(spec): spec for spec in specs}
         self.sweep, chunks = _read(self._path)
         self._out: dict[str, list[str]] = {}
         self._earlier: deque[tuple[str, tuple[RunSpec, ...]]] = deque()
@@ -61,8 +61,8 @@ class Ledger:
             while self._waiting and len(own) < most and self._waiting[0].program == program:
                 own.append(self._waiting.popleft())
             specs = tuple(own)
-            names = [identity.trial_name(spec) for spec in specs]
-            chunk = identity.sha256_of(names)[:16]
+            names = [fingerprint.trial_name(spec) for spec in specs]
+            chunk = fingerprint.sha256_of(names)[:16]
         self._out[chunk] = names
         self._write()
         return chunk, specs

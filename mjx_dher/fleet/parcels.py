@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import results, run_folder
+from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 KEPT = 2  # copies of a chunk in the storage: where the newest is damaged, the one before is used
 

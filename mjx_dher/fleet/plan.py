@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mjx_dher import names
+from mjx_dher import lookup
 from mjx_dher.config import check_count
-from mjx_dher.host.files import FolderError
+from mjx_dher.system.files import FolderError
 
 LOCAL = "local"
 PLACES = ("auto", "gpu", "cpu", "both")
@@ -70,7 +70,7 @@ def check(request: Request, shard: str) -> None:
                 "ray must be local (this machine), auto (the cluster that this machine is part of), or HOST:PORT of that"
                 f" cluster's head; got {request.ray!r}"
             )
-    names.check_name("ray_on", request.on, PLACES)
+    lookup.check_name("ray_on", request.on, PLACES)
     for field, value in (("ray_cpus", request.cpus), ("ray_chunk", request.chunk)):
         if value is not None:
             check_count(field, value)
@@ -80,7 +80,7 @@ def check(request: Request, shard: str) -> None:
         _check_storage(request.storage)
     if shard != "1/1":
         raise ValueError(f"shard does not go with --ray, which shares out the runs itself; got {shard}")
-    names.require_extra("--ray", "ray", "ray")
+    lookup.require_extra("--ray", "ray", "ray")
 
 
 def _check_storage(storage: str) -> None:

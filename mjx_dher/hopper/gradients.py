@@ -131,7 +131,7 @@ def _network_gradients(
 def _calls() -> tuple[Any, Any]:
     """Returns the two kernels as functions of JAX, compiled: nothing can be compiled while XLA records a graph."""
     from mjx_dher.hopper.kernels import actor_pass, critic_pass
-    from mjx_dher.host.warp_setup import prepare, wp
+    from mjx_dher.system.warp_setup import prepare, wp
 
     prepare()
     with concurrent.futures.ThreadPoolExecutor() as pool:
@@ -144,7 +144,7 @@ def _calls() -> tuple[Any, Any]:
 
 def devices() -> list[Any]:
     """Returns Warp's own device and those of JAX on this host, each once. They have no hash, and so no set."""
-    from mjx_dher.host.warp_setup import wp
+    from mjx_dher.system.warp_setup import wp
 
     local = [wp.device_from_jax(each) for each in jax.local_devices() if each.platform == "gpu"]
     return list({device.alias: device for device in (wp.get_device(), *local)}.values())

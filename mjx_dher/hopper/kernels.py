@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from mjx_dher.hopper.layout import BLOCKS, INPUTS, ROWS, THREADS, WIDTH
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 _CONSUMERS = THREADS - 128  # threads that multiply: two warpgroups; a third warpgroup copies
 _CHUNK = 64 * WIDTH  # weights in a chunk: 64 rows of a matrix

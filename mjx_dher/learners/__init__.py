@@ -8,13 +8,13 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import names, networks
+from mjx_dher import lookup, networks
 from mjx_dher.config import Config, HParams
+from mjx_dher.context import Values
 from mjx_dher.networks import NetworksFn
+from mjx_dher.parallel.split import Split
 from mjx_dher.spec import LEARNERS
-from mjx_dher.split import Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
-from mjx_dher.view import Values
 
 # What the loop and the log call theirs: a learner's metrics have other names.
 RESERVED = frozenset(
@@ -82,7 +82,7 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     Raises:
       ValueError: no such learner or networks, something that lacks a method of `Learner`, or parts that do not combine.
     """
-    make_learner = names.resolve("learner", name, LEARNERS, ("config", "sizes", "networks"))
+    make_learner = lookup.resolve("learner", name, LEARNERS, ("config", "sizes", "networks"))
     learner = make_learner(config, sizes, networks.make(network))
     check_methods(name, learner)
     check_discount(learner, config)

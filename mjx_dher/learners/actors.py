@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from mjx_dher.config import HParams
 from mjx_dher.learners import common
 from mjx_dher.networks import Actor, GaussianActor
-from mjx_dher.split import ALONE, Split
+from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.types import Array, Metrics, PRNGKey, PyTree, Sizes
 
 Judge = Callable[[Array], Array]

@@ -13,7 +13,7 @@ from flax import struct
 from mjx_dher import normalizer
 from mjx_dher.config import HParams
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.split import ALONE, Split
+from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.types import Array, Batch, GoalObs, PRNGKey, PyTree
 
 

@@ -17,8 +17,8 @@ from mjx_dher.learners import common
 from mjx_dher.learners.common import Losses, Params
 from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, check_outputs
 from mjx_dher.normalizer import NormalizerState
+from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.policy import Policy, from_mlp
-from mjx_dher.split import ALONE, Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 

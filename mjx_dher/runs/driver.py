@@ -18,19 +18,22 @@ import numpy as np
 
 from mjx_dher import config as config_lib
 from mjx_dher import spec as spec_lib
-from mjx_dher.host import files
-from mjx_dher.learners.stored import StoredPolicy
-from mjx_dher.runs import health, identity, loop, mesh, play, run_folder, sinks
-from mjx_dher.runs import program as program_lib
-from mjx_dher.runs.claims import Claims, Run, named
-from mjx_dher.runs.lane_checkpoints import LaneCheckpoints
-from mjx_dher.runs.loop import Progress, Start
+from mjx_dher.parallel import mesh
+from mjx_dher.parallel.processes import ALONE, Team
+from mjx_dher.policy.learner_policy import StoredPolicy
+from mjx_dher.runs import diagnostics, play
+from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
+from mjx_dher.runs.folder.locks import Claims, Run, named
+from mjx_dher.runs.folder.loggers import Sink
+from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.program import Program
-from mjx_dher.runs.run_folder import FAILED, FINISHED
-from mjx_dher.runs.sinks import Sink
-from mjx_dher.runs.team import ALONE, Team
+from mjx_dher.runs.program import loop
+from mjx_dher.runs.program import program as program_lib
+from mjx_dher.runs.program.loop import Progress, Start
+from mjx_dher.runs.program.program import Program
 from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
 from mjx_dher.types import Env
 
 STOPPED = "stopped"
@@ -84,7 +87,7 @@ def train_runs(
 ) -> list[Result]:
     """Trains runs that can share a program, as many side by side as can be, each into a folder of its own.
 
-    A run whose folder has a checkpoint goes on from it. A run that has gone bad (`health.failure`) has failed: it ends there,
+    A run whose folder has a checkpoint goes on from it. A run that goes bad (`diagnostics.failure`) ends there,
     alone, and its result says why.
 
     Args:
@@ -168,7 +171,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     options, team = session.options, session.team
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
-    runs = [identity.identity(spec, physics, identity.sources(spec)) for spec in specs]
+    runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec)) for spec in specs]
     checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs, team)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams))
@@ -209,7 +212,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
 
 
 def _success_rates(folder: Path) -> list[float]:
-    return [row["success_rate"] for row in sinks.read_rows(folder / sinks.METRICS_FILE)]
+    return [row["success_rate"] for row in loggers.read_rows(folder / loggers.METRICS_FILE)]
 
 
 def _refuse_ended(env: Env, spec: RunSpec, start: Start) -> None:
@@ -235,13 +238,13 @@ def _open(
 
     `ended` is the number of epochs that its metrics have.
     """
-    digest = identity.digest(run)
+    digest = fingerprint.digest(run)
     if ended == 0 or run_folder.read_content(folder).get("digest", digest) != digest:
         placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
         run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)
-    opened = [*sinks.open_sinks(folder, session.options.log, ended, steps, digest), *own]
+    opened = [*loggers.open_sinks(folder, session.options.log, ended, steps, digest), *own]
     for sink in opened:
         stack.callback(sink.close)
     return opened
@@ -268,11 +271,11 @@ class Watch:
         for lane, (spec, row) in enumerate(zip(self._specs, rows)):
             if lane in self.failed:
                 continue
-            if reason := health.failure(row, spec.config, bool(finite[lane])):
+            if reason := diagnostics.failure(row, spec.config, bool(finite[lane])):
                 self.failed[lane] = progress.epoch, reason
                 self._report(f"{self._names[lane]}failed in epoch {progress.epoch}: {reason}")
                 continue
-            for kind, text in health.warnings(row, spec.config).items():
+            for kind, text in diagnostics.warnings(row, spec.config).items():
                 if (lane, kind) not in self._warned:
                     self._warned.add((lane, kind))
                     self._report(f"{self._names[lane]}epoch {progress.epoch}: {text}")
@@ -281,7 +284,7 @@ class Watch:
 def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:
     """Returns an epoch's metrics of each run."""
     metrics = {name: np.atleast_1d(values) for name, values in progress.metrics.items()}
-    return [sinks.row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
+    return [loggers.row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
 
 
 def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], failed: Container[int]) -> None:
@@ -331,7 +334,7 @@ def _finish(
             "env_steps": progress.env_steps // progress.epoch * epoch,
             "wall_seconds": progress.wall_seconds,
             "lanes": program.lanes,
-            "digest": identity.digest(runs[lane]),
+            "digest": fingerprint.digest(runs[lane]),
         }
         if not reason:
             content |= play.summarize(*(x[lane] for x in outcome))
@@ -339,7 +342,7 @@ def _finish(
             if not reason:
                 _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
                 files.flush(folder / run_folder.POLICY_FILE)
-            sinks.flush(folder)
+            loggers.flush(folder)
             files.write_json(folder / run_folder.RESULT_FILE, content)
         results.append(Result(folder, str(content["status"]), epoch, progress.num_epochs, content))
     return results

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from mjx_dher.config import check_count, check_number
-from mjx_dher.runs import sinks
+from mjx_dher.runs.folder import loggers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Options:
         check_count("keep", self.keep)
         if not isinstance(self.keep_end, bool):
             raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
-        sinks.check(self.log)
+        loggers.check(self.log)
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
 

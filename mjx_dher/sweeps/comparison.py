@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import stats
-from mjx_dher.host import files
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs.run_folder import FAILED
+from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import SAMPLERS, reads
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
 
 COMPARISON = "comparison.csv"
 

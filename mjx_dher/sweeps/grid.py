@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_dher.config import Config, HParams
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import identity, results, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.spec import RunSpec, read_by, reads
+from mjx_dher.system.files import FolderError
 
 CELLS = "cells"
 _SIZES = tuple(field.name for field in dataclasses.fields(Config))
@@ -65,8 +65,8 @@ def shard(specs: Sequence[RunSpec], index: int, count: int) -> list[RunSpec]:
 
 def folder_of(sweep: Path, spec: RunSpec) -> Path:
     """Returns the run folder of a trial."""
-    folder = sweep / CELLS / identity.trial_name(spec)
-    earlier = sweep / CELLS / identity.trial_name(spec, own_sources={})  # of a version that did not look at own code
+    folder = sweep / CELLS / fingerprint.trial_name(spec)
+    earlier = sweep / CELLS / fingerprint.trial_name(spec, own_sources={})  # of a version that did not look at own code
     return earlier if earlier.exists() and not folder.exists() else folder
 
 
@@ -77,7 +77,7 @@ def is_done(sweep: Path, spec: RunSpec) -> bool:
 
 def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
     """Returns what a reader is told of own code that is not what trials in the folder were trained with."""
-    now = {(field, getattr(spec, field)): source for spec in specs for field, source in identity.sources(spec).items()}
+    now = {(field, getattr(spec, field)): source for spec in specs for field, source in fingerprint.sources(spec).items()}
     told: dict[str, int] = {}
     for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
         try:

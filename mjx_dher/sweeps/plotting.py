@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher import stats
-from mjx_dher.runs import run_folder
+from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps.comparison import Group, Row
 from mjx_dher.tools import figures
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from mjx_dher import __version__
 from mjx_dher.config import Config, HParams
-from mjx_dher.runs import curves, identity, run_folder
-from mjx_dher.runs.curves import Curve
-from mjx_dher.runs.run_folder import FAILED
+from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec, reads
 from mjx_dher.sweeps import comparison, plotting, tables
-from mjx_dher.tools import figures, page
+from mjx_dher.tools import curves, figures, html
+from mjx_dher.tools.curves import Curve
 
 REPORT = "report.html"
 
@@ -32,18 +32,18 @@ def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> s
     """
     curve = curves.read(folder, allow_empty=True)
     spec = curve.spec
-    body = [page.paragraph(curves.title(curve), "failed" if curve.status == FAILED else ""), page.facts(_facts(curve))]
+    body = [html.paragraph(curves.title(curve), "failed" if curve.status == FAILED else ""), html.facts(_facts(curve))]
     body += _videos(folder, report)
     if curve.rows:
-        body += [page.heading("Curves"), page.figure(figures.to_svg(curves.draw(curve), 0))]
+        body += [html.heading("Curves"), html.figure(figures.to_svg(curves.draw(curve), 0))]
         columns = [name for name in curve.rows[0] if name != "digest"]
         rows = [[_number(row.get(name)) for name in columns] for row in curve.rows]
-        body.append(page.details(f"every epoch ({len(rows)})", page.table(columns, rows)))
+        body.append(html.details(f"every epoch ({len(rows)})", html.table(columns, rows)))
     else:
-        body.append(page.paragraph("No epoch of the run has ended."))
-    body += [page.heading("Settings"), *_settings(spec, curve.content)]
-    body += [page.code(f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"), _footer(curve.content.get("versions"))]
-    return page.page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
+        body.append(html.paragraph("No epoch of the run has ended."))
+    body += [html.heading("Settings"), *_settings(spec, curve.content)]
+    body += [html.code(f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"), _footer(curve.content.get("versions"))]
+    return html.page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
 
 
 def _facts(curve: Curve) -> Iterator[tuple[str, str]]:
@@ -63,7 +63,7 @@ def _facts(curve: Curve) -> Iterator[tuple[str, str]]:
 
 def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
     """Yields the settings that a run reads, beside the defaults of the library where they differ."""
-    values, defaults = {**identity.settings(spec), "seed": spec.seed}, identity.settings(RunSpec())
+    values, defaults = {**fingerprint.settings(spec), "seed": spec.seed}, fingerprint.settings(RunSpec())
     sizes, numbers = [field.name for field in dataclasses.fields(Config)], HParams._fields
     parts = [name for name in values if name not in (*sizes, *numbers)]
     for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
@@ -71,17 +71,17 @@ def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
         rows = [[n, _value(values[n]), _value(defaults[n]) if n in defaults and defaults[n] != values[n] else ""] for n in own]
         if title == "run":
             rows.append(["physics", content["physics"], ""])
-        yield page.details(title, page.table((title, "value", "default, where it differs"), rows))
+        yield html.details(title, html.table((title, "value", "default, where it differs"), rows))
 
 
 def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in page.VIDEOS or not path.is_file():
+        if path.suffix.lower() not in html.VIDEOS or not path.is_file():
             continue
-        if path.stat().st_size > page.LARGEST:
-            report(f"{path} is larger than {page.LARGEST / 1e6:.0f} MB, and left out")
+        if path.stat().st_size > html.LARGEST:
+            report(f"{path} is larger than {html.LARGEST / 1e6:.0f} MB, and left out")
             continue
-        yield page.video(path)
+        yield html.video(path)
 
 
 def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
@@ -98,20 +98,20 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
     """
     trials = tables.read(folder)
     failed = [trial for trial in trials if trial["status"] == FAILED]
-    body = [page.paragraph(f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")]
+    body = [html.paragraph(f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")]
     body += _videos(folder, report)
     for number, (env, groups) in enumerate(comparison.groups(trials).items()):
         rows = comparison.compare(groups, baseline, threshold)
-        body += [page.heading(env), page.table(*comparison.table(rows))]
+        body += [html.heading(env), html.table(*comparison.table(rows))]
         compared = f"P(better) and p: against {baseline}" if any(row.better == row.better for row in rows) else "no baseline"
-        body.append(page.paragraph(f"epochs to a success rate of {threshold:g}; {compared}"))
+        body.append(html.paragraph(f"epochs to a success rate of {threshold:g}; {compared}"))
         for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
-            body.append(page.figure(figures.to_svg(figure, 10 * number + place), name))
+            body.append(html.figure(figures.to_svg(figure, 10 * number + place), name))
     plotting.close()
-    body += [page.heading("Runs"), page.details(f"all {len(trials)} runs", _runs(trials))]
-    body += [page.heading("Settings"), *_shared_settings(trials)]
+    body += [html.heading("Runs"), html.details(f"all {len(trials)} runs", _runs(trials))]
+    body += [html.heading("Settings"), *_shared_settings(trials)]
     body.append(_footer(None))
-    return page.page(f"Sweep {folder.absolute().name}", body)
+    return html.page(f"Sweep {folder.absolute().name}", body)
 
 
 def _runs(trials: Sequence[dict[str, Any]]) -> str:
@@ -123,7 +123,7 @@ def _runs(trials: Sequence[dict[str, Any]]) -> str:
         values = [_value(trial["settings"][name]) for name in varying]
         numbers = map(_number, (final.get("success_rate"), final.get("reset_success_rate"), seconds))
         rows.append([trial["folder"].name, *values, trial["seed"], trial["status"], *numbers, trial["reason"]])
-    return page.table(head, rows)
+    return html.table(head, rows)
 
 
 def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
@@ -134,14 +134,14 @@ def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
 def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
     varying, first = _varying(trials), trials[0]["settings"]
     if varying:
-        yield page.paragraph(f"What differs between runs: {', '.join(varying)}.")
+        yield html.paragraph(f"What differs between runs: {', '.join(varying)}.")
     rows = [(name, _value(value)) for name, value in first.items() if name not in varying]
-    yield page.details("the same in all runs", page.table(("setting", "value"), rows))
+    yield html.details("the same in all runs", html.table(("setting", "value"), rows))
 
 
 def _footer(versions: Any) -> str:
     told = ", ".join(f"{name} {version}" for name, version in versions.items()) if isinstance(versions, dict) else ""
-    return page.paragraph(f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
+    return html.paragraph(f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
 
 
 def _value(value: Any) -> str:

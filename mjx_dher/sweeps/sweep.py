@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from mjx_dher.parallel.processes import ALONE, Team
 from mjx_dher.runs.driver import Result, train_runs
-from mjx_dher.runs.loop import Progress
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.team import ALONE, Team
+from mjx_dher.runs.program.loop import Progress
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.types import Env

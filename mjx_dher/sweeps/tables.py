@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.host.files import FolderError, atomic_write
-from mjx_dher.runs import identity, results, run_folder, sinks
-from mjx_dher.runs.run_folder import FAILED
+from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.sweeps.grid import CELLS
+from mjx_dher.system.files import FolderError, atomic_write
 
 RESULTS = "results.csv"
 FINALS = "finals.csv"
@@ -41,12 +41,12 @@ def _read_trial(path: Path) -> dict[str, Any]:
     result, (content, spec) = results.read(path), run_folder.read(path)
     failed = result["status"] == FAILED
     try:
-        rows = sinks.read_rows(path / run_folder.METRICS_FILE)
-        columns = [name for name in (rows[0] if rows else ()) if name != sinks.DIGEST]
+        rows = loggers.read_rows(path / run_folder.METRICS_FILE)
+        columns = [name for name in (rows[0] if rows else ()) if name != loggers.DIGEST]
         return {
             "folder": path,
             "settings": {
-                **identity.settings(spec),
+                **fingerprint.settings(spec),
                 "engine": content["physics"],
                 "source": ", ".join(dict.fromkeys(content.get("sources", {}).values())),
             },

@@ -10,6 +10,7 @@ In a test:
 
 from mjx_dher.testing.env import EnvError, check_env
 from mjx_dher.testing.learner import check_learner
+from mjx_dher.testing.methods import check_generator
 from mjx_dher.testing.parts import (
     PartError,
     check_kernel,
@@ -19,7 +20,6 @@ from mjx_dher.testing.parts import (
     check_priority,
     check_sampler,
 )
-from mjx_dher.testing.views import check_generator
 
 __all__ = [
     "EnvError",

@@ -11,20 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import learners, names, priorities, samplers, scores
+from mjx_dher import learners, lookup, priorities, samplers, scores
 from mjx_dher.config import HParams
+from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
-from mjx_dher.names import is_import_path
+from mjx_dher.lookup import is_import_path
 from mjx_dher.priorities import Priority, PriorityFn
-from mjx_dher.readings import NormalizationFn
 from mjx_dher.rollout import env_sizes
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.scores import LearnedMetric
 from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS, RunSpec, own_parts, reads
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
+from mjx_dher.testing.methods import check_choice, check_generator, trial_view
 from mjx_dher.testing.trial import PartError, attempt, random_episodes
-from mjx_dher.testing.views import check_choice, check_generator, trial_view
 from mjx_dher.types import Env, Episode
 
 TOLERANCE = 1e-3
@@ -287,7 +287,7 @@ def _check_weights(weights: NDArray) -> None:
 
 
 def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:
-    return attempt(field, names.resolve, field, value, known, parameters)
+    return attempt(field, lookup.resolve, field, value, known, parameters)
 
 
 def _as_arrays(hparams: HParams) -> HParams:

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher import __version__, presets, spec
-from mjx_dher.host import caches, memory, subprocesses
-from mjx_dher.tools import originals, render
+from mjx_dher.system import caches, memory, subprocesses
+from mjx_dher.tools import render, transfer
 
 LONGEST_SECONDS = 3600.0  # longest time limit of a child process
 ENGINES = tuple(name for name in spec.ENGINES if name != "auto")
@@ -253,8 +253,8 @@ def _cache() -> dict[str, Any]:
 
 
 def _originals() -> dict[str, Any]:
-    environment = originals.default_environment()
-    return {"path": _brief(environment), "ready": originals.is_ready(originals.interpreter(environment))}
+    environment = transfer.default_environment()
+    return {"path": _brief(environment), "ready": transfer.is_ready(transfer.interpreter(environment))}
 
 
 def _brief(path: str | Path) -> str:

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_dher import __version__, names
-from mjx_dher.host import files
+from mjx_dher import __version__, lookup
 from mjx_dher.policy import Policy, from_arrays
 from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
 
 FORMAT_VERSION = 1  # version of names, shapes and meanings in both files
 OPSET = 17  # ONNX opset; later ones add nothing that this graph needs, and fewer programs read them
@@ -36,9 +36,9 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
     Raises:
       ValueError: `file_format` is unknown, its package is not installed, or `out` cannot or must not be written.
     """
-    names.check_name("format", file_format, FORMATS)
+    lookup.check_name("format", file_format, FORMATS)
     files.check_file(out, [f".{file_format}"], overwrite)
-    names.require_extra(f"format {file_format}", file_format, "export")
+    lookup.require_extra(f"format {file_format}", file_format, "export")
 
 
 def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:

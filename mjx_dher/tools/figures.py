@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import names
-from mjx_dher.host import files
+from mjx_dher import lookup
+from mjx_dher.system import files
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart, from dark to light; each with its own line and marker.
 _STYLES = (
@@ -35,7 +35,7 @@ def check(formats: Sequence[str], feature: str = "plot") -> None:
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
-    names.require_extra(feature, "matplotlib", "plot")
+    lookup.require_extra(feature, "matplotlib", "plot")
 
 
 def is_there() -> bool:

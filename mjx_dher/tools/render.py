@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import names
-from mjx_dher.host import files, subprocesses
+from mjx_dher import lookup
+from mjx_dher.system import files, subprocesses
 
 FPS = 25  # frames per second, in real time: an action lasts 40 ms
 HOLD = 10  # repetitions of an episode's last frame, so that the eye can compare object and goal
@@ -62,7 +62,7 @@ def ffmpeg() -> str:
     Raises:
       ValueError: it is not installed.
     """
-    names.require_extra("writing pictures", "imageio_ffmpeg", "video")
+    lookup.require_extra("writing pictures", "imageio_ffmpeg", "video")
     from imageio_ffmpeg import get_ffmpeg_exe
 
     try:

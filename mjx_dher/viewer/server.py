@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
-from mjx_dher.viewer import page
+from mjx_dher.viewer import address
 from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
 from mjx_dher.viewer.player import SECONDS_PER_STEP, Game, Player, bounds, make_game
 from mjx_dher.viewer.scene import Poses, add
@@ -29,7 +29,7 @@ class Viewer:
     Args:
       sources: policies to choose from; the first is at play.
       make_env: makes a source's environment.
-      host, port: where the page is served, as `page.check` gave the port.
+      host, port: where the page is served, as `address.check` gave the port.
       seed: of the first episode.
 
     Raises:
@@ -45,7 +45,7 @@ class Viewer:
         self._handle: Any = None
         self._cast, self.player = self._prepare(sources[0])
         self._server = _start(host, port)
-        self.address = page.address(host, self._server.get_port())
+        self.address = address.address(host, self._server.get_port())
         self._panel = Panel(self._server.gui, list(self._sources), self._commands, self.choose, lambda: self.player, self.take)
         self._draw_scene()
         self._name()
@@ -201,7 +201,7 @@ def _start(host: str, port: int) -> Any:
         server = viser.ViserServer(host=host, port=port, label="mjx-dher", verbose=False)
         if server.get_port() != port:  # it takes the next that is free
             server.stop()
-            raise page.in_use(host, port, "another program has taken it")
+            raise address.in_use(host, port, "another program has taken it")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.scene.configure_environment_map("studio", environment_intensity=0.22)  # light from all sides
     return server

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import policies
-from mjx_dher.host.files import FolderError
-from mjx_dher.runs import critic, load, results, run_folder, sinks
+from mjx_dher.policy import bundled, load
+from mjx_dher.runs.folder import loggers, results, run_folder
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
+from mjx_dher.system.files import FolderError
+from mjx_dher.viewer import critic
 from mjx_dher.viewer.player import Act, Value
 
 RANDOM = "random actions"
@@ -50,7 +51,7 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
 
 def of_package() -> list[Source]:
     """Returns the sources of the policies that are part of the package."""
-    return [of_run(name, policies.FOLDER / name) for name in policies.names()]
+    return [of_run(name, bundled.FOLDER / name) for name in bundled.names()]
 
 
 def by_random(env: str, env_kwargs: Sequence[str] = ()) -> Source:
@@ -97,12 +98,12 @@ class Cast:
         try:
             if results.exists(folder):
                 result = results.read(folder)
-                measured = policies.facts(folder)["here"] if policies.is_shipped(folder) else result
+                measured = bundled.facts(folder)["here"] if bundled.is_shipped(folder) else result
                 return (
                     f"{text}, trained: success {measured['success_rate']:.3f} in {measured['episodes']:,} episodes after"
                     f" {result['env_steps']:,} steps"
                 )
-            row: Mapping[str, Any] = sinks.read_rows(folder / run_folder.METRICS_FILE)[-1]
+            row: Mapping[str, Any] = loggers.read_rows(folder / run_folder.METRICS_FILE)[-1]
             return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
         except (FolderError, KeyError, IndexError, OSError, ValueError):  # what it plays is whole, and that is what counts
             return text
@@ -134,7 +135,7 @@ class Cast:
         folder, run = self.source.folder, self.source.run
         assert folder is not None
         assert run is not None
-        if policies.is_shipped(folder):
+        if bundled.is_shipped(folder):
             self.critic = "No critic: the policies of the package come without one."
             return
         newest = next(iter(run_folder.checkpoints(folder)), None)

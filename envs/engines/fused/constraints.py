@@ -5,10 +5,10 @@ D = imp / ((1 - imp) times its inverse inertia) has it: https://mujoco.readthedo
 """
 
 from mjx_dher.envs.engines.fused.contacts import tangent
-from mjx_dher.envs.engines.fused.kinematics import times
-from mjx_dher.envs.engines.fused.lanes import sync
+from mjx_dher.envs.engines.fused.dynamics import times
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, Softness, World
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.envs.engines.fused.threads import sync
+from mjx_dher.system.warp_setup import wp
 
 _MOST = wp.constant(6)  # edges of a pyramid of condim 4, which has most
 _TINY = wp.constant(1e-15)  # MuJoCo's smallest number

@@ -1,10 +1,10 @@
 """Contacts of a substep: a lane for each pair of geoms."""
 
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
-from mjx_dher.envs.engines.fused.lanes import sync
 from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, Contacts, Memory
-from mjx_dher.host import private_api
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.envs.engines.fused.threads import sync
+from mjx_dher.system import private_api
+from mjx_dher.system.warp_setup import wp
 
 _BOX_BOX, _CYLINDER_BOX, _PLANE_BOX, _PLANE_CYLINDER = (
     wp.constant(kind) for kind in (BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER)

@@ -11,7 +11,7 @@ overlap are noise.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 _STEPS = wp.constant(50)  # most steps in the search for a portal, and most refinements of it
 _TOLERANCE = wp.constant(wp.float64(1e-6))  # m, of the portal's distance from the surface; MuJoCo's default

@@ -5,12 +5,12 @@ from typing import Any
 
 from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
-from mjx_dher.envs.engines.fused.kinematics import integrate, move, place, push, strain, turn, weigh
-from mjx_dher.envs.engines.fused.lanes import gather, sync
+from mjx_dher.envs.engines.fused.dynamics import integrate, move, place, push, strain, turn, weigh
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, Bodies, Contacts, Dofs, Layout, Memory, World
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.envs.engines.fused.threads import gather, sync
+from mjx_dher.system.warp_setup import wp
 
 
 @wp.func

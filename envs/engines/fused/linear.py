@@ -5,7 +5,7 @@ On a GPU each lane has whole rows of the matrix in its registers, and lanes hand
 memory would wait for it at every step. L lanes have R rows each, N = L R at least as many as there are.
 """
 
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 _ON_A_GPU = """
     const unsigned group = lanes == 32 ? ~0u : ((1u << lanes) - 1u) << (threadIdx.x & 31 & ~(lanes - 1));

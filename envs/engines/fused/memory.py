@@ -1,8 +1,8 @@
 """One environment's memory, made of one array of floats."""
 
-from mjx_dher.envs.engines.fused.lanes import floats, ints, matrices, quats, spatials, vec3s
 from mjx_dher.envs.engines.fused.model import Layout, Memory
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.envs.engines.fused.threads import floats, ints, matrices, quats, spatials, vec3s
+from mjx_dher.system.warp_setup import wp
 
 
 @wp.func

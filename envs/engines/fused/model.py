@@ -2,7 +2,7 @@
 """What the fused substep knows of a model and of its environments: structs of Warp arrays, made from a MuJoCo model."""
 # Not `from __future__ import annotations`: Warp reads the annotations of structs as types.
 
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 # How a body moves against its parent.
 STILL, HINGE, SLIDE, FREE, MOCAP = range(5)

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.system.warp_setup import wp
 
 CONTACT_KINDS = {
     ("PLANE", "BOX"): (kinds.PLANE_BOX, 4),

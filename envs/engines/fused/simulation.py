@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused import kernel, setup
-from mjx_dher.host.warp_setup import load, wp
+from mjx_dher.system.warp_setup import load, wp
 
 # Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
 LANES, WARPS = 16, 8

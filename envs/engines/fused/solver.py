@@ -5,10 +5,10 @@ other forces: convex and quadratic in pieces, so that Newton's step from a point
 E. Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops on its own.
 """
 
-from mjx_dher.envs.engines.fused.lanes import sync, total
 from mjx_dher.envs.engines.fused.linear import direction
 from mjx_dher.envs.engines.fused.model import Dofs, Memory, World
-from mjx_dher.host.warp_setup import wp
+from mjx_dher.envs.engines.fused.threads import sync, total
+from mjx_dher.system.warp_setup import wp
 
 _EQUALITIES = wp.constant(6)  # rows that hold from both sides, the first ones
 _SLOPE = wp.constant(1e-4)  # of the cost along the search direction, relative to that at its start, at which a search ends

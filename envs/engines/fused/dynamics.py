@@ -1,0 +1,265 @@
+"""Places, velocities, mass matrix and forces of a substep, from coordinates and velocities.
+
+R. Featherstone, Rigid Body Dynamics Algorithms (2008): composite rigid bodies and recursive Newton-Euler, as sums over what
+is below a body instead of walks along the tree, which would leave all lanes but one idle.
+"""
+
+from mjx_dher.envs.engines.fused.model import FREE, HINGE, MOCAP, SLIDE, STILL, Bodies, Dofs, Memory, World
+from mjx_dher.envs.engines.fused.threads import sync
+from mjx_dher.system.warp_setup import wp
+
+_FREE, _HINGE, _MOCAP, _SLIDE, _STILL = (wp.constant(kind) for kind in (FREE, HINGE, MOCAP, SLIDE, STILL))
+
+
+@wp.func
+def times(a: wp.vec4, b: wp.vec4) -> wp.vec4:
+    """Returns the product of quaternions (w, x, y, z)."""
+    return wp.vec4(
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@wp.func
+def turned(quat: wp.vec4, v: wp.vec3) -> wp.vec3:
+    """Returns a vector, turned by a quaternion."""
+    axis = wp.vec3(quat[1], quat[2], quat[3])
+    twice = 2.0 * wp.cross(axis, v)
+    return v + quat[0] * twice + wp.cross(axis, twice)
+
+
+@wp.func
+def about(axis: wp.vec3, angle: float) -> wp.vec4:
+    """Returns the quaternion of a turn about an axis of length 1."""
+    s = wp.sin(0.5 * angle)
+    return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
+
+
+@wp.func
+def _matrix(q: wp.vec4) -> wp.mat33:
+    return wp.matrix_from_cols(
+        turned(q, wp.vec3(1.0, 0.0, 0.0)), turned(q, wp.vec3(0.0, 1.0, 0.0)), turned(q, wp.vec3(0.0, 0.0, 1.0))
+    )
+
+
+@wp.func
+def place(
+    bodies: Bodies,
+    memory: Memory,
+    inputs: wp.array(dtype=float),
+    lane: int,
+    lanes: int,
+):
+    """Computes the pose of every body: against its parent side by side, then along the tree."""
+    for b in range(lane, bodies.number, lanes):
+        pos = bodies.pos[b]
+        quat = bodies.quat[b]
+        first = bodies.qpos[b]
+        kind = bodies.kind[b]
+        if kind == _HINGE:
+            bent = times(quat, about(bodies.axis[b], memory.qpos[first] - bodies.rest[b]))
+            pos = pos + turned(quat, bodies.anchor[b]) - turned(bent, bodies.anchor[b])
+            quat = bent
+        elif kind == _SLIDE:
+            pos = pos + turned(quat, bodies.axis[b]) * (memory.qpos[first] - bodies.rest[b])
+        elif kind == _FREE:
+            pos = wp.vec3(memory.qpos[first], memory.qpos[first + 1], memory.qpos[first + 2])
+            quat = wp.normalize(
+                wp.vec4(memory.qpos[first + 3], memory.qpos[first + 4], memory.qpos[first + 5], memory.qpos[first + 6])
+            )
+        elif kind == _MOCAP:
+            pos = wp.vec3(inputs[0], inputs[1], inputs[2])
+            quat = wp.normalize(wp.vec4(inputs[3], inputs[4], inputs[5], inputs[6]))
+        memory.pos[b] = pos
+        memory.quat[b] = quat
+    sync(lanes)
+    # One lane goes along the tree, twice, with as little to do as can be; the rest is done side by side.
+    if lane == 0:
+        for b in range(1, bodies.number):
+            parent = bodies.parent[b]
+            if parent > 0:
+                memory.quat[b] = times(memory.quat[parent], memory.quat[b])
+    sync(lanes)
+    for b in range(lane, bodies.number, lanes):
+        parent = bodies.parent[b]
+        if parent > 0:
+            memory.pos[b] = turned(memory.quat[parent], memory.pos[b])
+    sync(lanes)
+    if lane == 0:
+        for b in range(1, bodies.number):
+            parent = bodies.parent[b]
+            if parent > 0:
+                memory.pos[b] = memory.pos[b] + memory.pos[parent]
+    for b in range(lane, bodies.number, lanes):
+        memory.quat[b] = wp.normalize(memory.quat[b])
+    sync(lanes)
+
+
+@wp.func
+def move(bodies: Bodies, memory: Memory, lane: int, lanes: int):
+    """Computes inertias, and the motion that each degree of freedom stands for."""
+    for b in range(lane, bodies.number, lanes):
+        origin = memory.pos[bodies.root[b]]
+        at = memory.pos[b] - origin
+        mat = _matrix(memory.quat[b])
+        memory.mat[b] = mat
+        mass = bodies.mass[b]
+        com = at + mat * bodies.com[b]
+        axes = mat * bodies.principal[b]
+        memory.moment[b] = mass * com
+        memory.inertia[b] = axes * wp.diag(bodies.inertia[b]) * wp.transpose(axes) + mass * (
+            wp.dot(com, com) * wp.identity(n=3, dtype=float) - wp.outer(com, com)
+        )
+        dof = bodies.dof[b]
+        kind = bodies.kind[b]
+        none = wp.vec3(0.0)
+        if kind == _HINGE:
+            axis = mat * bodies.axis[b]
+            memory.motion[dof] = wp.spatial_vector(axis, wp.cross(at + mat * bodies.anchor[b], axis))
+        elif kind == _SLIDE:
+            memory.motion[dof] = wp.spatial_vector(none, mat * bodies.axis[b])
+        elif kind == _FREE:
+            for i in range(3):
+                unit = wp.vec3(wp.where(i == 0, 1.0, 0.0), wp.where(i == 1, 1.0, 0.0), wp.where(i == 2, 1.0, 0.0))
+                memory.motion[dof + i] = wp.spatial_vector(none, unit)
+                axis = mat * unit
+                memory.motion[dof + 3 + i] = wp.spatial_vector(axis, wp.cross(at, axis))
+    sync(lanes)
+
+
+@wp.func
+def turn(bodies: Bodies, memory: Memory, lane: int, lanes: int):
+    """Computes velocities, and how fast each degree of freedom's motion turns."""
+    for b in range(lane, bodies.number, lanes):
+        velocity = wp.spatial_vector()
+        moved_by = bodies.moved_by[b]
+        for i in range(memory.qvel.shape[0]):
+            if (moved_by >> i) & 1 == 1:
+                velocity += memory.motion[i] * memory.qvel[i]
+        memory.velocity[b] = velocity
+        dof = bodies.dof[b]
+        kind = bodies.kind[b]
+        if kind == _HINGE or kind == _SLIDE:
+            memory.turning[dof] = _crossed(velocity, memory.motion[dof])
+        elif kind == _FREE:
+            for i in range(3):
+                memory.turning[dof + i] = wp.spatial_vector()
+                memory.turning[dof + 3 + i] = _crossed(velocity, memory.motion[dof + 3 + i])
+    sync(lanes)
+
+
+@wp.func
+def _crossed(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spatial_vector:
+    """Returns how fast a motion turns that is fixed to a frame with this velocity."""
+    omega, axis = wp.spatial_top(velocity), wp.spatial_top(motion)
+    return wp.spatial_vector(
+        wp.cross(omega, axis), wp.cross(omega, wp.spatial_bottom(motion)) + wp.cross(wp.spatial_bottom(velocity), axis)
+    )
+
+
+@wp.func
+def _momentum(inertia: wp.mat33, moment: wp.vec3, mass: float, motion: wp.spatial_vector) -> wp.spatial_vector:
+    """Returns inertia times motion: angular, then linear momentum."""
+    omega, v = wp.spatial_top(motion), wp.spatial_bottom(motion)
+    return wp.spatial_vector(inertia * omega + wp.cross(moment, v), mass * v - wp.cross(moment, omega))
+
+
+@wp.func
+def strain(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+    """Computes the force that each body needs to go on as it moves, and not to fall."""
+    for b in range(lane, bodies.number, lanes):
+        bias = wp.spatial_vector()
+        moved_by = bodies.moved_by[b]
+        for i in range(dofs.number):
+            if (moved_by >> i) & 1 == 1:
+                bias += memory.turning[i] * memory.qvel[i]
+        memory.bias[b] = bias
+        inertia = memory.inertia[b]
+        moment = memory.moment[b]
+        mass = bodies.mass[b]
+        velocity = memory.velocity[b]
+        has = _momentum(inertia, moment, mass, velocity)
+        omega, v = wp.spatial_top(velocity), wp.spatial_bottom(velocity)
+        memory.force[b] = _momentum(
+            inertia, moment, mass, wp.spatial_vector(wp.spatial_top(bias), wp.spatial_bottom(bias) - world.gravity)
+        ) + wp.spatial_vector(
+            wp.cross(omega, wp.spatial_top(has)) + wp.cross(v, wp.spatial_bottom(has)), wp.cross(omega, wp.spatial_bottom(has))
+        )
+    sync(lanes)
+
+
+@wp.func
+def push(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), lane: int, lanes: int):
+    """Computes all forces except those of constraints, and the momentum that each degree of freedom stands for."""
+    for i in range(lane, dofs.number, lanes):
+        motion = memory.motion[i]
+        body = dofs.body[i]
+        momentum, force = wp.spatial_vector(), wp.spatial_vector()
+        for b in range(body, bodies.last[body] + 1):
+            momentum += _momentum(memory.inertia[b], memory.moment[b], bodies.mass[b], motion)
+            force += memory.force[b]
+        memory.momentum[i] = momentum
+        smooth = dofs.stiffness[i] * (dofs.rest[i] - memory.qpos[dofs.qpos[i]]) - dofs.damping[i] * memory.qvel[i]
+        smooth -= wp.dot(motion, force)
+        for a in range(dofs.actuators):
+            if dofs.actuator_dof[a] == i:
+                smooth += _actuated(dofs, a, inputs[7 + a], memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+        memory.smooth[i] = smooth
+    sync(lanes)
+
+
+@wp.func
+def weigh(bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+    """Computes the mass matrix."""
+    for at in range(lane, dofs.number * dofs.number, lanes):
+        i, j = at // dofs.number, at % dofs.number
+        later, sooner = wp.max(i, j), wp.min(i, j)
+        mass = float(0.0)
+        if (bodies.moved_by[dofs.body[later]] >> sooner) & 1 == 1:
+            mass = wp.dot(memory.motion[sooner], memory.momentum[later])
+        if i == j:
+            mass += dofs.armature[i]
+        memory.mass[at] = mass
+    sync(lanes)
+
+
+@wp.func
+def _actuated(dofs: Dofs, a: int, control: float, length: float, velocity: float) -> float:
+    """Returns an actuator's force on its joint."""
+    clip = dofs.actuator_clip[a]
+    factors = dofs.actuator_force[a]
+    force = factors[0] + factors[1] * length + factors[2] * velocity + factors[3] * wp.clamp(control, clip[0], clip[1])
+    return wp.clamp(force, clip[2], clip[3])
+
+
+@wp.func
+def integrate(
+    world: World,
+    bodies: Bodies,
+    memory: Memory,
+    lane: int,
+    lanes: int,
+):
+    """Advances positions by the velocities at the substep's end."""
+    h = world.timestep
+    for b in range(lane, bodies.number, lanes):
+        first = bodies.qpos[b]
+        dof = bodies.dof[b]
+        kind = bodies.kind[b]
+        if kind == _HINGE or kind == _SLIDE:
+            memory.qpos[first] = memory.qpos[first] + h * memory.qvel[dof]
+        elif kind == _FREE:
+            for i in range(3):
+                memory.qpos[first + i] = memory.qpos[first + i] + h * memory.qvel[dof + i]
+            omega = wp.vec3(memory.qvel[dof + 3], memory.qvel[dof + 4], memory.qvel[dof + 5])
+            speed = wp.length(omega)
+            turn = wp.vec4(1.0, 0.0, 0.0, 0.0)
+            if speed > 0.0:
+                turn = about(omega / speed, h * speed)
+            quat = wp.vec4(memory.qpos[first + 3], memory.qpos[first + 4], memory.qpos[first + 5], memory.qpos[first + 6])
+            quat = wp.normalize(times(quat, turn))
+            for i in range(4):
+                memory.qpos[first + 3 + i] = quat[i]
+    sync(lanes)

@@ -1,0 +1,106 @@
+"""Priorities of whole episodes: by the energy an object was given, by how rare and by how diverse the achieved goals are."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher.config import HParams
+from mjx_dher.context import View
+from mjx_dher.contrib.metrics import GRAVITY, STEP_SECONDS, displacements
+from mjx_dher.priorities import Priority
+from mjx_dher.replay import ReplayState
+from mjx_dher.types import Array, Episode, RewardFn
+
+COMPONENTS = 3  # Gaussians of the mixture that `max_entropy` fits
+ROUNDS = 10  # of expectation and maximization
+
+
+def energy(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
+    """Returns the energy that the object was given in an episode, in J a kg (Zhao & Tresp 2018, "EBP").
+
+    sum_t max(E_t - E_(t-1), 0),  E_t = g (z_t - z_0) + |v_t|^2 / 2,  E_0 = 0
+
+    with v_t from differences of achieved goals. Losses do not count, nor does rotation, which positions do not show. A goal of
+    fewer than three coordinates has no height.
+    """
+    del compute_reward, hparams
+    achieved = episode.achieved_goal
+    kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / STEP_SECONDS), axis=-1)
+    potential = GRAVITY * (achieved[:, 2] - achieved[0, 2]) if achieved.shape[-1] > 2 else jnp.zeros_like(kinetic)
+    total = potential + kinetic
+    return jnp.sum(jnp.maximum(total[1:] - total[:-1], 0.0))
+
+
+def diversity(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
+    """Returns how diverse an episode's achieved goals are (Dai, Liu & Bharath 2021, "DTGSH").
+
+    The sum over pairs of successive goals of det(X X'), X the pair as unit vectors: 1 - c^2, c the cosine between them. In the
+    form d^2 - d^4 / 4, d the distance of the unit vectors, small angles are not lost in rounding.
+    """
+    del compute_reward, hparams
+    goals = episode.achieved_goal
+    unit = goals / jnp.maximum(jnp.linalg.norm(goals, axis=-1, keepdims=True), 1e-12)
+    squared = jnp.sum(jnp.square(unit[1:] - unit[:-1]), axis=-1)
+    return jnp.sum(jnp.maximum(squared - 0.25 * jnp.square(squared), 0.0))
+
+
+def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Array:
+    """Returns the log densities [E, components] of `rows` [E, K] under each component, its share included."""
+    inverse = 1.0 / variances
+    constant = jnp.sum(jnp.square(means) * inverse + jnp.log(2.0 * jnp.pi * variances), axis=1)
+    squares = jnp.square(rows) @ inverse.T - 2.0 * rows @ (means * inverse).T + constant[None]
+    return jnp.log(shares)[None] - 0.5 * squares
+
+
+def fit_mixture(rows: Array, counted: Array) -> Array:
+    """Returns the log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to those that are `counted` [E].
+
+    Three components with diagonal covariances, by ten rounds of expectation and maximization, begun with means spread along the
+    first principal axis that power iteration finds. Deterministic.
+    """
+    weight = counted.astype(rows.dtype)[:, None]
+    total = jnp.maximum(jnp.sum(weight), 1.0)
+    mean = jnp.sum(weight * rows, axis=0) / total
+    centred = weight * (rows - mean[None])
+    variance = jnp.sum(jnp.square(centred), axis=0) / total
+    floor = 1e-3 * jnp.mean(variance) + 1e-12
+    axis = jnp.sqrt(variance + floor)
+    for _ in range(3):
+        axis = centred.T @ (centred @ axis)
+        axis = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-12)
+    spread = jnp.sqrt(jnp.sum(jnp.square(centred @ axis)) / total)
+    places = jnp.arange(COMPONENTS, dtype=rows.dtype) - (COMPONENTS - 1) / 2
+    means = mean[None] + spread * places[:, None] * axis[None]
+    state = means, jnp.tile(variance + floor, (COMPONENTS, 1)), jnp.full(COMPONENTS, 1.0 / COMPONENTS, rows.dtype)
+
+    def step(state: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        share = weight * jax.nn.softmax(_log_parts(rows, *state), axis=1)
+        count = jnp.sum(share, axis=0) + 1e-6
+        means = share.T @ rows / count[:, None]
+        squares = share.T @ jnp.square(rows) / count[:, None] - jnp.square(means)
+        return (means, jnp.maximum(squares, 0.0) + floor, count / jnp.sum(count)), None
+
+    state, _ = jax.lax.scan(step, state, length=ROUNDS)
+    return jax.nn.logsumexp(_log_parts(rows, *state), axis=1)
+
+
+def _by_rarity(ring: ReplayState, view: View) -> Array:
+    """Returns weights [E]: the ranks, from 0 for the most common, of episodes by how rare their achieved goals are.
+
+    Zhao, Sun & Tresp 2019 ("MEP"): a mixture of three Gaussians over whole sequences of achieved goals gives their density; an
+    episode is drawn in proportion to its rank by minus the log density.
+    """
+    del view
+    goals = ring.episodes.achieved_goal
+    filled = jnp.arange(goals.shape[0]) < ring.size
+    rows = goals.reshape(goals.shape[0], -1)
+    first = rows[:1]  # near to zero, squares lose less to rounding
+    rarity = jnp.where(filled, -fit_mixture(jnp.where(filled[:, None], rows - first, 0.0), filled), -jnp.inf)
+    order = jnp.argsort(rarity)
+    rank = jnp.zeros(rarity.shape, jnp.int32).at[order].set(jnp.arange(rarity.shape[0], dtype=jnp.int32))
+    empty = rarity.shape[0] - ring.size
+    return jnp.maximum(rank - empty, 0).astype(jnp.float32)
+
+
+max_entropy = Priority(renew=_by_rarity)

@@ -1,0 +1,99 @@
+"""Which goals to take in hindsight, and which to play for: Next-Future, and Hindsight Goal Generation."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher import replay
+from mjx_dher.config import HParams
+from mjx_dher.context import View
+from mjx_dher.generators import Generator
+from mjx_dher.replay import ReplayState
+from mjx_dher.samplers import future
+from mjx_dher.types import Array, GoalObs, PRNGKey
+
+START_WEIGHT = 3.0  # c of HGG
+LIPSCHITZ = 5.0  # L of HGG
+STILL = 0.01  # m; an episode whose goals end within this of where they began offers none
+SOFTNESS = 0.05  # of the matching, as a fraction of the mean cost
+SINKHORN_ROUNDS = 50
+
+
+def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+    """Mixes the goal that the step itself achieves, with probability 1/k, and any future one; k is `her_k`, at least 1.
+
+    Özgür, Zurbrügg & Kumar 2025 ("Next-Future"): of k virtual goals the first is the next achieved one.
+    """
+    share = 1.0 / jnp.maximum(hparams.her_k, 1.0)
+    following = (jnp.arange(achieved.shape[0]) == step + 1).astype(jnp.float32)
+    return jnp.log(share * following + (1.0 - share) * jax.nn.softmax(future(achieved, desired, step, hparams)))
+
+
+def match(cost: Array, usable: Array, softness: Array | float = SOFTNESS, rounds: int = SINKHORN_ROUNDS) -> Array:
+    """Returns the log plan [N, P] of a soft matching of N rows to the usable of P columns: how likely a row takes each.
+
+    Every row has the same mass and so has every usable column (Sinkhorn & Knopp 1967; Cuturi 2013), so that the plan makes the
+    total cost small where columns share the rows evenly. The less `softness`, a fraction of the mean cost, the nearer it is to
+    the assignment of least cost. Logarithms keep mass from vanishing. At least one column must be usable.
+    """
+    open_to = jnp.broadcast_to(usable[None], cost.shape)
+    mean = jnp.sum(jnp.where(open_to, jnp.abs(cost), 0.0)) / jnp.sum(open_to, dtype=cost.dtype)
+    plan = jnp.where(open_to, -cost / (softness * jnp.maximum(mean, 1e-12)), -jnp.inf)
+
+    def balance(plan: Array, _: None) -> tuple[Array, None]:
+        by_column = jax.nn.logsumexp(jnp.where(open_to, plan, 0.0), axis=0, keepdims=True)
+        plan = jnp.where(open_to, plan - by_column, -jnp.inf)
+        return plan - jax.nn.logsumexp(plan, axis=1, keepdims=True), None
+
+    return jax.lax.scan(balance, plan, length=rounds)[0]
+
+
+def _nearest(achieved: Array, easy: Array, desired: Array) -> tuple[Array, Array]:
+    """Returns, for N desired goals and P episodes, the least of |g - a_t| - easy_t over t, and its t; both [N, P].
+
+    `achieved` is [P, T+1, G], `easy` [P, T+1], `desired` [N, G].
+    """
+
+    def earlier(best: tuple[Array, Array], at: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        goals, bonus, step = at
+        squares = sum(jnp.square(desired[:, None, i] - goals[None, :, i]) for i in range(goals.shape[-1]))
+        cost = jnp.sqrt(squares) - bonus[None]
+        return (jnp.minimum(best[0], cost), jnp.where(cost < best[0], step, best[1])), None
+
+    shape = (desired.shape[0], achieved.shape[0])
+    start = jnp.full(shape, jnp.inf, achieved.dtype), jnp.zeros(shape, jnp.int32)
+    steps = jnp.arange(achieved.shape[1], dtype=jnp.int32)
+    return jax.lax.scan(earlier, start, (jnp.moveaxis(achieved, 1, 0), easy.T, steps))[0]
+
+
+def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, view: View) -> Array:
+    """Returns goals [N, G] that were achieved before, each on the way to a desired one (Ren et al. 2019, "HGG").
+
+    N stored episodes, drawn uniformly, are matched to the N resets at the least total cost
+
+        w(j, p) = c |a_p0 - a_j| + min_t (|g_j - a_pt| - (1 - gamma) V(s_p0, a_pt) D / L)
+
+    with a_j and g_j the achieved and the desired goal of reset j, D the largest |g_j - a_j|, c = 3 and L = 5; the goal is the
+    a_pt of the minimum. The authors match by a flow of least cost on the host; here the matching is soft (`match`) and each
+    reset draws its episode from its row. Without an episode in which something moved, resets keep their own goals.
+    """
+    assert view.values is not None
+    row_key, match_key = jax.random.split(key)
+    start, desired = obs["achieved_goal"], obs["desired_goal"]
+    number = desired.shape[0]
+    rows = replay.randint_from_bits(jax.random.bits(row_key, (number,)), ring.size)
+    achieved = ring.episodes.achieved_goal[rows]
+    first = jnp.broadcast_to(ring.episodes.observation[rows, :1], (*achieved.shape[:2], ring.episodes.observation.shape[-1]))
+    diameter = jnp.max(jnp.linalg.norm(desired - start, axis=-1))
+    bound = -1.0 / (1.0 - view.hparams.gamma)
+    value = jnp.clip(view.values.of_state(first, achieved), bound, 0.0)
+    least, step = _nearest(achieved, value * (1.0 - view.hparams.gamma) * diameter / LIPSCHITZ, desired)
+    cost = least + START_WEIGHT * jnp.linalg.norm(start[:, None] - achieved[None, :, 0], axis=-1)
+    moved = jnp.linalg.norm(achieved[:, -1] - achieved[:, 0], axis=-1) > STILL
+    row = jax.random.categorical(match_key, match(cost, moved | ~jnp.any(moved)), axis=-1)
+    goals = achieved[row, step[jnp.arange(number), row]]
+    return jnp.where((ring.size > 0) & jnp.any(moved), goals, desired)
+
+
+hgg = Generator(hindsight_goals, uses_values=True)

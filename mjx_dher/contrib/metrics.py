@@ -1,0 +1,63 @@
+"""Distances from achieved goals to a desired one that see more than positions; for closest, epsilon_closest and weighted.
+
+    metric(achieved [T+1, G], desired [G]) -> [T+1]
+
+Velocities are differences of successive achieved goals, in m a step; the first is 0.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+
+from mjx_dher.context import View
+from mjx_dher.samplers import position
+from mjx_dher.scores import LearnedMetric
+from mjx_dher.types import Array, Episode
+
+STEP_SECONDS = 0.04  # of the Fetch tasks
+GRAVITY = 9.81  # m/s^2
+SPEED_STEPS = 5.0  # steps at its present velocity that count as much as the distance
+
+
+def displacements(achieved: Array) -> Array:
+    """Returns the displacements [T+1, G] of achieved goals [T+1, G] from those a step before; the first is 0."""
+    return jnp.concatenate([jnp.zeros_like(achieved[:1]), achieved[1:] - achieved[:-1]])
+
+
+def velocity(achieved: Array, desired: Array) -> Array:
+    """Returns the distances [T+1] in position and velocity to rest at the desired goal [G].
+
+    sqrt(|p_i - g|^2 + |5 v_i|^2), v_i the displacement of one step: an object that flies past a goal is not near to it.
+    """
+    distance = position(achieved, desired)
+    moving = position(SPEED_STEPS * displacements(achieved), jnp.zeros_like(desired))
+    return jnp.sqrt(jnp.square(distance) + jnp.square(moving))
+
+
+def resting(achieved: Array, desired: Array, friction: float) -> Array:
+    """Returns the distances [T+1] to the desired goal [G] of the points at which the object would come to rest.
+
+    An object that slides at v m/s, held back by friction alone, stops after v^2 / (2 friction g): it comes to rest at
+    p_i + v_i |v_i| / (2 friction g). A height among its coordinates is taken as it is.
+    """
+    velocities = displacements(achieved) / STEP_SECONDS
+    if achieved.shape[-1] > 2:
+        velocities = velocities.at[..., 2:].set(0.0)
+    speed = position(velocities, jnp.zeros_like(desired))
+    return position(achieved + velocities * speed[:, None] / (2.0 * friction * GRAVITY), desired)
+
+
+resting_point = functools.partial(resting, friction=0.1)  # Slide's puck on its table
+resting_point_rough = functools.partial(resting, friction=1.0)  # the cube of Push and PickAndPlace
+
+
+def _steps_left(episode: Episode, view: View) -> Array:
+    """Returns -V(s_i, g) [T+1], not negative: for rewards of -1 a step, the discounted number of steps to the goal."""
+    assert view.values is not None
+    goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal.shape)
+    return jnp.maximum(-view.values.of_state(episode.observation, goals), 0.0)
+
+
+time_to_goal = LearnedMetric(_steps_left)

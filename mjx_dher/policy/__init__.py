@@ -1,0 +1,8 @@
+"""Trained policies: as NumPy functions, as a learner's state, as files, and the bundled ones.
+
+`Policy` needs only NumPy. Import `policy.load`, `policy.learner_policy` and `policy.bundled` by name.
+"""
+
+from mjx_dher.policy.numpy_policy import Policy, from_arrays, from_mlp
+
+__all__ = ["Policy", "from_arrays", "from_mlp"]

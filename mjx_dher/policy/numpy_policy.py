@@ -1,0 +1,151 @@
+"""Trained policies, as files and as functions of NumPy arrays. They need nothing but NumPy."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher.system import files
+
+_VECTORS = ("observation_mean", "observation_std", "goal_mean", "goal_std")
+_SCALARS = ("norm_clip", "obs_clip")
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A deterministic policy: normalization, linear layers with ReLU between them, tanh.
+
+    It is called with a mapping that has "observation" [..., D] and "desired_goal" [..., G], such as the observation of a
+    gymnasium goal environment; other keys are ignored. It returns actions [..., A] float32 in [-1, 1].
+    """
+
+    layers: tuple[tuple[Any, Any], ...]  # (kernel [in, out], bias [out]) of each linear layer
+    observation_mean: Any  # [D]
+    observation_std: Any  # [D], at least norm_eps
+    goal_mean: Any  # [G]
+    goal_std: Any  # [G]
+    norm_clip: float
+    obs_clip: float
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers in an observation, a goal and an action: D, G and A."""
+        return self.observation_mean.shape[0], self.goal_mean.shape[0], self.layers[-1][1].shape[0]
+
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
+        """Computes the actions [..., A] for the observations of one state or a batch.
+
+        Raises:
+          ValueError: a key is missing, a last axis has the wrong size, or a value is not finite.
+        """
+        values = []
+        for key, mean in (("observation", self.observation_mean), ("desired_goal", self.goal_mean)):
+            if key not in obs:
+                raise ValueError(f"the policy needs {key!r}; got {sorted(obs)}")
+            value = np.asarray(obs[key], np.float32)
+            if value.ndim == 0 or value.shape[-1] != mean.shape[0]:
+                raise ValueError(f"{key} must end in an axis of {mean.shape[0]}; got shape {value.shape}")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{key} must be finite")
+            values.append(value)
+        if values[0].shape[:-1] != values[1].shape[:-1]:
+            raise ValueError(f"batch shapes differ: observation {values[0].shape}, desired_goal {values[1].shape}")
+        return self.forward(values[0], values[1], np)
+
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any:
+        """Computes the actions for observations [..., D] and goals [..., G], in NumPy or, with xp=jax.numpy, in JAX."""
+
+        def normalize(value, mean, std):
+            value = xp.clip(value, -self.obs_clip, self.obs_clip)
+            rank = (1,) * (value.ndim - 1)  # mean and std get the axes of the batch, which JAX may be told to insist on
+            return xp.clip((value - mean.reshape(*rank, -1)) / std.reshape(*rank, -1), -self.norm_clip, self.norm_clip)
+
+        x = xp.concatenate(
+            [
+                normalize(observation, self.observation_mean, self.observation_std),
+                normalize(goal, self.goal_mean, self.goal_std),
+            ],
+            axis=-1,
+        )
+        for index, (kernel, bias) in enumerate(self.layers):
+            x = x @ kernel + bias.reshape(*(1,) * (x.ndim - 1), -1)
+            if index < len(self.layers) - 1:
+                x = xp.maximum(x, 0)
+        return xp.tanh(x)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Returns the policy's arrays by name, float32: layerI_kernel [in, out] and layerI_bias [out], and the other fields."""
+        arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
+        arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
+        return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
+
+    def save(self, path: Path, **extra: Any) -> None:
+        """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
+        arrays: dict[str, Any] = {**self.arrays(), **extra}
+        with files.atomic_write(path) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)
+
+
+def from_arrays(arrays: Mapping[str, Any]) -> Policy:
+    """Returns the policy with these `Policy.arrays`.
+
+    Raises:
+      ValueError: an array is missing, or not what a policy has; the message names it.
+    """
+    num_layers = sum(name.endswith("_kernel") for name in arrays)
+    needed = [f"layer{i}_{part}" for i in range(max(1, num_layers)) for part in ("kernel", "bias")] + [*_VECTORS, *_SCALARS]
+    if missing := [name for name in needed if name not in arrays]:
+        raise ValueError(f"it has no array {missing[0]}")
+    for name in needed:
+        _check_array(name, arrays[name])
+    sizes = [arrays["observation_mean"].shape[0] + arrays["goal_mean"].shape[0]]
+    for i in range(num_layers):
+        kernel, bias = arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]
+        if kernel.shape[0] != sizes[-1] or bias.shape != kernel.shape[1:]:
+            raise ValueError(
+                f"layer{i}_kernel {list(kernel.shape)} and layer{i}_bias {list(bias.shape)} do not follow {sizes[-1]} numbers"
+            )
+        sizes.append(kernel.shape[1])
+    for name in ("observation", "goal"):
+        if arrays[f"{name}_mean"].shape != arrays[f"{name}_std"].shape:
+            raise ValueError(f"{name}_mean and {name}_std differ in shape")
+    return Policy(
+        layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
+        **{field: arrays[field] for field in _VECTORS},
+        **{field: float(arrays[field]) for field in _SCALARS},
+    )
+
+
+def _check_array(name: str, array: Any) -> None:
+    """Raises ValueError for an array of the wrong type or number of axes, that is not finite, or that must be positive."""
+    ndim = 0 if name in _SCALARS else 2 if name.endswith("_kernel") else 1
+    if array.dtype.kind != "f" or array.ndim != ndim or 0 in array.shape:
+        raise ValueError(f"{name} must be floating-point numbers of {ndim} axes; it is {array.dtype}{list(array.shape)}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{name} must be finite")
+    if (name in _SCALARS or name.endswith("_std")) and not np.all(array > 0):
+        raise ValueError(f"{name} must be greater than 0; the least is {array.min():g}")
+
+
+def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
+    """Returns the policy of an actor's linear layers, by flax's names for them, with the normalizers folded in."""
+    layers = tuple(
+        (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
+    )
+
+    def std(norm: Any) -> np.ndarray:
+        return np.maximum(np.sqrt(np.asarray(norm.var)), np.float32(hparams.norm_eps))
+
+    return Policy(
+        layers=layers,
+        observation_mean=np.asarray(observation_norm.mean),
+        observation_std=std(observation_norm),
+        goal_mean=np.asarray(goal_norm.mean),
+        goal_std=std(goal_norm),
+        norm_clip=float(hparams.norm_clip),
+        obs_clip=float(hparams.obs_clip),
+    )

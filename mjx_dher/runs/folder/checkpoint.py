@@ -1,0 +1,290 @@
+"""A run in progress on disk: written whole or not at all, restored as it was or not at all.
+
+A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, the leaves of the TrainState as orbax stores arrays, and
+manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype. Orbax alone does not
+notice a flipped bit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher.parallel.reshard import regroup
+from mjx_dher.runs.folder.fingerprint import sha256_of
+from mjx_dher.runs.folder.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
+from mjx_dher.system import files, memory, private_api
+from mjx_dher.system.files import FolderError
+
+SCHEMA = 2
+_STATE = "state"
+_PARTIAL = ".partial-"
+_HPARAMS = ".hparams."
+
+
+class CheckpointError(FolderError):
+    """A checkpoint that cannot be written, or must not be used."""
+
+
+class Restored(NamedTuple):
+    """A restored checkpoint."""
+
+    path: Path
+    epoch: int  # epochs that had ended
+    wall_seconds: float
+    state: Any
+    runs: list[dict[str, Any]]  # `identity.identity` of each; none of an earlier version
+    refused: dict[Path, str]  # newer checkpoints that are not used, and why
+    failed: dict[int, tuple[int, str]]  # of runs side by side, those that had failed: the epoch, and why
+
+
+def save(
+    folder: Path,
+    state: Any,
+    epoch: int,
+    wall_seconds: float,
+    keep: int,
+    runs: Sequence[Mapping[str, Any]] = (),
+    refused: Sequence[Path] = (),
+    failed: Mapping[int, tuple[int, str]] | None = None,
+) -> Path:
+    """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
+
+    Those of later epochs go, too: the run did not go on from them.
+
+    Args:
+      folder: of the run.
+      state: a TrainState, or any pytree of arrays.
+      epoch: epochs that have ended.
+      wall_seconds: of training, so far.
+      keep: at least 1.
+      runs: `identity.identity` of the run, or of each of those side by side.
+      refused: checkpoints that cannot be used, which go.
+      failed: of runs side by side, those that have failed: in which epoch, and why.
+
+    Raises:
+      CheckpointError: it cannot be written; earlier ones are as they were.
+    """
+    parent = folder / CHECKPOINTS
+    target, partial = parent / f"epoch-{epoch:06d}", parent / f"{_PARTIAL}{epoch:06d}"
+    try:
+        files.make_folder(parent)
+        for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
+            files.remove(left)
+        told = {"runs": list(runs), "failed": {str(lane): list(how) for lane, how in (failed or {}).items()}}
+        _write(partial, state, {"schema": SCHEMA, "epoch": epoch, "wall_seconds": wall_seconds, **told})
+        files.flush_all(partial)
+        if target.exists() or target.is_symlink():
+            files.remove(target)
+        partial.rename(target)
+        files.flush(parent)
+        whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
+        for old in set(checkpoints(folder)) - {target, *whole[: keep - 1]}:
+            files.remove(old)
+    except Exception as error:  # orbax raises errors of its own, of many kinds
+        shutil.rmtree(partial, ignore_errors=True)
+        kept = checkpoints(folder)
+        last = f"the last one is {kept[0]}" if kept else "there is none before it"
+        raise CheckpointError(f"cannot write the checkpoint {target} ({error}); {last}") from error
+    finally:
+        memory.release()  # the buffers of the threads that compress leave holes
+    return target
+
+
+def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
+    """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and what tells damage."""
+    leaves = _to_arrays(state)
+    needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(partial.parent).free
+    if needed > free:
+        raise OSError(f"it can take {memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free")
+    _write_arrays(partial / _STATE, list(leaves.values()))
+    content = {
+        **content,
+        "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
+        "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
+    }
+    with (partial / MANIFEST).open("w") as file:
+        json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
+
+
+def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
+    """Returns the newest checkpoint of the run in `folder` that is whole.
+
+    `read` and `place` do the same in two steps.
+
+    Args:
+      folder: of the run.
+      template: the state's structure; leaves have shape and dtype, and on several devices a sharding (`jax.ShapeDtypeStruct`).
+      lines: up to which epoch metrics.csv of each run goes; later checkpoints are not used.
+
+    Raises:
+      FolderError: there is none.
+      CheckpointError: says why each that is there cannot be used.
+    """
+    restored = read(folder, template, lines)
+    return restored._replace(state=place(restored.state, template))
+
+
+def read(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
+    """Returns what `restore` returns, but the leaves of the state as a list of NumPy arrays; raises what `restore` raises."""
+    refused: dict[Path, str] = {}
+    for path in checkpoints_to_resume(folder):
+        try:
+            failed = _check_lines(path, lines)
+            manifest, arrays = _load(path, template)
+            runs = manifest.get("runs", [])
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], arrays, runs, refused, failed)
+        except FolderError as error:
+            refused[path] = str(error)
+    raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
+
+
+def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
+    """Returns the runs that had failed; raises CheckpointError where one's metrics.csv lacks epochs that had ended."""
+    manifest = _read_manifest(path)
+    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest.get("failed", {}).items()}
+    for lane, whole in enumerate(lines):
+        if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
+            raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {whole}")
+    return failed
+
+
+def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
+    manifest = _read_manifest(path)
+    for name, digest in manifest["files"].items():
+        try:
+            digest_now = _digest(path / name)
+        except OSError as error:
+            raise CheckpointError(f"{path} is damaged: {name} cannot be read ({error.strerror})") from error
+        if digest_now != digest:
+            raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
+    if manifest["epoch"] != epoch_of(path):
+        raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
+    saved = {name: [name, shape, dtype] for name, shape, dtype in manifest["leaves"]}
+    arrays = dict(zip(saved, _read_arrays(path / _STATE, len(saved))))
+    for name, array in arrays.items():
+        if [name, list(array.shape), str(array.dtype)] != saved[name]:
+            read = _say([name, list(array.shape), str(array.dtype)])
+            raise CheckpointError(f"{path} was read as {read}, and was written as {_say(saved[name])}")
+    shapes = _to_shapes(template)
+    if manifest["schema"] == 1:
+        arrays = _upgraded(arrays, shapes)
+    arrays = regroup(arrays, shapes, len(manifest.get("runs", [])))
+    return manifest, _fit(path, arrays, shapes)
+
+
+def _upgraded(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
+    """Returns the arrays of schema 1 as today's: two have other names, and one lane had an axis of its own."""
+    names = {".replay.eventful": ".replay.priority", ".hparams.eventful_share": ".hparams.priority_fraction"}
+    arrays = {names.get(name, name): array for name, array in arrays.items()}
+    if ".replay.priority" in arrays:
+        arrays[".replay.priority"] = arrays[".replay.priority"].astype(np.float32)
+    lane = {name for name, leaf in shapes.items() if name in arrays and arrays[name].shape == (1, *leaf.shape)}
+    return {name: array[0] if name in lane else array for name, array in arrays.items()}
+
+
+def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
+    """Returns the arrays in the order of `shapes`.
+
+    HParams that the checkpoint lacks are 0, and those that it has too many are left out: a run takes them from its settings.
+
+    Raises:
+      CheckpointError: names the first array that is not what `shapes` asks for.
+    """
+    fitted = []
+    for name, leaf in shapes.items():
+        needed = [name, list(leaf.shape), str(leaf.dtype)]
+        if name not in arrays and name.startswith(_HPARAMS):
+            fitted.append(np.zeros(leaf.shape, leaf.dtype))
+        elif name not in arrays:
+            raise CheckpointError(f"{path} does not fit this run: it has no {_say(needed)}")
+        elif [name, list(arrays[name].shape), str(arrays[name].dtype)] != needed:
+            held = _say([name, list(arrays[name].shape), str(arrays[name].dtype)])
+            raise CheckpointError(f"{path} does not fit this run: it holds {held} where {_say(needed)} is needed")
+        else:
+            fitted.append(arrays[name])
+    if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
+        raise CheckpointError(f"{path} does not fit this run: it holds {extra[0]}, which is not needed")
+    return fitted
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        content = read_versioned(path / MANIFEST, 1, SCHEMA)
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
+    if content.pop("sha256", None) != sha256_of(content):
+        raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
+    return content
+
+
+def _say(leaf: list[Any]) -> str:
+    name, shape, dtype = leaf
+    return f"{name} {dtype}{shape}"
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def _to_arrays(state: Any) -> dict[str, np.ndarray]:
+    return {name: np.asarray(jax.random.key_data(x) if _is_key(x) else x) for name, x in _named(state).items()}
+
+
+def _to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
+    shape_of = lambda x: jax.eval_shape(jax.random.key_data, x) if _is_key(x) else x  # noqa: E731
+    return {name: shape_of(leaf) for name, leaf in _named(template).items()}
+
+
+def without_keys(state: Any) -> Any:
+    """Returns a state with the data of keys in place of the keys: `save` writes the same for it."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+
+
+def place(arrays: Sequence[np.ndarray], template: Any) -> Any:
+    """Returns the state whose leaves `read` gave, where `template` says: on its shardings, or else the default device."""
+    leaves, treedef = jax.tree.flatten(template)
+
+    def put(array: np.ndarray, leaf: Any) -> Any:
+        if getattr(leaf, "sharding", None) is None:
+            value = jnp.array(array)  # a copy: the next epoch takes over its memory
+        else:
+            value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
+        return jax.random.wrap_key_data(value) if _is_key(leaf) else value
+
+    return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
+
+
+def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
+    with private_api.array_checkpointer() as checkpointer:
+        checkpointer.save(path.absolute(), {f"{index:04d}": array for index, array in enumerate(arrays)})
+
+
+def _read_arrays(path: Path, count: int) -> list[np.ndarray]:
+    try:
+        with private_api.array_checkpointer() as checkpointer:
+            arrays = checkpointer.restore(path.absolute())
+        return [np.asarray(arrays[f"{index:04d}"]) for index in range(count)]
+    except Exception as error:
+        raise CheckpointError(f"{path} cannot be read ({error})") from error

@@ -1,0 +1,114 @@
+"""What a run is, in files: its settings, the files of its own code, and the digest that all of its files carry."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_dher import lookup
+from mjx_dher.config import HParams
+from mjx_dher.spec import PARTS, RunSpec
+
+RENAMED = {"eventful_share": "priority_fraction"}  # HParams of schema 1, and what they are called now
+MAY_CHANGE = ("total_steps", "physics", "sources")  # what a run that is resumed may have other than it had
+# Settings of schema 1. Later ones are part of a run's digest only where they differ from their defaults, so that the trials of
+# an older sweep keep their names.
+_FIRST_SETTINGS = frozenset(
+    (
+        *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
+        *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype", "learner_kernels"),
+        *("eval_episodes", "actor_lr", "critic_lr", "lr_end", "gamma", "polyak", "action_l2", "random_eps", "noise_std"),
+        *("her_k", "priority_fraction", "epsilon", "temperature", "obs_clip", "norm_clip", "norm_eps"),
+    )
+)
+
+
+def settings(spec: RunSpec) -> dict[str, Any]:
+    """Returns all settings of a run by name, the seed left out."""
+    parts = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
+    return {
+        **{name: value for name, value in parts.items() if name not in ("config", "hparams", "seed")},
+        **dataclasses.asdict(spec.config),
+        **spec.hparams._asdict(),
+    }
+
+
+def sources(spec: RunSpec) -> dict[str, str]:
+    """Returns, by field, name and digest of the file of each part's module that is the user's own: "push2d.py 3fa9c1d2e4".
+
+    It is the file of the module that is named, not of those that it imports. It is read once in a process, which goes on with
+    what it has imported.
+    """
+    values = {name: str(getattr(spec, name)) for name in ("env", *PARTS)}
+    read = {name: _source(value) for name, value in values.items() if lookup.is_import_path(value)}
+    return {name: source for name, source in read.items() if source is not None}
+
+
+@functools.cache
+def _source(import_path: str) -> str | None:
+    file = lookup.module_file(import_path)
+    return None if file is None else f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()[:10]}"
+
+
+def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
+    """Returns what a run computes with, as JSON has it: settings, seed, the engine that runs, the files of its own code."""
+    defaults = settings(RunSpec())
+    kept = {name: x for name, x in settings(spec).items() if name in _FIRST_SETTINGS or x != defaults[name]}
+    numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
+    kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
+    content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
+    return {**content, "sources": dict(own_sources)}
+
+
+def digest(content: Mapping[str, Any]) -> str:
+    """Returns ten digits that stand for what `identity` gave."""
+    return sha256_of(content)[:10]
+
+
+def trial_name(spec: RunSpec, own_sources: Mapping[str, str] | None = None) -> str:
+    """Returns the name of a trial's folder: readable settings plus a digest of every setting and of own code.
+
+    `own_sources` are those of now where None. Empty, as a version that did not look at own code had them, they leave the name
+    as that version gave it.
+    """
+    values, defaults = settings(spec), settings(RunSpec())
+    kept = {name: value for name, value in values.items() if name in _FIRST_SETTINGS or value != defaults[name]}
+    old_names = {new: old for old, new in RENAMED.items()}
+    numbers = {old_names.get(name, name): kept.pop(name) for name in HParams._fields if name in kept}
+    own_sources = sources(spec) if own_sources is None else own_sources
+    hashed = sha256_of([1, kept, numbers, spec.seed, *([dict(own_sources)] if own_sources else [])])
+    return f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{hashed[:10]}"
+
+
+def in_a_path(name: str) -> str:
+    """Returns the name of an environment or a sampler as a part of a file's: "Tasks:Mine" is tasks-mine."""
+    return re.sub(r"[^a-z0-9_]+", "-", name.lower())
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
+    """Returns what differs between two identities, by name, as a reader is told: "gamma was 0.98 and is 0.1"."""
+    defaults = {**settings(RunSpec()), "sources": {}}
+
+    def value(content: Mapping[str, Any], name: str) -> Any:
+        return content.get(name, defaults.get(name))
+
+    changed = [name for name in {**before, **now} if value(before, name) != value(now, name)]
+    told = {name: f"{name} was {value(before, name)!r} and is {value(now, name)!r}" for name in changed}
+    if "sources" in told:
+        told["sources"] = _changed_files(value(before, "sources"), value(now, "sources"))
+    return told
+
+
+def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    changed = [(name, before.get(name), now.get(name)) for name in {**before, **now} if before.get(name) != now.get(name)]
+    return "; ".join(f"{(new or old or '').split()[0]} has changed ({name})" for name, old, new in changed)
+
+
+def sha256_of(content: Any) -> str:
+    """Returns the SHA-256 of what JSON can hold."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

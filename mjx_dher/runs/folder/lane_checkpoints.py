@@ -1,0 +1,176 @@
+"""Checkpoints of runs that are trained side by side."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher.parallel.processes import ALONE, Team
+from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
+from mjx_dher.runs.folder.checkpoint import Restored
+from mjx_dher.runs.program.loop import Progress, Start
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
+from mjx_dher.trainer import TrainState
+
+NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
+class LaneCheckpoints:
+    """Checkpoints of runs side by side: in a folder named after them in `shared`, or, of one run, in its own."""
+
+    folders: Sequence[Path]  # of the runs
+    lanes: int
+    shared: Path
+    keep: int
+    restart: bool  # begin anew where no checkpoint can be used, rather than raise
+    report: Callable[[str], None]
+    runs: Sequence[dict[str, Any]]  # `fingerprint.identity` of each
+    team: Team = ALONE  # its first process reads and writes
+    refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
+    failed: dict[int, tuple[int, str]] = dataclasses.field(
+        default_factory=dict
+    )  # lane -> the epoch in which it failed, and why
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the run folders."""
+        return [folder.name for folder in self.folders]
+
+    @property
+    def folder(self) -> Path:
+        """Folder that holds `checkpoints/`: one that these runs, side by side, have had before, with any number of lanes."""
+        shared = self.shared / fingerprint.sha256_of([self.lanes, *self.names])[:10]
+        if not shared.exists():
+            others = (path.parent for path in sorted(self.shared.glob(f"*/{NAMES_FILE}")) if _names(path) == self.names)
+            shared = next(others, shared)
+        return shared if self.lanes > 1 or shared.exists() else self.folders[0]
+
+    def restore(self, init: Callable[[], TrainState]) -> Start:
+        """Returns the point from which the runs go on: what `init` makes, if there is no checkpoint.
+
+        Raises:
+          FolderError: no checkpoint can be used, unless `restart`.
+        """
+        state = init()
+        if not self.team.share(lambda: len(run_folder.checkpoints(self.folder))):
+            return Start(state)
+        template = jax.tree.map(self._shape_of, state)
+        hparams: Any = jax.tree.map(jnp.copy, state.hparams)
+        del state  # there may be no memory for two
+        try:
+            restored = self._read(template)
+            self._compare(restored)
+        except FolderError as error:
+            if not self.restart:
+                raise
+            self.report(f"{error}; training these runs from their start")
+            self.refused.extend(run_folder.checkpoints(self.folder) if self.team.leads else [])
+            return Start(init())
+        for path, why in restored.refused.items():
+            self.report(f"not used: {why}")
+            self.refused.append(path)
+        self.failed.update(restored.failed)
+        self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
+        # A lane's number for its sampler depends on which others are left.
+        return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
+
+    def _read(self, template: TrainState) -> Restored:
+        """Returns the checkpoint that the first process reads; raises FolderError in all processes."""
+        arrays: list[Any] = []
+
+        def decide() -> list[Any]:
+            try:
+                restored = checkpoint.read(self.folder, template, [*map(loggers.whole_epochs, self.folders)])
+            except FolderError as error:
+                return [str(error)]
+            arrays.extend(restored.state)
+            path, epoch, wall_seconds, _, runs, refused, failed = restored
+            return [str(path), epoch, wall_seconds, runs, {str(path): why for path, why in refused.items()}, [*failed.items()]]
+
+        path, *told = self.team.share(decide)
+        if not told:
+            raise FolderError(path)
+        epoch, wall_seconds, runs, refused, failed = told
+        state = checkpoint.place(self.team.share_arrays(arrays), template)
+        paths = {Path(name): why for name, why in refused.items()}
+        return Restored(Path(path), epoch, wall_seconds, state, runs, paths, {lane: tuple(how) for lane, how in failed})
+
+    def _shape_of(self, leaf: Any) -> jax.ShapeDtypeStruct:
+        sharding = leaf.sharding if len(leaf.sharding.device_set) > 1 else None
+        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+
+    def _compare(self, restored: Restored) -> None:
+        """Reports settings that have changed since the checkpoint was made and may; raises FolderError for others."""
+        changed: dict[str, str] = {}
+        for before, now in zip(restored.runs, self.runs):
+            changed |= fingerprint.differences(before, now)
+        if refused := [text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE]:
+            raise FolderError(f"{restored.path} is of a run with other settings: {'; '.join(refused)}")
+        for text in changed.values():
+            self.report(f"since {restored.path}: {text}")
+
+    def save(self, progress: Progress) -> Path:
+        """Writes a checkpoint and returns its path.
+
+        Raises:
+          CheckpointError: it cannot be written.
+        """
+        state = progress.state
+        if self.team.size > 1:
+            state = self.team.collect(checkpoint.without_keys(state))
+            if not self.team.leads:
+                return self.shared
+        folder = self.folder
+        if folder not in self.folders:
+            files.make_folder(folder)
+            files.write_json(folder / NAMES_FILE, {"cells": self.names})
+        for run in self.folders:
+            loggers.flush(run)  # a checkpoint is of no use without the lines before it
+        told: dict[str, Any] = {"runs": self.runs, "refused": tuple(self.refused), "failed": self.failed}
+        path = checkpoint.save(folder, state, progress.epoch, progress.wall_seconds, self.keep, **told)
+        self.refused.clear()
+        return path
+
+    def try_save(self, progress: Progress) -> None:
+        """Writes a checkpoint. One that cannot be written is reported, and costs nothing else."""
+        try:
+            self.save(progress)
+        except (OSError, checkpoint.CheckpointError) as error:
+            self.report(str(error))
+
+    def clear(self, keep_end: bool = False) -> None:
+        """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay.
+
+        With `keep_end` the newest stays that is in the run's own folder.
+        """
+        if not self.team.leads:
+            return
+        own = self.folders[0] / run_folder.CHECKPOINTS
+        for path in run_folder.checkpoints(self.folders[0])[1:] if keep_end else ():
+            shutil.rmtree(path, ignore_errors=True)
+        for path in {self.folder, *(() if keep_end else (own,))} - {self.folders[0]}:
+            shutil.rmtree(path, ignore_errors=True)
+        for path in self.shared.glob(f"*/{NAMES_FILE}"):
+            names = _names(path)
+            if names and all((self.folders[0].parent / name / run_folder.RESULT_FILE).exists() for name in names):
+                shutil.rmtree(path.parent, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty, or never made
+            self.shared.rmdir()
+
+
+def _names(path: Path) -> list[str]:
+    """Returns the names of the runs that share a checkpoint; none where another program has just removed it."""
+    try:
+        return list(json.loads(path.read_text())["cells"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

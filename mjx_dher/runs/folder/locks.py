@@ -1,0 +1,105 @@
+"""Which program trains which run: the lock of each run's folder, and what is asked under it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from mjx_dher import lookup
+from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
+from mjx_dher.system.files import BusyError, FolderError
+
+Run = tuple[RunSpec, Path]  # and its folder
+
+
+@dataclasses.dataclass(frozen=True)
+class Claims:
+    """Claims of one program on runs."""
+
+    sweep: bool  # leave out runs that have ended or that another program has, rather than raise
+    report: Callable[[str], None]
+
+    def is_free(self, spec: RunSpec, folder: Path) -> bool:
+        """Returns whether a run is to be trained, as far as can be told before its turn comes: now, not when all is compiled.
+
+        Raises:
+          FolderError: it is not, and this is no sweep.
+        """
+        if not folder.exists():
+            return True
+        try:
+            with named(folder), files.lock(folder):
+                return self._is_due(spec, folder)
+        except BusyError:
+            if not self.sweep:
+                raise
+            return False
+
+    def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
+        """Locks the first runs that are to be trained and that no other program has, up to `lanes`, and makes their folders.
+
+        Args:
+          stack: it holds the locks.
+          waiting: runs, in order.
+          lanes: at least 1.
+
+        Returns:
+          The runs, and those that wait; of these, runs of another program come last. Runs that have ended are in neither.
+
+        Raises:
+          FolderError: one has ended or is another program's, and this is no sweep; or its folder cannot be written to.
+        """
+        claimed: list[Run] = []
+        busy: list[Run] = []
+        for number, (spec, folder) in enumerate(waiting):
+            if len(claimed) == lanes:
+                return claimed, [*waiting[number:], *busy]
+            try:
+                with named(folder), contextlib.ExitStack() as attempt:
+                    files.make_folder(folder)
+                    attempt.enter_context(files.lock(folder))
+                    if self._is_due(spec, folder):
+                        claimed.append((spec, folder))
+                        stack.enter_context(attempt.pop_all())
+            except BusyError:
+                if not self.sweep:
+                    raise
+                busy.append((spec, folder))
+        return claimed, busy
+
+    def _is_due(self, spec: RunSpec, folder: Path) -> bool:
+        """Returns whether a run, which is locked, is to be trained.
+
+        Raises:
+          FolderError: it is not, and this is no sweep.
+        """
+        if not results.exists(folder):
+            return True
+        problem = results.problem(folder)
+        if self.sweep and problem is not None:
+            self.report(f"{problem}; it is trained again")
+        if self.sweep:
+            return problem is not None
+        if problem is None and results.can_go_on(folder, spec.config.total_steps):
+            return True
+        raise FolderError(problem or f"{folder} has ended; there is nothing to go on with")
+
+
+@contextlib.contextmanager
+def named(folder: Path) -> Iterator[None]:
+    """Makes an error of the file system name the folder, and what is left to go on from."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise FolderError(f"{folder} cannot be written to ({reason}); {last_checkpoint(folder)}") from error
+
+
+def last_checkpoint(folder: Path) -> str:
+    """Returns what an error tells of the checkpoint that a run has left."""
+    paths = run_folder.checkpoints(folder)
+    return f"`{lookup.program()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"

@@ -1,0 +1,283 @@
+"""A run on disk: config.json, metrics.csv, policy.npz, checkpoints, result.json."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher import __version__
+from mjx_dher import spec as spec_lib
+from mjx_dher.config import Config, HParams
+from mjx_dher.runs.folder import fingerprint
+from mjx_dher.runs.folder.fingerprint import in_a_path
+from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
+
+SCHEMA = 2
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.csv"
+POLICY_FILE = "policy.npz"
+RESULT_FILE = "result.json"
+CHECKPOINTS = "checkpoints"
+MANIFEST = "manifest.json"  # of a checkpoint
+
+# Statuses in result.json.
+FINISHED = "finished"
+FAILED = "failed"
+
+
+@contextlib.contextmanager
+def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
+    """Makes and locks the folder for a new run: `out`, else a fresh one under runs/. It goes again if nothing is written to it.
+
+    Raises:
+      FolderError: `out` is something else than an empty folder, or another program has it.
+      OSError: it cannot be made or written to.
+    """
+    if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
+        raise FolderError(f"out: {out} is there already and is no folder")
+    while True:
+        folder = _fresh(spec) if out is None else out
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(files.new_folder(folder))
+            except FolderError:
+                if out is not None:
+                    raise
+                continue  # another program has just taken it
+            yield folder
+            return
+
+
+def _fresh(spec: RunSpec) -> Path:
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    name = f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{now}"
+    paths = (Path("runs") / (name + suffix) for suffix in ("", *(f"-{n}" for n in range(2, 1000))))
+    return next(path for path in paths if not path.exists())
+
+
+def engine_name(env: Any) -> str:
+    """Returns the name of the physics that an environment runs on; none for one without an engine."""
+    return getattr(getattr(env, "engine", None), "name", "none")
+
+
+def create(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> None:
+    """Makes the folder and writes config.json.
+
+    Args:
+      path: of the folder.
+      spec: the run's description.
+      engine: the physics that runs, where `spec.engine` may say auto.
+      extra: written, too, for the reader and for `resume`.
+    """
+    hparams = {name: float(value) for name, value in spec.hparams._asdict().items()}
+    description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
+    description |= {"config": dataclasses.asdict(spec.config), "hparams": hparams}
+    own = fingerprint.sources(spec)
+    run = {"physics": engine, "sources": own, "digest": fingerprint.digest(fingerprint.identity(spec, engine, own))}
+    files.make_folder(path)
+    files.write_json(path / CONFIG_FILE, {"schema": SCHEMA, **description, **run, **extra, "versions": _versions()})
+
+
+def _versions() -> dict[str, str]:
+    from importlib import metadata
+
+    names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
+
+
+def checkpoints(path: Path) -> list[Path]:
+    """Returns the checkpoints of the run in `path`, the newest first."""
+    paths = (path / CHECKPOINTS).glob("epoch-*")
+    return sorted((path for path in paths if path.name[6:].isdecimal()), key=epoch_of, reverse=True)
+
+
+def epoch_of(checkpoint: Path) -> int:
+    """Returns the epochs that had ended when a checkpoint was made, by its name."""
+    return int(checkpoint.name[6:])
+
+
+def checkpoints_to_resume(path: Path) -> list[Path]:
+    """Returns the checkpoints of the run in `path`, the newest first, of which there must be one.
+
+    Raises:
+      FolderError: there is none.
+    """
+    if paths := checkpoints(path):
+        return paths
+    raise FolderError(
+        f"{path} has no checkpoint to go on from: it was stopped before it had saved any (see --checkpoint-every)"
+    )
+
+
+def read_versioned(file: Path, *schemas: int) -> dict[str, Any]:
+    """Returns an object of JSON that names its schema, one of `schemas`.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      FolderError: it cannot be read, or is of another schema.
+    """
+    if file.exists() and not file.is_file():
+        raise FolderError(f"{file} is not a file")  # a FIFO, whose reader would wait for ever
+    try:
+        content = json.loads(file.read_text())
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise FolderError(f"{file} cannot be read ({error})") from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema not in schemas:
+        raise FolderError(f"{file} is not of this program's schema {schemas[-1]} (found {schema!r})")
+    return content
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """Returns the config.json of the run in `path`, in today's schema.
+
+    Raises:
+      FolderError: no run folder, or one of another schema; the message says which.
+    """
+    if not path.is_dir():
+        raise FolderError(f"{path} is not a run folder: no such folder")
+    try:
+        return read_file(path / CONFIG_FILE)
+    except FileNotFoundError:
+        raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
+
+
+def read_file(file: Path) -> dict[str, Any]:
+    """Returns the content of a run's config.json, wherever it lies and whatever its name is, in today's schema.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      FolderError: it does not describe a run, or is of another schema.
+    """
+    try:
+        content = read_versioned(file, 1, SCHEMA)
+        content = _upgraded(content) if content["schema"] == 1 else content
+        _check_kinds(content)
+        return content
+    except (KeyError, AttributeError, TypeError) as error:
+        raise FolderError(f"{file} does not describe a run ({error})") from error
+
+
+def _check_kinds(content: dict[str, Any]) -> None:
+    """Raises TypeError where a part of config.json is of another kind than it is read as."""
+    sources = content.get("sources", {})  # earlier versions did not look at own code
+    texts = sources if isinstance(sources, dict) else {}
+    right = {
+        "config, an object": isinstance(content["config"], dict),
+        "hparams, an object": isinstance(content["hparams"], dict),
+        "hidden_sizes, a list": isinstance(content["config"], dict) and isinstance(content["config"]["hidden_sizes"], list),
+        "physics, a name": isinstance(content["physics"], str),
+        "env_kwargs, a list": isinstance(content.get("env_kwargs", []), list),
+        "sources, an object": isinstance(sources, dict),
+        **{f"sources.{name}, a text": isinstance(text, str) for name, text in texts.items()},
+    }
+    if wrong := [name for name, is_right in right.items() if not is_right]:
+        raise TypeError(f"without {'; without '.join(wrong)}")
+
+
+def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
+    """Returns the content of schema 1 in that of schema 2: the parts left `config`, and a number got another name."""
+    config = dict(content["config"])
+    parts = {name: config.pop(name) for name in ("env", "engine", "sampler", "weight_kernel", "metric")}
+    hparams = {fingerprint.RENAMED.get(name, name): value for name, value in content["hparams"].items()}
+    return {**content, "schema": SCHEMA, **parts, "physics": content["engine"], "config": config, "hparams": hparams}
+
+
+def read_spec(path: Path) -> RunSpec:
+    """Returns the description of the run in `path`.
+
+    Raises:
+      FolderError: no run folder, one of another schema, or a config.json that was edited; the message says which.
+    """
+    return read(path)[1]
+
+
+def read(path: Path) -> tuple[dict[str, Any], RunSpec]:
+    """Returns config.json of the run in `path`, and the description in it.
+
+    Raises:
+      FolderError: as for `read_spec`.
+    """
+    content = read_content(path)
+    spec = to_spec(path, content)
+    if edits := edited(path, content, spec):
+        raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
+    return content, spec
+
+
+def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
+    """Returns the `identity` of the run that config.json describes."""
+    return fingerprint.identity(spec, content["physics"], content.get("sources", {}))
+
+
+def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
+    """Returns which settings in config.json are not those that the run was trained with, by name, as a reader is told.
+
+    Its policy knows them, or else its newest checkpoint; those of earlier versions do not.
+    """
+    now, written = identity_of(content, spec), written_identity(path)
+    changed = {} if written is None else fingerprint.differences(written, now)
+    if content.get("digest", fingerprint.digest(now)) == fingerprint.digest(now):  # by `resume`, if at all
+        return {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
+    return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {fingerprint.digest(now)}"}
+
+
+def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
+    """Returns what a reader is told of own code that is not what the run was trained with."""
+    if "sources" not in content:
+        return []
+    before = identity_of(content, spec)
+    return list(fingerprint.differences(before, {**before, "sources": fingerprint.sources(spec)}).values())
+
+
+def written_identity(path: Path) -> dict[str, Any] | None:
+    """Returns the `identity` that the run's newest checkpoint has, or else its policy; None where neither can tell."""
+    for checkpoint in checkpoints(path):
+        try:
+            (content,) = read_versioned(checkpoint / MANIFEST, 2)["runs"]
+            return dict(content)
+        except (OSError, ValueError, KeyError, TypeError):  # damaged, or of an earlier version
+            continue
+    try:
+        if not (path / POLICY_FILE).is_file():
+            return None
+        with np.load(path / POLICY_FILE, allow_pickle=False) as arrays:
+            return dict(json.loads(arrays["settings"].tobytes()))
+    except Exception:  # NumPy, zipfile and zlib raise nearly anything at a file that is damaged; who loads it says so
+        return None
+
+
+def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
+    """Returns the description that `read_content` gave of the run in `path`, or `read_file` of the file there.
+
+    Raises:
+      FolderError: something is missing in it, or of another kind.
+    """
+    file = path / CONFIG_FILE if path.is_dir() else path
+    try:
+        fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
+        config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
+        if "total_steps" not in config:  # its default would be taken for a wish, which `resume` grants
+            raise KeyError("total_steps")
+        spec = RunSpec(
+            config=Config(**config),
+            hparams=HParams(**content["hparams"]),
+            **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
+            env_kwargs=tuple(content.get("env_kwargs", ())),
+        )
+        spec_lib.validate_values(spec)
+        return spec
+    except (KeyError, TypeError, ValueError) as error:
+        raise FolderError(f"{file} does not describe a run ({error})") from error

@@ -1,0 +1,1 @@
+"""A compiled training program, and the loop that calls it."""

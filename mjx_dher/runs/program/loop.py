@@ -1,0 +1,256 @@
+"""The host's side of a training loop: compile it, call it epoch by epoch, see that it fits into memory."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_dher import config as config_lib
+from mjx_dher.config import Config, HParams
+from mjx_dher.parallel import mesh, sharded
+from mjx_dher.parallel.mesh import ONE, Layout
+from mjx_dher.rollout import check_steps
+from mjx_dher.system import memory
+from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
+from mjx_dher.types import Array, Env, Metrics, PRNGKey
+
+# Updates, of all runs side by side, from which on the compiler's search for the fastest matrix products pays: on one H100 it
+# takes half a minute, and Push's epochs then take 0.83 of the time (docs/design.md).
+WORTH_A_SEARCH = 500_000
+# What XLA hands over to YNNPACK on a CPU.
+_YNN, _PRODUCTS = "xla_cpu_experimental_ynn_fusion_type", "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
+
+
+class Start(NamedTuple):
+    """Point from which a run, or L side by side, goes on."""
+
+    state: TrainState
+    epoch: int = 0  # epochs that have ended
+    wall_seconds: float = 0.0
+
+
+class Progress(NamedTuple):
+    """Point that a run, or L side by side, has reached after an epoch."""
+
+    epoch: int  # from 1
+    num_epochs: int
+    env_steps: int  # of each run
+    updates: int  # of each run
+    wall_seconds: float  # since the first epoch began: compilation is not counted
+    epoch_seconds: float
+    metrics: dict[str, Any]  # a float each; of runs side by side an array [L] each
+    state: TrainState  # valid until the next epoch begins, which takes over its memory
+    finite: Any  # [] or [L] bool, whether all of the learner's numbers are
+
+
+class Compiled(NamedTuple):
+    """A training loop, compiled."""
+
+    init: Callable[[PRNGKey, HParams], TrainState]
+    epoch: Callable[[TrainState], tuple[TrainState, Metrics, Array]]  # the last as `Progress.finite`
+    nbytes: int  # memory that an epoch takes on a device, as the compiler planned it; 0 where it does not tell
+
+
+def train(
+    env: Env,
+    config: Config,
+    hparams: HParams | None = None,
+    seed: int = 0,
+    on_compile: Callable[[float | None], None] = lambda seconds: None,
+    start: Start | None = None,
+    devices: int | str = 1,
+    **parts: Any,
+) -> Iterator[Progress]:
+    """Trains one run without a folder, yielding after every epoch. Stop by not asking for more.
+
+    `train_runs` adds folders, checkpoints, logs and runs side by side.
+
+    Args:
+      env: the environment.
+      config: sizes.
+      hparams: numbers; the defaults where None.
+      seed: random seed.
+      on_compile: called with None when compilation begins and with its seconds when it has ended.
+      start: point to go on from, as `checkpoint.restore` gives it; a new run where None.
+      devices: that share the run, or "all": each has an equal share of environments, ring and batches.
+      **parts: sampler, priority and learner, as `make_train` takes them.
+
+    Raises:
+      ValueError: a Config or HParams that cannot run, memory that does not suffice, devices that are not there, or what
+        `env.check` raises, where the environment has one, before the first epoch or after any.
+    """
+    hparams = HParams() if hparams is None else hparams
+    config_lib.validate(config, hparams, env.episode_length)
+    layout = mesh.arrange(mesh.find(devices), 1)
+    program = make_train(env, config, split=layout.split, **parts)
+    key = jax.random.key(seed)
+    check_memory(program, config, layout.sharers)
+    on_compile(None)
+    started = time.perf_counter()
+    compiled = compile_program(program, key, hparams, config_lib.num_updates(config, env.episode_length), layout)
+    check_program(compiled, config, layout.sharers)
+    check_steps(env)
+    on_compile(time.perf_counter() - started)
+    for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
+        yield progress._replace(metrics={name: to_float(value) for name, value in progress.metrics.items()})
+
+
+def run(
+    env: Env, config: Config, compiled: Compiled, start: Start, fetch: Callable[[Any], Any] = jax.device_get
+) -> Iterator[Progress]:
+    """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays.
+
+    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way. `fetch` gives
+    arrays as NumPy's.
+
+    Raises:
+      ValueError: what `env.check` raises, where the environment has one, after an epoch.
+    """
+    num_epochs = config_lib.num_epochs(config, env.episode_length)
+    state = jax.block_until_ready(start.state)
+    previous = time.perf_counter()
+    started = previous - start.wall_seconds
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        for number in range(start.epoch + 1, num_epochs + 1):
+            running = pool.submit(lambda state: jax.block_until_ready(compiled.epoch(state)), state)
+            while not running.done():
+                concurrent.futures.wait([running], timeout=0.1)
+            state, *told = running.result()
+            check_steps(env)
+            metrics, finite = fetch(told)
+            now = time.perf_counter()
+            yield Progress(
+                epoch=number,
+                num_epochs=num_epochs,
+                env_steps=number * config_lib.steps_per_epoch(config, env.episode_length),
+                updates=number * config.cycles_per_epoch * config.updates_per_cycle,
+                wall_seconds=now - started,
+                epoch_seconds=now - previous,
+                metrics=metrics,
+                state=state,
+                finite=np.asarray(finite),
+            )
+            previous = time.perf_counter()
+
+
+def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0, layout: Layout = ONE) -> Compiled:
+    """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
+
+    Their values do not matter. The compiler takes more trouble for a run of many `updates`. `layout` says on which devices.
+    """
+
+    def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:
+        state, metrics = program.epoch(state)
+        return state, metrics, is_finite(state.learner)
+
+    search = updates * (key.shape[0] if key.ndim else 1) // layout.lanes >= WORTH_A_SEARCH
+    init, epoch = (jax.vmap(program.init), jax.vmap(epoch_and_check)) if key.ndim else (program.init, epoch_and_check)
+    arguments: tuple[Any, Any] = key, as_arrays(hparams)
+    if layout.devices:
+        init, epoch = sharded.place_init(layout, init, bool(key.ndim)), sharded.place_epoch(layout, epoch, bool(key.ndim))
+        arguments = sharded.to_host(*arguments)
+        state = init.eval_shape(*arguments)
+    else:
+        state = jax.eval_shape(init, *arguments)
+        init, epoch = jax.jit(init), jax.jit(epoch, donate_argnums=0)
+    lowered_init = init.lower(*arguments)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        compiling = pool.submit(compile_lowered, lowered_init)
+        lowered = epoch.lower(state)
+        compiled = compile_lowered(lowered, search)
+        compiled_init = compiling.result()
+    sizes = compiled.memory_analysis()
+    nbytes = 0
+    if sizes is not None:
+        nbytes = (
+            sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
+        )
+    memory.release()
+
+    def start(key: PRNGKey, hparams: HParams) -> TrainState:
+        return compiled_init(*(sharded.to_host(key, as_arrays(hparams)) if layout.devices else (key, as_arrays(hparams))))
+
+    return Compiled(init=start, epoch=compiled, nbytes=nbytes)
+
+
+def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
+    """Compiles what `jax.jit(...).lower` gave, without what takes most of the time and gains little.
+
+    On a CPU a program of which physics takes nearly all the time need not be optimized (`plain`). On a GPU one pass makes
+    Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many tilings each,
+    what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix products compiled,
+    with many tilings each, to be timed against those of cuBLAS, which has its own ready.
+
+    On a CPU XLA hands sums along an axis, as a norm has them, to a library (YNNPACK), too. Of small sums each call takes longer
+    than the sum: with layer normalization an update took two to three times as long. Only matrix products are handed over.
+    """
+    options: dict[str, Any] = {}
+    if jax.default_backend() == "cpu":
+        if plain:
+            options |= {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+        if _YNN not in os.environ.get("XLA_FLAGS", ""):
+            options[_YNN] = _PRODUCTS
+    if jax.default_backend() == "gpu":
+        options["xla_disable_hlo_passes"] = "triton-softmax-rewriter"
+        if "xla_gpu_enable_triton_gemm" not in os.environ.get("XLA_FLAGS", ""):
+            options["xla_gpu_enable_triton_gemm"] = search
+    try:
+        return lowered.compile(compiler_options=options)
+    except jax.errors.JaxRuntimeError as error:
+        if _YNN not in options or _YNN not in str(error):
+            raise
+    del options[_YNN]  # this version of the compiler does not have it: it is called experimental
+    return lowered.compile(compiler_options=options)
+
+
+def state_template(program: Train) -> TrainState:
+    """Returns the shapes and types of a run's TrainState, for `checkpoint.restore`."""
+    return jax.eval_shape(program.init, jax.random.key(0), as_arrays(HParams()))
+
+
+def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
+    """Refuses a replay ring, or networks, that cannot fit, before anything is compiled; so many devices share the memory.
+
+    Raises:
+      ValueError: says what is needed, what is free and, for the ring, which replay_size would fit.
+    """
+    available = memory.available_bytes()
+    if available is None:
+        return
+    free = f"but only {memory.format_bytes(available)} of memory is free"
+    ring = sharers * program.replay_bytes
+    if ring > available:
+        fitting = int(config.replay_size * available / ring)
+        needed = memory.format_bytes(ring)
+        raise ValueError(f"replay_size {config.replay_size} needs {needed}, {free}; at most {fitting} transitions fit")
+    shapes = jax.tree.leaves(jax.eval_shape(program.learner.init, jax.random.key(0)))
+    nbytes = sharers * sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
+    if nbytes > available:
+        raise ValueError(f"hidden_sizes {config.hidden_sizes}: the learner needs {memory.format_bytes(nbytes)}, {free}")
+
+
+def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
+    """Refuses a program that cannot fit, by the compiler's figure, before it runs; so many devices share the memory.
+
+    Raises:
+      ValueError: says what is needed, what is free and which settings decide it.
+    """
+    available = memory.available_bytes()
+    nbytes = sharers * compiled.nbytes
+    if available is not None and nbytes > available:
+        settings = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes")
+        raise ValueError(
+            f"an epoch needs {memory.format_bytes(nbytes)}, but only {memory.format_bytes(available)} of memory"
+            f" is free; what decides it: {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
+        )
+
+
+def to_float(value: Any) -> float:
+    """Returns a float32 to the digits that it has: 95 of 100 are 0.95, which float(float32) is not."""
+    return float(f"{value:.6g}")

@@ -1,0 +1,224 @@
+"""A compiled program for runs side by side: lanes of one `vmap`, or one run without a lane axis."""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher import config as config_lib
+from mjx_dher import generators, learners, priorities, samplers, trainer
+from mjx_dher.config import HParams
+from mjx_dher.learners import Learner
+from mjx_dher.parallel import mesh, sharded
+from mjx_dher.parallel.mesh import ONE, Layout
+from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.rollout import Outcome, check_steps
+from mjx_dher.runs import play
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.program import loop
+from mjx_dher.runs.program.loop import Compiled
+from mjx_dher.spec import RunSpec
+from mjx_dher.system import memory
+from mjx_dher.trainer import Train, TrainState
+from mjx_dher.types import Env, PRNGKey, Sizes
+
+# HParams, and which of a program's samplers, priorities and generators a lane uses; see `one_of` of each.
+Lane = collections.namedtuple("Lane", (*HParams._fields, "choice", "priority_choice", "generator_choice"))  # type: ignore[misc]
+EvaluateFn = Callable[[TrainState, Any], Outcome]
+
+
+class Choices(NamedTuple):
+    """What lanes of one program may differ in beside numbers: each list once, in the order of the runs."""
+
+    samplers: list[tuple[str, str, str, str]]  # arguments of samplers.make
+    priorities: list[str]
+    generators: list[str]
+
+    def of(self, spec: RunSpec) -> tuple[int, int, int]:
+        """Returns the numbers of a run's sampler, priority and generator."""
+        sampler, priority, generator = _parts(spec)
+        return self.samplers.index(sampler), self.priorities.index(priority), self.generators.index(generator)
+
+
+def _parts(spec: RunSpec) -> tuple[tuple[str, str, str, str], str, str]:
+    return spec.sampler_choice, spec.priority, spec.generator
+
+
+def choices_of(specs: Sequence[RunSpec]) -> Choices:
+    """Returns what the runs of a program choose from."""
+    return Choices(*(list(dict.fromkeys(values)) for values in zip(*map(_parts, specs))))
+
+
+class Program(NamedTuple):
+    """A compiled program for runs side by side."""
+
+    lanes: int
+    layout: Layout
+    choices: Choices
+    learner: Learner
+    sizes: Sizes
+    compiled: Compiled
+    evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
+
+
+def make_loop(env: Env, spec: RunSpec, choices: Choices, split: Split = ALONE) -> Train:
+    """Makes the training loop of runs that share a program, with the parts that they name; each run may be split itself."""
+    of_a_part = dataclasses.replace(spec.config, batch_size=split.share(spec.config.batch_size))
+    return trainer.make_train(
+        env,
+        spec.config,
+        sampler=samplers.one_of([samplers.make(*choice) for choice in choices.samplers]),
+        priority=priorities.one_of([priorities.make(name) for name in choices.priorities]),
+        generator=generators.one_of([generators.make(name) for name in choices.generators]),
+        learner=learners.make(spec.learner, of_a_part, trainer.env_sizes(env), spec.networks),
+        split=split,
+    )
+
+
+def compile_runs(
+    env: Env,
+    specs: Sequence[RunSpec],
+    max_lanes: int | None,
+    final_episodes: int,
+    report: Callable[[str], None],
+    devices: Sequence[Any] = (),
+) -> Program:
+    """Compiles for as many lanes as there may be and memory holds, by the compiler's figure.
+
+    The last evaluation may still be compiling, in a thread, while the runs are trained.
+
+    Raises:
+      ValueError: memory does not suffice for one run, or sizes that the devices do not divide.
+    """
+    spec, choices = specs[0], choices_of(specs)
+    most = min(len(specs), max_lanes or len(specs))
+    layout = mesh.arrange(devices, most)
+    train = make_loop(env, spec, choices, layout.split)
+    loop.check_memory(train, spec.config, layout.sharers)
+    lanes = math.ceil(most / layout.lanes)  # of a device, as are the bytes
+    available = memory.available_bytes()
+    if available is not None:  # the rings alone must fit before the compiler is asked
+        available //= layout.sharers
+        lanes = max(1, min(lanes, int(available / train.replay_bytes)))
+    while True:
+        chunks = math.ceil(len(specs) / (lanes * layout.lanes))
+        lanes = math.ceil(len(specs) / (chunks * layout.lanes))  # chunks of equal size
+        keys, hparams = stack(specs, choices, lanes * layout.lanes)
+        title = _title(env, specs, train, lanes * layout.lanes, layout)
+        compiled = _compile(env, spec, train, keys, hparams, title, report, layout)
+        if available is None or compiled.nbytes <= available or lanes == 1:
+            loop.check_program(compiled, spec.config, layout.sharers)
+            beside = available is not None and compiled.nbytes <= available / 2
+            evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside, layout)
+            return Program(lanes * layout.lanes, layout, choices, train.learner, trainer.env_sizes(env), compiled, evaluate)
+        lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
+
+
+def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout: Layout) -> str:
+    apart = f"{layout.lanes} of them apart" if layout.lanes > 1 else ""
+    parts = f"{layout.parts} for each run" if layout.parts > 1 else ""
+    number = f"{len(layout.devices)} devices ({', '.join(filter(None, (apart, parts)))}) of " if layout.devices else ""
+    together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
+    return (
+        f"{'one run' if len(specs) == 1 else together}; physics {run_folder.engine_name(env)}, learner on"
+        f" {number}{jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
+    )
+
+
+def _compile(
+    env: Env,
+    spec: RunSpec,
+    train: Train,
+    keys: PRNGKey,
+    hparams: Any,
+    title: str,
+    report: Callable[[str], None],
+    layout: Layout,
+) -> Compiled:
+    report(f"{spec.env}: compiling for {title} ...")
+    started = time.perf_counter()
+    updates = config_lib.num_updates(spec.config, env.episode_length)
+    compiled = loop.compile_program(train, keys, hparams, updates, layout)
+    check_steps(env)
+    seconds = time.perf_counter() - started
+    report(f"{spec.env}: compiled in {seconds:.1f} s; {memory.format_bytes(compiled.nbytes)} of memory")
+    return compiled
+
+
+def _compile_evaluation(
+    env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
+) -> concurrent.futures.Future[EvaluateFn]:
+    """Compiles the last evaluation, which is not needed before the runs have ended: `beside` their training, in a thread.
+
+    Compiling takes memory, too, to try kernels in.
+    """
+    episodes = min(final_episodes, play.CHUNK)
+
+    def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
+        return trainer.evaluate_state(env, train.learner, state, key, episodes, train.split)
+
+    init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
+    arguments: tuple[Any, Any] = keys, hparams
+    if layout.devices:
+        batched = bool(keys.ndim)
+        init, evaluate_all = sharded.place_init(layout, init, batched), sharded.place_evaluate(layout, evaluate_all, batched)
+        arguments = sharded.to_host(keys, hparams)
+        state = init.eval_shape(*arguments)
+    else:
+        state, evaluate_all = jax.eval_shape(init, keys, hparams), jax.jit(evaluate_all)
+    lowered = evaluate_all.lower(state, arguments[0])
+    pool = concurrent.futures.ThreadPoolExecutor(1)
+    compiling = pool.submit(loop.compile_lowered, lowered, plain=True)
+    pool.shutdown(wait=not beside)
+    return cast("concurrent.futures.Future[EvaluateFn]", compiling)
+
+
+def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGKey, Any]:
+    """Returns the keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
+    padded = [specs[min(i, len(specs) - 1)] for i in range(lanes)]
+    numbers: list[Any] = [spec.hparams for spec in padded]
+    if any(len(own) > 1 for own in choices):
+        numbers = [Lane._make((*spec.hparams, *choices.of(spec))) for spec in padded]
+    if lanes == 1:
+        return jax.random.key(padded[0].seed), trainer.as_arrays(numbers[0])
+    keys = jnp.stack([jax.random.key(spec.seed) for spec in padded])
+    return keys, jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *numbers)
+
+
+def lane_of(tree: Any, lane: int, lanes: int) -> Any:
+    """Returns one run's part of a pytree that `lanes` runs share; one lane has no axis."""
+    return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
+
+
+def evaluate(
+    env: Env,
+    program: Program,
+    state: TrainState,
+    keys: PRNGKey,
+    episodes: int,
+    fetch: Callable[[Any], Any] = jax.device_get,
+) -> Outcome:
+    """Plays the last evaluation of each lane; returns the outcomes [lanes, episodes] as NumPy arrays.
+
+    `fetch` gives arrays as NumPy's. `keys` are those of the runs; the i-th `play.CHUNK` episodes of a run follow
+    `fold_in(key, i)`, i from 1.
+    """
+    play_chunk = program.evaluate.result()
+    outcomes = []
+    for number in range(1, 1 + math.ceil(episodes / play.CHUNK)):
+        fold_in = functools.partial(jax.random.fold_in, data=number)
+        own = jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)
+        outcome = fetch(play_chunk(state, sharded.to_host(own)[0] if program.layout.devices else own))
+        outcomes.append(jax.tree.map(np.atleast_2d, outcome))
+    check_steps(env)
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :episodes], *outcomes)

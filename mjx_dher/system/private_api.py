@@ -1,0 +1,118 @@
+"""Private names of MJX, MuJoCo Warp, Warp and orbax: every one that this library uses, behind a function each.
+
+Each function says which names are private, why they are needed, and which versions need them. tests/test_private_api.py
+fails, naming the function to delete, once a newer version does without. The libraries are imported on the first call.
+
+Two dependencies on internals stay where they are used, because they are not names of Python:
+
+- `runs.loop.compile_lowered` disables the pass triton-softmax-rewriter of XLA (jaxlib 0.10.2; no upstream issue known).
+- envs/engines/fused/threads.py and hopper/kernels.cu use `wp::array_t` and `dynamic_smem_base` of Warp's C++ code, and the
+  latter numbers lanes in the order in which Warp flattens the axes of `jax.vmap` (warp-lang 1.18.0; no upstream issue known).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+
+@contextlib.contextmanager
+def bodies_computed_once() -> Iterator[None]:
+    """Keeps XLA's CPU backend, while tracing, from computing each body's pose anew for each of its descendants.
+
+    Private: `mujoco.mjx._src.scan.body_tree`, which is replaced meanwhile, for every thread.
+    Why: XLA's fusion emitters fuse MJX's walk along the arm into one loop that repeats all ancestors for every use of them:
+      0.7 s instead of 0.9 ms for the kinematics of 16 environments on 2 cores. A barrier after each level ends the fusion.
+    Needed by: mujoco-mjx 3.17.0 with jaxlib 0.10.2. The same slowdown is reported, since JAX 0.7, in
+      https://github.com/google-deepmind/mujoco/issues/2957 and https://github.com/jax-ml/jax/issues/33761 (both closed).
+    """
+    import jax
+    from mujoco.mjx._src import scan
+
+    walk = scan.body_tree
+
+    def body_tree(model, f, *args, **kwargs):
+        return walk(model, lambda *level: jax.lax.optimization_barrier(f(*level)), *args, **kwargs)
+
+    scan.body_tree = body_tree
+    try:
+        yield
+    finally:
+        scan.body_tree = walk
+
+
+def shift_reference_acceleration(data: Any, shift: Any) -> Any:
+    """Returns `data` of MJX with `shift` [R] added to the reference acceleration of the first R constraint rows.
+
+    Private: `Data._impl.efc_aref`, and that equality constraints come first.
+    Why: MJX leaves J' qvel out of a weld's reference acceleration, which MuJoCo C and MuJoCo Warp put in.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known; https://github.com/google-deepmind/mujoco_warp/pull/1294 added the
+      term to MuJoCo Warp.
+    """
+    aref = data._impl.efc_aref
+    return data.tree_replace({"_impl.efc_aref": aref.at[: shift.shape[0]].add(shift)})
+
+
+@functools.cache
+def mujoco_warp_shapes() -> SimpleNamespace:
+    """Returns the functions of MuJoCo Warp's kernels that find the contacts of two shapes.
+
+    Private: both, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be imported
+      without what the packages around it import.
+    Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows. To import
+      the packages takes 3.4 s, the module alone 0.3 s.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
+    """
+    import mujoco
+
+    names = ["mjx", "mjx.third_party", "mjx.third_party.mujoco_warp", "mjx.third_party.mujoco_warp._src"]
+    packages = {f"mujoco.{name}": os.path.join(mujoco.__path__[0], *name.split(".")) for name in names}
+    bare = {} if "mujoco.mjx" in sys.modules else packages
+    for name, folder in bare.items():
+        sys.modules[name] = ModuleType(name)
+        sys.modules[name].__path__ = [folder]
+    try:
+        core = importlib.import_module(f"{[*packages][-1]}.collision_primitive_core")
+    finally:
+        if bare:  # so that others import the packages whole
+            for name in [name for name in sys.modules if f"{name}.".startswith("mujoco.mjx.")]:
+                del sys.modules[name]
+    return SimpleNamespace(box_box=core.box_box, plane_cylinder=core.plane_cylinder)
+
+
+def reset_call_id(callable_: Any) -> None:
+    """Numbers the next trace of a `warp.jax_callable` as its first.
+
+    Private: `FfiCallable.call_id`.
+    Why: Warp writes the number of the trace into the program. JAX then finds no compiled program that it has kept.
+    Needed by: warp-lang 1.18.0. No upstream issue known.
+    """
+    callable_.call_id = 0
+
+
+def array_checkpointer() -> Any:
+    """Returns an orbax checkpointer that writes a folder for each array; silences orbax's log.
+
+    Private: nothing by its name, but `PyTreeCheckpointHandler(use_ocdbt=False)` and the logger `absl` belong to orbax's older
+      interface, which https://github.com/google/orbax/issues/1624 (open) is to replace.
+    Why: the process keeps some memory of every checkpoint in orbax's other format, OCDBT (docs/reliability.md).
+    Needed by: orbax-checkpoint 0.12.8. No upstream issue known for the memory.
+    """
+    import jax
+    import orbax.checkpoint
+
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax warns at every checkpoint in the older format
+    alone: dict[str, Any] = {}
+    if jax.process_count() > 1:  # the process that writes does so alone; orbax would have all of them wait for one another
+        own = jax.process_index()
+        options = orbax.checkpoint.options.MultiprocessingOptions(primary_host=own, active_processes={own})
+        alone = {"multiprocessing_options": options}
+    handler = orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False, **alone)
+    return orbax.checkpoint.Checkpointer(handler, **alone)

@@ -1,0 +1,192 @@
+"""Learning curves of single runs: read from their folders, drawn one by one or together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mjx_dher import stats
+from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder.run_folder import FAILED
+from mjx_dher.spec import RunSpec
+from mjx_dher.system.files import FolderError
+from mjx_dher.tools import figures
+
+CURVE = "curve"  # the picture of one run, without its ending
+NOT_ENDED = "not ended"
+# Panels of a run's picture: heading, curves by column, and whether the axis is logarithmic. Those without columns are left out.
+_PANELS = (
+    ("mean return", {"return_mean": "evaluation", "train_return_mean": "exploring"}, False),
+    ("mean value of a transition", {"q_mean": "critic"}, False),
+    ("loss of the critic", {"critic_loss": "critic"}, True),
+)
+
+
+class Curve(NamedTuple):
+    """What a run folder has of how the run went."""
+
+    folder: Path
+    spec: RunSpec
+    content: dict[str, Any]  # of config.json
+    status: str  # finished, failed or not ended
+    reason: str  # of a run that failed
+    rows: list[dict[str, Any]]  # metrics of each epoch
+    result: dict[str, Any]  # of result.json; empty for a run that has not ended
+
+    def column(self, name: str) -> NDArray:
+        """Returns a metric [P] of all epochs; NaN where an epoch lacks it."""
+        return np.array([row.get(name, math.nan) for row in self.rows], float)
+
+
+def read(folder: Path, allow_empty: bool = False) -> Curve:
+    """Returns the curve of the run in `folder`, finished or not.
+
+    Raises:
+      FolderError: no run folder, one that cannot be believed, or, unless `allow_empty`, no epoch has ended.
+    """
+    content, spec = run_folder.read(folder)
+    ended = results.exists(folder)
+    if ended and (problem := results.problem(folder)) is not None:
+        raise FolderError(problem)
+    result = results.read(folder) if ended else {}
+    rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
+    status = result.get("status", NOT_ENDED)
+    if not rows and not allow_empty:
+        told = f"it failed in its first epoch: {result['reason']}" if status == FAILED else "no epoch of the run has ended"
+        raise FolderError(f"{folder} has no curve: {told}")
+    return Curve(folder, spec, content, status, result.get("reason", ""), rows, result)
+
+
+def title(curve: Curve) -> str:
+    """Returns what a run is, and how far it came, in a line."""
+    spec = curve.spec
+    parts = [spec.env, *spec.env_kwargs, f"sampler {spec.sampler}", f"learner {spec.learner}", f"seed {spec.seed}"]
+    steps = f"{curve.rows[-1]['env_steps']:,} steps in {curve.rows[-1]['wall_seconds']:,.0f} s" if curve.rows else "no epoch"
+    state = f"failed: {curve.reason}" if curve.status == FAILED else curve.status
+    return f"{', '.join(parts)}; {curve.content['physics']}; {steps}; {state}"
+
+
+def draw(curve: Curve) -> Any:
+    """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values and losses."""
+    panels = [
+        (label, {name: text for name, text in columns.items() if np.isfinite(curve.column(name)).any()}, log)
+        for label, columns, log in _PANELS
+    ]
+    panels = [panel for panel in panels if panel[1]]
+    count = 1 + len(panels)
+    columns = min(2, count)
+    height = 3.2 * math.ceil(count / columns)
+    figure, axes = figures.subplots(math.ceil(count / columns), columns, 4.6 * columns, height)
+    unit, name = _unit([curve])
+    steps = curve.column("env_steps") / unit
+    _draw_success(axes[0], curve, steps)
+    marker = "." if len(steps) == 1 else ""
+    for axis, (label, names, log) in zip(axes[1:], panels):
+        for (column, text), (color, line, _) in zip(names.items(), figures.styles(len(names))):
+            axis.plot(steps, curve.column(column), color=color, linestyle=line, label=text, marker=marker)
+        axis.set_title(label, fontsize=10)
+        if log and (curve.column(next(iter(names))) > 0).all():
+            axis.set_yscale("log")
+        if len(names) > 1:
+            axis.legend(frameon=False, fontsize=8)
+    for axis in axes[count:]:
+        axis.set_visible(False)
+    for axis in axes[:count]:
+        axis.set_xlabel(name, fontsize=9)
+        axis.grid(alpha=0.2)
+    figure.suptitle(figures.folded(title(curve), 4.6 * columns), fontsize=10)
+    return figure
+
+
+def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
+    """Draws the success of evaluation and exploration, of the last evaluation, and at the reset."""
+    rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
+    bounds = [stats.wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
+    low, high = np.reshape(bounds, (-1, 2)).T
+    axis.fill_between(steps, low, high, color="#000000", alpha=0.13, linewidth=0)
+    marker = "." if len(steps) == 1 else ""
+    axis.plot(steps, rates, color="#000000", label=f"evaluation, {episodes} episodes", marker=marker)
+    axis.plot(steps, curve.column("train_success_rate"), color="#0072B2", linestyle="--", label="exploring", marker=marker)
+    if np.isfinite(at_reset := curve.column("reset_success_rate")).any():
+        axis.axhline(float(np.nanmean(at_reset)), color="0.6", linewidth=0.8, linestyle=":", label="at the reset")
+    if "success_rate" in curve.result and len(steps):
+        rate = curve.result["success_rate"]
+        around = np.maximum([[rate - curve.result["success_low"]], [curve.result["success_high"] - rate]], 0.0)  # of rounding
+        label = f"end, {curve.result['episodes']} episodes: {rate:.3f}"
+        axis.errorbar(steps[-1], rate, around, color="#D55E00", marker="D", markersize=4, capsize=3, label=label)
+    axis.set_title("success rate", fontsize=10)
+    axis.set_ylim(-0.02, 1.02)
+    axis.legend(frameon=False, fontsize=8)
+
+
+def _unit(curves: Sequence[Curve]) -> tuple[float, str]:
+    """Returns what environment steps are counted in, and the label of their axis."""
+    last = max((curve.rows[-1]["env_steps"] for curve in curves if curve.rows), default=0)
+    return (1e6, "million environment steps") if last >= 1e6 else (1e3, "thousand environment steps")
+
+
+def labels(curves: Sequence[Curve]) -> list[str]:
+    """Returns a name for each run: the settings in which the runs differ, or else their folders."""
+    settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
+    varying = [name for name in settings[0] if len({str(each[name]) for each in settings}) > 1 and name != "engine"]
+    told = [", ".join(_value(name, each[name]) for name in varying) for each in settings]
+    apart = [text if text and told.count(text) == 1 else f"{text}: {c.folder}".lstrip(": ") for text, c in zip(told, curves)]
+    return [f"{text} ({c.status})" if c.status != run_folder.FINISHED else text for text, c in zip(apart, curves)]
+
+
+def _value(name: str, value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"{name} {' '.join(map(str, value)) or 'none'}"
+    return f"{name} {value:g}" if isinstance(value, (int, float)) else str(value)
+
+
+def draw_together(curves: Sequence[Curve]) -> Any:
+    """Draws the success of several runs over environment steps and over seconds."""
+    names = labels(curves)
+    columns = max(1, min(4, 120 // (6 + max(map(len, names)))))
+    rows = math.ceil(len(names) / columns)
+    figure, axes = figures.subplots(1, 2, 10, 3.8 + 0.22 * rows)
+    unit, label_steps = _unit(curves)
+    for curve, name, (color, line, marker) in zip(curves, names, figures.styles(len(curves))):
+        rates, every = curve.column("success_rate"), max(1, len(curve.rows) // 8)
+        style = {"color": color, "linestyle": line, "marker": marker, "markevery": every, "markersize": 4}
+        for axis, x in zip(axes, (curve.column("env_steps") / unit, curve.column("wall_seconds"))):
+            axis.plot(x, rates, label=name, **style)
+    for axis, label in zip(axes, (label_steps, "seconds of training")):
+        axis.set_xlabel(label)
+        axis.set_xlim(left=0)
+        axis.set_ylim(-0.02, 1.02)
+        axis.grid(alpha=0.2)
+    axes[0].set_ylabel("success rate")
+    tasks = ", ".join(dict.fromkeys(curve.spec.env for curve in curves))
+    figure.suptitle(figures.folded(f"{tasks}: success of each evaluation", 10), fontsize=11)
+    handles, _ = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    return figure
+
+
+def table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
+    """Returns a table of several runs, its head and its cells: what each is, how far it came, and its success."""
+    head = ["run", "what differs", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
+    cells = []
+    for curve, name in zip(curves, labels(curves)):
+        last, final = curve.rows[-1] if curve.rows else {}, ""
+        if "success_rate" in curve.result:
+            final = "{success_rate:.3f} ({success_low:.3f} to {success_high:.3f})".format(**curve.result)
+        cells.append(
+            [
+                str(curve.folder),
+                name,
+                curve.status,
+                f"{last.get('env_steps', 0):,}",
+                f"{last.get('wall_seconds', 0):,.0f}",
+                f"{last['success_rate']:.2f}" if last else "",
+                final,
+            ]
+        )
+    return head, cells

@@ -1,0 +1,146 @@
+"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo and so a virtual environment of their own.
+
+Run as a program in that environment, this file plays episodes and prints their outcomes. It needs gymnasium-robotics and
+NumPy, but neither JAX nor this library's MuJoCo:
+
+    python -m mjx_dher.tools.transfer RUN EPISODES FIRST_SEED
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import sys
+import tempfile
+import venv
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_dher.policy.load import load_policy
+from mjx_dher.runs.folder.run_folder import read_spec
+from mjx_dher.system import subprocesses
+from mjx_dher.system.caches import user_cache
+
+ORIGINALS = {
+    "push": "FetchPush-v4",
+    "pick_and_place": "FetchPickAndPlace-v4",
+    "slide": "FetchSlide-v4",
+    "reach": "FetchReach-v4",
+}
+REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0")  # the tasks cannot be built on mujoco 3.12 or newer
+REACHED = 0.05  # m
+
+
+def default_environment() -> Path:
+    """Returns the folder of the virtual environment that `set_up` creates, in the user's cache folder."""
+    return user_cache() / "fetch-originals"
+
+
+def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
+    """Creates a virtual environment with the original tasks, from the package index, unless it is complete already.
+
+    Raises:
+      ValueError: pip failed; the message has its output.
+    """
+    if is_ready(interpreter(environment), requirements):
+        return
+    venv.create(environment, with_pip=True, clear=True)
+    pip = (str(interpreter(environment)), "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+    answer = subprocesses.ask((*pip, *requirements))
+    if answer.failure:
+        raise ValueError(f"{environment} could not be set up: {answer.err.strip() or answer.failure}")
+
+
+def interpreter(environment: Path) -> Path:
+    """Returns the Python of a virtual environment."""
+    return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def check(env_name: str, python: Path) -> str:
+    """Returns the gymnasium id of the original of a task.
+
+    Raises:
+      ValueError: the task has no original, or `python` does not have the original tasks.
+    """
+    if env_name not in ORIGINALS:
+        raise ValueError(f"{env_name} has no original to transfer to; the tasks that have: {', '.join(ORIGINALS)}")
+    if not is_ready(python):
+        raise ValueError(
+            f"the original tasks need {' and '.join(REQUIREMENTS)} in a virtual environment of their own, and {python} does"
+            " not have them: create one with --set-up (a download of 200 MB), or name the Python of yours with --python"
+        )
+    return ORIGINALS[env_name]
+
+
+def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) -> dict[str, np.ndarray]:
+    """Plays a run's policy in its original task, in `workers` processes of another Python.
+
+    Returns:
+      Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.
+
+    Raises:
+      ValueError: a process failed; the message has the end of its output.
+    """
+    workers = min(workers, episodes)
+    bounds = [episodes * i // workers for i in range(workers + 1)]
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        # A folder with this package only, without its neighbours: the other Python has its own NumPy and MuJoCo.
+        (Path(folder) / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
+        processes = []
+        for first, end in itertools.pairwise(bounds):
+            arguments = (str(run.resolve()), str(end - first), str(seed + first))
+            command = (str(python), "-m", "mjx_dher.tools.transfer", *arguments)
+            processes.append(stack.enter_context(subprocesses.started(command, {"PYTHONPATH": folder})))
+        outcomes = []
+        for process in processes:
+            answer = subprocesses.answer(process)
+            if answer.failure:
+                raise ValueError(f"{python} failed to play the original task: {answer.err.strip()[-2000:] or answer.failure}")
+            outcomes.append(answer.last_json())
+    return {name: np.concatenate([np.asarray(outcome[name]) for outcome in outcomes]) for name in outcomes[0]}
+
+
+def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
+    """Plays a run's policy in its original task in this process: episode i uses the seed `first_seed` + i."""
+    warnings.filterwarnings("ignore")
+    import gymnasium
+    import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    env, policy = gymnasium.make(ORIGINALS[read_spec(run).env]), load_policy(run)
+    outcome: dict[str, list[Any]] = {"success": [], "reset_success": [], "ret": []}
+    for seed in range(first_seed, first_seed + episodes):
+        obs, _ = env.reset(seed=seed)
+        distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
+        ended, ret = False, 0.0
+        info: dict[str, Any] = {}
+        while not ended:
+            obs, reward, _, ended, info = env.step(policy(obs))
+            ret += float(reward)
+        outcome["success"].append(bool(info["is_success"]))
+        outcome["reset_success"].append(bool(distance < REACHED))
+        outcome["ret"].append(ret)
+    return outcome
+
+
+def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
+    """Returns whether `python` exists and has the original tasks in the required versions."""
+    names = [requirement.split("==")[0] for requirement in requirements]
+    code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
+    return tuple(subprocesses.ask((str(python), "-c", code)).out.split()) == requirements
+
+
+def main(argv: Sequence[str]) -> None:
+    """Prints the outcomes of `play` as JSON in the last line."""
+    run, episodes, first_seed = argv
+    print(json.dumps(play(Path(run), int(episodes), int(first_seed))))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
