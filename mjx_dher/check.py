@@ -1,0 +1,41 @@
+"""One check of the arrays that a user's functions return."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjx_dher.types import Array
+
+_NAMES = {jnp.floating: "floats", jnp.integer: "integers", jnp.number: "numbers", jnp.bool_: "booleans"}
+
+
+def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floating) -> Array:
+    """Converts `value` to an array and checks its shape and dtype. Works under tracing, at no cost in the program.
+
+    Args:
+      what: name of the value and its symbolic shape, such as "sampler: log weights [T+1]".
+      value: array, number, or nested sequence of them.
+      shape: expected shape.
+      kind: expected kind of dtype: `jnp.floating`, `jnp.integer`, `jnp.number` or `jnp.bool_`.
+
+    Raises:
+      ValueError: names the value, what is expected and what was given.
+    """
+    expected = f"{what} must be {_NAMES[kind]} of shape {list(shape)}"
+    try:
+        result = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{expected}; got {describe(value)}") from None
+    if result.shape != tuple(shape) or not jnp.issubdtype(result.dtype, kind):
+        raise ValueError(f"{expected}; got {describe(result)}")
+    return result
+
+
+def describe(value: Any) -> str:
+    """Dtype and shape of an array, such as "float32[3, 4]"; the type of anything else."""
+    if isinstance(value, jax.Array):
+        return f"{value.dtype}{list(value.shape)}"
+    return f"a {type(value).__name__}"
