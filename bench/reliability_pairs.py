@@ -125,11 +125,10 @@ def one_of(folder, right, processes):
 
 
 def sweep_pair(folder, right, rng):
-    """The same sweep twice, or overlapping shards; one of them may be killed. Then the whole sweep once more."""
-    shards = rng.choice((("1/1", "1/1"), ("1/2", "1/3"), ("2/2", "2/3")))
+    """The same sweep twice, or two with some seeds in common; one may be killed. Then the whole sweep once more."""
     processes = []
-    for shard in shards:
-        processes.append(start(*SWEEP, "--shard", shard, "--out", folder))
+    for first, seeds in rng.choice((((0, 3), (0, 3)), ((0, 2), (0, 1)), ((1, 2), (2, 1)))):
+        processes.append(start(*SWEEP, "--first-seed", first, "--seeds", seeds, "--out", folder))
         time.sleep(rng.choice((0.0, rng.uniform(0, 2), rng.uniform(0, 10))))
     return and_once_more(folder, right, processes, rng)
 

@@ -98,7 +98,6 @@ BAD = [
     (["--learning-rate", "0.01"], ["--learning-rate is called --actor-lr and --critic-lr here"]),
     (["--buffer-size", "1000"], ["--buffer-size is called --replay-size here"]),
     (["--tau=0.05"], ["--tau is called --polyak here, which is 1 - tau: tau 0.05 is --polyak 0.95"]),
-    (["sweep", "--out", "x", "--share", "1/2"], ["--share is called --shard here"]),
     (["--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
     (["--cycles-per-epoch", HUGE], [f"cycles_per_epoch must lie in [1, 1000000]; got {HUGE}"]),
     (["--updates-per-cycle", HUGE], [f"updates_per_cycle must lie in [1, 1000000]; got {HUGE}"]),

@@ -128,7 +128,6 @@ WRONG = [
     (["--ray", "local", "--ray-chunk", "-1"], r"ray_chunk must lie in \[1, .*; got -1"),
     (["--ray", "local", "--ray-chunk", "100000000000000000000"], "ray_chunk must lie in"),
     (["--ray", "local", "--ray-on", "gpu", "--ray-cpus", "2"], "ray_cpus is for tasks on CPUs"),
-    (["--ray", "local", "--shard", "1/2"], "shard does not go with --ray"),
     (["--ray", "local", "--dry-run"], "dry_run does not go with --ray"),
     (["--ray", "local", "--storage", ""], "storage must be a folder, or begin with gs://"),
     (["--ray", "local", "--storage", "ftp://host/x"], "storage must be a folder, or begin with gs://"),
@@ -152,7 +151,7 @@ def test_without_the_extra_the_refusal_names_it(monkeypatch):
     find = lookup.importlib.util.find_spec
     monkeypatch.setattr(lookup.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
     with pytest.raises(ValueError, match=r'--ray needs ray, which the extra "ray" installs: pip install -e ".\[ray\]"'):
-        request_of(FleetArgs(ray="local"), "1/1")
+        request_of(FleetArgs(ray="local"))
 
 
 def test_checkpoints_of_one_machine_are_kept_beside_its_sweep():

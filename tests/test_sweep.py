@@ -97,21 +97,6 @@ def test_environments_stay_together():
     assert [trial.env for trial in trials] == ["reach"] * 3 + ["push"] * 3
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7])
-def test_shards_have_all_runs_between_them_and_whole_seeds_where_they_can(count):
-    trials = [trial for env in ("push", "slide") for trial in make_grid(seeds=(0, 1, 2, 3), env=env)]
-    shards = [grid.shard(trials, index, count) for index in range(1, count + 1)]
-    assert sorted(map(trial_name, trials)) == sorted(trial_name(trial) for shard in shards for trial in shard)
-    for env in ("push", "slide"):
-        sizes = [sum(trial.env == env for trial in shard) for shard in shards]
-        assert max(sizes) - min(sizes) <= 1
-    if count == 2:
-        assert [[(t.env, t.sampler, t.seed) for t in shard] for shard in shards] == [
-            [(env, sampler, seed) for env in ("push", "slide") for seed in seeds for sampler in ("future", "weighted")]
-            for seeds in ((0, 1), (2, 3))
-        ]
-
-
 def test_a_run_that_another_program_trains_is_left_to_it(tmp_path, monkeypatch):
     trials = make_grid(seeds=(0, 1))
     path = grid.folder_of(tmp_path, trials[0])

@@ -122,7 +122,7 @@ def calls(folder: Path, run: Path, stopped: Path, sweep: Path) -> list[list[str]
         "--log",
     ):
         found += [[*train, "--out", out, flag, name] for name in NAMES]
-    for flag in ("--seeds", "--first-seed", "--lanes", "--devices", "--threshold", "--shard", "--sweep.gamma", "--sweep.her-k"):
+    for flag in ("--seeds", "--first-seed", "--lanes", "--devices", "--threshold", "--sweep.gamma", "--sweep.her-k"):
         found += [["sweep", *TINY, "--out", out, flag, number] for number in NUMBERS[:4]]
     for command in (["eval", str(run)], ["transfer", str(run)], ["render", str(run), "--out", out + ".png"]):
         found += [[*command, "--episodes", number] for number in NUMBERS[:5]]

@@ -58,7 +58,6 @@ FOREIGN_FLAGS = {
     "--tensorboard-log": "--log tensorboard",
     "--n-eval-episodes": "--eval-episodes",
     "--eventful-share": "--priority-fraction",
-    "--share": "--shard",
 }
 LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
 

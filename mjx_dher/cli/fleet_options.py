@@ -26,7 +26,7 @@ class FleetArgs:
     """Folder that all nodes see, or gs://, s3://, az://, for checkpoints: a lost node then costs no more than one interval."""
 
 
-def request_of(args: FleetArgs, shard: str) -> Request | None:
+def request_of(args: FleetArgs) -> Request | None:
     """Returns what is asked of a fleet; None where none is.
 
     Raises:
@@ -39,5 +39,5 @@ def request_of(args: FleetArgs, shard: str) -> Request | None:
                 raise ValueError(f"{name} is for --ray local, auto or HOST:PORT, which is not given; got {value!r}")
         return None
     request = Request(args.ray, args.ray_on, args.ray_cpus, args.ray_chunk, args.storage)
-    plan.check(request, shard)
+    plan.check(request)
     return request

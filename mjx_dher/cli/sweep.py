@@ -109,8 +109,6 @@ class SweepArgs:
     devices: Devices = 1
     """Devices to train on, or all: runs side by side are shared out among them; where they are more, several share each run."""
     fleet: Annotated[FleetArgs, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetArgs)
-    shard: str = "1/1"
-    """Part of the trials: 2/4 is the second of four, for several programs on one folder where --ray cannot be used."""
     threshold: float = 0.9
     """Success rate for the time that it takes to get there."""
     baseline: str = "future"
@@ -138,10 +136,7 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
         return args, trials  # which preset is for the cluster is known once it is joined
     if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
         trials = _trials(args, preset)
-    own = grid.shard(trials, *_parse_shard(args.shard))
-    if not own:
-        raise ValueError(f"shard {args.shard} is empty: there are {len(trials)} runs in all")
-    return args, own
+    return args, trials
 
 
 def _check(args: SweepArgs) -> None:
@@ -158,8 +153,7 @@ def _check(args: SweepArgs) -> None:
     args.options.check()
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
-    _parse_shard(args.shard)
-    if request_of(args.fleet, args.shard) is not None and args.dry_run:
+    if request_of(args.fleet) is not None and args.dry_run:
         raise ValueError("dry_run does not go with --ray: try the command without --ray")
     if args.out.exists() and not args.out.is_dir():
         raise FolderError(f"out: {args.out} is there already and is no folder")
@@ -188,19 +182,12 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds))
 
 
-def _parse_shard(text: str) -> tuple[int, int]:
-    number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
-        raise ValueError(f"shard must be N/M, 1 to M, such as 2/4; got {text!r}")
-    return int(number), int(count)
-
-
 def sweep_command(argv: list[str], console: Console) -> int:
     """Trains a grid of runs."""
     args, trials = parse_sweep_args(argv)
     if args.dry_run:
         return _dry_run(args, trials, console)
-    if (request := request_of(args.fleet, args.shard)) is not None:
+    if (request := request_of(args.fleet)) is not None:
         refuse_with_ray(args.hosts, args.devices)
         return _sweep_fleet(args, request, console)
     settle_compiler(args.engine)
@@ -249,8 +236,7 @@ def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[
         console.print(text, soft_wrap=True)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     done = f"; {len(trials) - len(todo)} of them are done already" if len(todo) < len(trials) else ""
-    shard = "" if args.shard == "1/1" else f", shard {args.shard} of the sweep"
-    console.print(f"{len(trials)} runs{shard}{done}; writing to {args.out}", soft_wrap=True)
+    console.print(f"{len(trials)} runs{done}; writing to {args.out}", soft_wrap=True)
     return todo
 
 
@@ -326,7 +312,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console, team: Any) ->
 def _write_tables(args: SweepArgs, console: Console) -> None:
     from mjx_dher.sweeps import comparison, tables
 
-    with files.lock(args.out / grid.CELLS, wait=True):  # another shard's program may be writing them
+    with files.lock(args.out / grid.CELLS, wait=True):  # another program may be writing them
         trials = tables.read(args.out)
         tables.write(args.out, trials)
         compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)

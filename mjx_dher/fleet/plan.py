@@ -57,7 +57,7 @@ class Node(NamedTuple):
     speed: float = 1.0  # of its slots, beside one another
 
 
-def check(request: Request, shard: str) -> None:
+def check(request: Request) -> None:
     """Refuses wishes that cannot be met, before Ray is loaded.
 
     Raises:
@@ -78,8 +78,6 @@ def check(request: Request, shard: str) -> None:
         raise ValueError("ray_cpus is for tasks on CPUs: it goes with --ray-on cpu, both or auto; got --ray-on gpu")
     if request.storage is not None:
         _check_storage(request.storage)
-    if shard != "1/1":
-        raise ValueError(f"shard does not go with --ray, which shares out the runs itself; got {shard}")
     lookup.require_extra("--ray", "ray", "ray")
 
 

@@ -54,15 +54,6 @@ def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
     return list(groups.values())
 
 
-def shard(specs: Sequence[RunSpec], index: int, count: int) -> list[RunSpec]:
-    """Returns the `index`-th (from 1) of `count` near-equal shards, split within each environment.
-
-    Neighbours stay together, so a shard has all settings of some seeds, which are compared, and trains them side by side.
-    """
-    grouped = (list(group) for _, group in itertools.groupby(specs, key=lambda spec: spec.env))
-    return [spec for group in grouped for spec in group[len(group) * (index - 1) // count : len(group) * index // count]]
-
-
 def folder_of(sweep: Path, spec: RunSpec) -> Path:
     """Returns the run folder of a trial."""
     folder = sweep / CELLS / fingerprint.trial_name(spec)
