@@ -13,19 +13,6 @@ from conftest import ROOT
 import mjx_dher
 
 
-def modules():
-    """Every module of the library by name, `mjx_dher.` left off, and its file."""
-    found = {}
-    for root, prefix in ((ROOT / "mjx_dher", ()), (ROOT / "envs", ("envs",))):  # mjx_dher/envs is a link to envs/
-        for path in root.rglob("*.py"):
-            parts = (*prefix, *path.relative_to(root).with_suffix("").parts)
-            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return found
-
-
-MODULES = modules()
-
-
 def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
     code = "import sys, mjx_dher; from mjx_dher import envs, Config; print({'jax', 'mujoco'} & set(sys.modules))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

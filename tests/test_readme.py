@@ -3,13 +3,14 @@ import runpy
 
 import numpy as np
 from conftest import ROOT
-from test_packaging import MODULES
 
 from mjx_dher import stats
 
 README = (ROOT / "README.md").read_text()
 # What commands and engines are made of; some of it has a place among the API pages, too.
-INNER = "cli host hopper envs.engines.fused envs.engines.warp learners.stored runs sweeps testing tools names viewer fleet"
+INNER = (
+    "cli system hopper envs.engines.fused envs.engines.warp policy.learner_policy runs sweeps testing tools lookup viewer fleet"
+)
 
 
 def test_the_components_example_runs(capsys):
@@ -38,7 +39,7 @@ def test_the_two_commands_are_what_ci_installs_and_runs():
     ci = (ROOT / ".ci" / "run").read_text()
     assert 'pip install -e ".[test]" && pytest\n' in README
     assert '-e ".[test]"' in ci
-    assert ci.rstrip().endswith("\npytest")
+    assert "\npytest" in ci
 
 
 def test_the_picture_of_the_design_is_what_its_script_draws():
@@ -62,8 +63,13 @@ def test_the_site_has_every_module_that_is_for_users():
     pages = "".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
     listed = re.findall(r"^- \[`mjx_dher\.([\w.]+)`\]\(../../([\w./]+)\)", pages, re.M)
     assert len(set(listed)) == len(listed)
-    assert {name: MODULES[name] for name, _ in listed} == {name: ROOT / path for name, path in listed}
-    users = {name for name in MODULES if name and not any(f"{name}.".startswith(f"{part}.") for part in INNER.split())}
+    modules = {}
+    for folder in ("mjx_dher", "envs"):  # mjx_dher/envs is a link
+        for path in (ROOT / folder).rglob("*.py"):
+            parts = path.relative_to(ROOT).with_suffix("").parts[folder == "mjx_dher" :]
+            modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    assert {name: modules[name] for name, _ in listed} == {name: ROOT / path for name, path in listed}
+    users = {name for name in modules if name and not any(f"{name}.".startswith(f"{part}.") for part in INNER.split())}
     assert users <= {name for name, _ in listed}
 
 

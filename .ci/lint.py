@@ -1,0 +1,182 @@
+#!/usr/bin/env python3
+"""Check the form of code and prose. Prints every violation as `file:line: text` and exits with status 1 if there is one.
+
+ruff checks style, mypy types, and lint-imports the layers. This script checks the rest:
+
+- that each module has a layer
+- lengths of files and functions
+- names that say nothing
+- public names of the algorithm that appear on no page and in no example
+- habits of wording that make prose hard to read, per 1,000 words
+
+The last two have a limit that the tree passes; lower it as the tree improves. `--list` prints what they count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE_LINES = 350
+FUNCTION_LINES, FUNCTION_LINES_P95 = 60, 30
+EMPTY_NAMES = {"found", "said", "there", "thing", "stuff", "tmp"}
+UNMENTIONED_NAMES = 152  # public names of CORE
+HABITS_PER_1000_WORDS = {"pages": 10.5, "docstrings": 15.0}
+CORE = {
+    *("types", "config", "spec", "context", "replay", "samplers", "relabel", "normalizer", "networks", "rollout", "evaluate"),
+    *("trainer", "learners", "contrib", "distance_normalization", "priorities", "generators", "scores", "updates"),
+}
+HABITS = re.compile(
+    r"\b(?:of|with|in|by|from|to|for|on|and|says?|than|as|is|are|has|have|gives?|returns?|takes?|sees?) what\b"
+    r"|(?:^|[.;:] )what\b(?![^.?!]*\?)|\breturns? (?:whether|how|by what|which)\b"  # a clause in place of a noun
+    r"|[;,] (?:None|nothing|all|none) where\b|\bwhere (?:there (?:is|are)|it (?:is|has|was|does)|none|no )\b"  # if, when
+    r"|\b(?:of|with) (?:one's|your|its|their|a user's|our) own\b|\bone's own\b"  # custom
+    r"|\b(?:anew|likewise|hence|so many|as such|but for|save for|all but|by name|refuse[sd]?|go(?:es)? on|told|lest|mends?)\b",
+    re.MULTILINE | re.IGNORECASE,
+)
+
+Add = Callable[[Path, int, str], None]
+
+
+def python_files(*folders: str) -> list[Path]:
+    return [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]  # links are not followed
+
+
+def pages() -> list[Path]:
+    files = [path for pattern in ("*.md", ".github/*.md", "docs/**/*.md", "bench/*.md") for path in sorted(ROOT.glob(pattern))]
+    return [path for path in files if path.name not in ("CHANGELOG.md", "history.md")]  # they report what there was
+
+
+def check_lengths(trees: dict[Path, ast.Module], add: Add) -> str:
+    files = {path: len(path.read_text().splitlines()) for path in python_files("mjx_dher", "envs", "tests", "bench", "docs")}
+    for path, length in files.items():
+        if length > FILE_LINES:
+            add(path, FILE_LINES + 1, f"the file has {length} lines; at most {FILE_LINES} are allowed")
+    lengths = []
+    for path, node in definitions(trees):
+        lengths.append((node.end_lineno or node.lineno) - node.lineno + 1)
+        if lengths[-1] > FUNCTION_LINES:
+            add(path, node.lineno, f"{node.name} has {lengths[-1]} lines; at most {FUNCTION_LINES} are allowed")
+    lengths.sort()
+    p95 = lengths[math.ceil(0.95 * len(lengths)) - 1]
+    if p95 > FUNCTION_LINES_P95:
+        add(ROOT / "mjx_dher", 1, f"5 % of the functions have more than {FUNCTION_LINES_P95} lines (p95: {p95})")
+    lines = sum(files[path] for path in trees)
+    return f"{len(trees)} modules, {lines} lines; {len(lengths)} functions, p95 {p95} lines, longest {lengths[-1]}"
+
+
+def check_layers(add: Add) -> None:
+    layers = (ROOT / "pyproject.toml").read_text()
+    for path in sorted((ROOT / "mjx_dher").iterdir()):
+        is_module = path.suffix == ".py" or (path / "__init__.py").is_file()
+        if is_module and path.stem != "__init__" and not re.search(rf"mjx_dher\.{path.stem}\b", layers):
+            add(path, 1, "this module is in no layer of [tool.importlinter] in pyproject.toml")
+
+
+def definitions(trees: dict[Path, ast.Module]) -> Iterator[tuple[Path, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    for path, tree in trees.items():
+        yield from ((path, node) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+
+
+def check_local_names(trees: dict[Path, ast.Module], add: Add) -> None:
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.arg) and node.arg in EMPTY_NAMES:
+                add(path, node.lineno, f"the name {node.arg!r} says nothing")
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in EMPTY_NAMES:
+                add(path, node.lineno, f"the name {node.id!r} says nothing")
+
+
+def public_names(trees: dict[Path, ast.Module]) -> Iterator[tuple[Path, int, str]]:
+    """Functions, classes and constants that the core's modules define at their top level."""
+    for path, tree in trees.items():
+        if path.relative_to(ROOT).with_suffix("").parts[1] not in CORE or path.parts[-2] == "bundled":
+            continue
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names = [node.name]
+            elif isinstance(node, ast.Assign | ast.AnnAssign):
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                names = [target.id for target in targets if isinstance(target, ast.Name)]
+            else:
+                continue
+            yield from ((path, node.lineno, name) for name in names if not name.startswith("_"))
+
+
+def check_public_names(trees: dict[Path, ast.Module], add: Add, listing: bool) -> str:
+    text = "\n".join(path.read_text() for path in [*ROOT.glob("**/*.md"), *python_files("docs/examples")])
+    words = set(re.findall(r"\w+", text))
+    names = list(public_names(trees))
+    missing = [(path, line, name) for path, line, name in names if name not in words]
+    if listing or len(missing) > UNMENTIONED_NAMES:
+        for path, line, name in missing:
+            add(path, line, f"the public name {name} is on no page: describe it or make it private")
+    return f"{len(names)} public names in the core, {len(missing)} on no page (limit {UNMENTIONED_NAMES})"
+
+
+def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node)
+            yield from [(node.body[0].lineno, text)] if text else []
+
+
+def paragraphs(path: Path) -> Iterator[tuple[int, str]]:
+    """A page's lines with their numbers; without code, tables and addresses."""
+    text = re.sub(r"```.*?```|<!--.*?-->", lambda match: re.sub(r"[^\n]", "", match[0]), path.read_text(), flags=re.DOTALL)
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.lstrip().startswith(("|", "![", "    ")):
+            yield number, re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)
+
+
+def check_prose(trees: dict[Path, ast.Module], add: Add, listing: bool) -> Iterator[str]:
+    kinds = {
+        "pages": [(path, *piece) for path in pages() for piece in paragraphs(path)],
+        "docstrings": [(path, *piece) for path, tree in trees.items() for piece in docstrings(tree)],
+    }
+    for kind, pieces in kinds.items():
+        words, habits = Counter[Path](), Counter[Path]()
+        for path, line, text in pieces:
+            plain = re.sub(r"`[^`]*`", "code", text)
+            words[path] += len(plain.split())
+            for match in HABITS.finditer(plain):
+                habits[path] += 1
+                if listing:
+                    add(path, line + plain.count("\n", 0, match.start()), f"{match[0].strip()!r} is hard to read")
+        rate, limit = 1000 * habits.total() / words.total(), HABITS_PER_1000_WORDS[kind]
+        if rate > limit:
+            path = max(habits, key=lambda path: habits[path])
+            add(
+                path,
+                1,
+                f"{kind} have {rate:.2f} hard-to-read habits per 1,000 words; the limit is {limit} (this file: {habits[path]})",
+            )
+        yield f"{kind}: {rate:.2f} hard-to-read habits per 1,000 words (limit {limit})"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--list", action="store_true", help="print each name and habit that is counted")
+    listing = parser.parse_args().list
+    violations = []
+
+    def add(path: Path, line: int, text: str) -> None:
+        violations.append(path)
+        print(f"{path.relative_to(ROOT)}:{line}: {text}")
+
+    trees = {path: ast.parse(path.read_text()) for path in python_files("mjx_dher", "envs")}
+    check_layers(add)
+    check_local_names(trees, add)
+    summary = [check_lengths(trees, add), check_public_names(trees, add, listing), *check_prose(trees, add, listing)]
+    print("\n".join(summary))
+    return bool(violations) and not listing
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
