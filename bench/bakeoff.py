@@ -28,7 +28,7 @@ from bakeoff_report import Row, compare, forest
 from bakeoff_runs import Run, by_arm, load, merged, save
 from rich.console import Console
 
-from mjx_dher import envs, stats
+from mjx_dher import stats
 from mjx_dher.cli import sentence
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
@@ -95,7 +95,7 @@ def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> 
     """Returns the runs of the arms of a group, seed by seed, so that what is compared ends together."""
     settings = [args.experiment.spec_of(learner, task, arm, args.toy) for arm in args.arms if arm.group == group]
     for setting in settings:
-        validate(setting, envs.list_envs())
+        validate(setting)
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     return [dataclasses.replace(setting, seed=seed) for seed in seeds for setting in settings]
 

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from timing import median_seconds, print_table
 
 from mjx_dher import Config, HParams, learners, replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.relabel import draw_batches
-from mjx_dher.spec import LEARNERS
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Episode, Sizes
 
@@ -111,7 +111,7 @@ class Timed:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--learners", nargs="+", default=["ddpg"], choices=LEARNERS)
+    parser.add_argument("--learners", nargs="+", default=["ddpg"], choices=COMPONENTS["learner"])
     parser.add_argument("--networks", default="mlp")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[256, 512, 1024])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])

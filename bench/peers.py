@@ -37,10 +37,10 @@ from typing import Any
 
 from peers_worker import EPISODE_LENGTH, FIRST_SEED, PEERS, ZOO, usable_cores
 
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import check_count, check_number
 from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import loggers, run_folder
-from mjx_dher.spec import LEARNERS, SAMPLERS
 from mjx_dher.stats import wilson_interval
 from mjx_dher.system import subprocesses
 from mjx_dher.system.caches import user_cache
@@ -301,8 +301,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=1, help="runs of each learner, with the seeds 0, 1, ... (1)")
     parser.add_argument("--peers", nargs="+", choices=tuple(PEERS), default=list(PEERS))
     parser.add_argument("--peer-set", nargs="+", default=[], metavar="NAME=VALUE", help=", ".join(ZOO))
-    parser.add_argument("--learner", choices=tuple(LEARNERS), help="ours; the preset's unless given")
-    parser.add_argument("--sampler", choices=SAMPLERS, help="ours; train.py's default unless given")
+    parser.add_argument("--learner", choices=tuple(COMPONENTS["learner"]), help="ours; the preset's unless given")
+    parser.add_argument("--sampler", choices=COMPONENTS["sampler"], help="ours; train.py's default unless given")
     parser.add_argument("--episodes", type=int, default=100, help="of an evaluation (100)")
     parser.add_argument("--final-episodes", type=int, default=100, help="of the last policy in the original task (100)")
     parser.add_argument("--eval-every", type=float, help="seconds from one to a peer's next (60, or a quarter of the budget)")

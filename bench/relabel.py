@@ -16,8 +16,8 @@ from learner import compute_reward, full_ring
 from timing import median_seconds, print_table
 
 from mjx_dher import HParams, replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.relabel import draw_batches
-from mjx_dher.spec import SAMPLERS
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Batch
 
@@ -69,7 +69,7 @@ def main() -> None:
     shape = (max(1, MAX_TRANSITIONS_PER_DRAW // args.batch_size), args.batch_size)
     num_drawn = shape[0] * shape[1]
     rates = {}
-    for name in SAMPLERS:
+    for name in COMPONENTS["sampler"]:
 
         def draw(key, sampler=samplers.make(name)):  # noqa: B008
             return draw_batches(ring, key, shape, sampler, compute_reward, hparams, cumulative)

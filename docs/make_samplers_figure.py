@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from paper_analysis import DOCS, with_tables
 
 from mjx_dher import HParams, samplers
-from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
+from mjx_dher.components import COMPONENTS
 
 PAGE, PICTURE, SCRIPT = DOCS / "samplers.md", DOCS / "images" / "sampler_weights.png", "docs/make_samplers_figure.py"
 CANDIDATES = 25
@@ -53,7 +53,9 @@ def total_variation(sampler: samplers.Sampler, distances: NDArray) -> float:
 def rows() -> list[tuple[str, list[float]]]:
     """Returns what the table says: a name, and the total variation in each situation."""
     made = {
-        f"`{n}`, `{k}`": samplers.make("weighted", k, normalization=n) for n in WEIGHT_NORMALIZATIONS for k in WEIGHT_KERNELS
+        f"`{n}`, `{k}`": samplers.make("weighted", k, normalization=n)
+        for n in COMPONENTS["weight_normalization"]
+        for k in COMPONENTS["weight_kernel"]
     }
     made |= {"`epsilon_closest`": samplers.make("epsilon_closest"), "`closest`": samplers.make("closest")}
     return [(name, [total_variation(sampler, d) for d in SITUATIONS.values()]) for name, sampler in made.items()]

@@ -117,7 +117,7 @@ def check(folder: Path, run: RunSpec) -> None:
         raise ValueError(problem)
     if results.read(folder)["status"] != run_folder.FINISHED:
         raise ValueError(f"{folder} has failed; a policy of the package is of a run that has ended well")
-    if run.env not in TITLES or spec.own_parts(run):
+    if run.env not in TITLES or spec.custom_components(run):
         raise ValueError(f"{folder} is of parts of its user's own, which a user of the package does not have")
 
 

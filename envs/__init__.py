@@ -10,7 +10,8 @@ import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.lookup import check_name, load_import_path
+from mjx_dher.components import COMPONENTS, load
+from mjx_dher.lookup import check_name
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State
@@ -18,18 +19,10 @@ if TYPE_CHECKING:
 
 __all__ = ["GoalEnv", "Simulator", "State", "list_envs", "make"]
 
-# name -> constructor, or its "module:attribute", so that this module stays cheap to import
-_REGISTRY: dict[str, Callable[..., Any] | str] = {
-    "push": "mjx_dher.envs.push:Push",
-    "pick_and_place": "mjx_dher.envs.pick_and_place:PickAndPlace",
-    "slide": "mjx_dher.envs.slide:Slide",
-    "reach": "mjx_dher.envs.reach:Reach",
-}
-
 
 def list_envs() -> tuple[str, ...]:
-    """Returns the names that `make` takes, beside "module:attribute"."""
-    return tuple(sorted(_REGISTRY))
+    """Names of the built-in environments."""
+    return tuple(sorted(COMPONENTS["env"]))
 
 
 def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
@@ -45,10 +38,7 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
       ValueError: there is no such environment, module, attribute or engine (the message names the nearest), an argument is out
         of range, an engine is given to a constructor that takes none, or the constructor returns no environment.
     """
-    check_name("env", name, list_envs(), own=True)
-    constructor = _REGISTRY.get(name, name)
-    if isinstance(constructor, str):
-        constructor = load_import_path("env", constructor)
+    constructor = load("env", name)
     if not callable(constructor):
         raise ValueError(f"env {name!r} must be a class or function that makes an environment; it is {constructor!r}")
     try:
@@ -82,7 +72,7 @@ def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict
         key for key, parameter in parameters.items() if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
     ]
     if len(named) < len(parameters):  # **options are the engine's, of which it alone knows
-        if name not in _REGISTRY:
+        if name not in COMPONENTS["env"]:
             return
         from mjx_dher.envs.engines import engine_options
 

@@ -1,7 +1,7 @@
 """`Config` (static: shapes of the compiled program) and `HParams` (traced: the algorithm's numbers), and their validation.
 
-A number's range, its help text and which samplers read it stand beside its field. This module loads neither JAX nor MuJoCo,
-so that a wrong argument is refused before either has been loaded.
+A number's range and its help text stand beside its field. This module loads neither JAX nor MuJoCo, so that a wrong argument
+is rejected before either is loaded.
 """
 
 from __future__ import annotations
@@ -28,14 +28,6 @@ class Number:
         low, high = map(float, self.interval[1:-1].split(","))
         above = value >= low if self.interval[0] == "[" else value > low
         return above and (value <= high if self.interval[-1] == "]" else value < high)
-
-
-class ReadBy(tuple[str, ...]):
-    """Metadata of a field: the built-in samplers, or learners, that read it. A field without it is read by every run."""
-
-    def __new__(cls, *parts: str) -> ReadBy:
-        """Makes the tuple of `parts`."""
-        return super().__new__(cls, parts)
 
 
 Count = Annotated[int, Number("[1, 1000000]")]
@@ -68,15 +60,15 @@ class Config:
     """Transitions that the replay ring (the buffer) holds."""
     hidden_sizes: Annotated[tuple[int, ...], Number("[1, 65536]")] = (256, 256, 256)
     """Units of the hidden layers, of actor and critic both."""
-    num_critics: Annotated[int, Number("[1, 1000]"), ReadBy("td3", "sac", "redq", "tqc", "dtqc")] = 2
+    num_critics: Annotated[int, Number("[1, 1000]")] = 2
     """Critics that learn side by side: 2 in TD3 and SAC, 5 in TQC, 10 in REDQ."""
-    subset_critics: Annotated[int, Number("[1, 1000]"), ReadBy("redq")] = 2
+    subset_critics: Annotated[int, Number("[1, 1000]")] = 2
     """Critics, drawn at random, whose smallest value is the target."""
-    num_quantiles: Annotated[int, Number("[1, 10000]"), ReadBy("tqc", "dtqc")] = 25
+    num_quantiles: Annotated[int, Number("[1, 10000]")] = 25
     """Quantiles of the return that a critic gives."""
-    dropped_quantiles: Annotated[int, Number("[0, 10000]"), ReadBy("tqc", "dtqc")] = 2
+    dropped_quantiles: Annotated[int, Number("[0, 10000]")] = 2
     """Quantiles a critic that are left out of the target, the largest of all critics' first."""
-    policy_delay: Annotated[int, Number("[1, 1000]"), ReadBy("td3", "sac", "redq", "tqc", "dtqc")] = 1
+    policy_delay: Annotated[int, Number("[1, 1000]")] = 1
     """Gradient steps of the critics for one of the actor: 2 in TD3. It divides target_period, or is a multiple of it that
     divides updates_per_cycle."""
     learner_dtype: Literal["float32", "bfloat16"] = "float32"
@@ -118,27 +110,27 @@ class HParams(NamedTuple):
     """Weight of the mean squared action in the actor's loss."""
     random_eps: Share = 0.3
     """Probability of a uniformly random action while exploring."""
-    noise_std: Annotated[float, Number("[0, inf)"), ReadBy("ddpg", "td3", "dtqc")] = 0.2
+    noise_std: NotNegative = 0.2
     """Standard deviation of the Gaussian noise on the other actions; a learner that draws its actions needs none."""
-    random_noise: Annotated[float, Number("[0, 1]"), ReadBy("ddpg", "td3", "dtqc")] = 0.0
+    random_noise: Share = 0.0
     """Noise on the random actions, too, as a fraction of noise_std; actions are clipped to [-1, 1] after it."""
     her_k: NotNegative = 4.0
     """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
     priority_fraction: Share = 0.0
     """Fraction of each batch drawn from episodes in proportion to their priority; the rest is uniform."""
-    epsilon: Annotated[float, Number("[0, 1]"), ReadBy("epsilon_closest")] = 0.2
+    epsilon: Share = 0.2
     """Probability of a uniform future goal instead of the closest, for epsilon_closest."""
-    temperature: Annotated[float, Number("(0, inf)"), ReadBy("weighted")] = 1.0
+    temperature: Positive = 1.0
     """Evenness of the weights, for weighted: the larger, the more even (infinite: the same as future)."""
-    weight_scale: Annotated[float, Number("[1e-6, 1e6]"), ReadBy("weighted")] = 0.05
+    weight_scale: Annotated[float, Number("[1e-6, 1e6]")] = 0.05
     """Distance that counts as 1, in metres, for weighted with weight_normalization none."""
-    target_noise: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.2
+    target_noise: NotNegative = 0.2
     """Standard deviation of the Gaussian noise on the actions of targets, which smooths these."""
-    target_noise_clip: Annotated[float, Number("[0, inf)"), ReadBy("td3", "dtqc")] = 0.5
+    target_noise_clip: NotNegative = 0.5
     """Bound of that noise: it is clipped to +- this."""
-    entropy_weight: Annotated[float, Number("[0, inf)"), ReadBy("sac", "redq", "tqc")] = 1.0
+    entropy_weight: NotNegative = 1.0
     """Weight of the policy's entropy in its values, before the learner has changed it."""
-    entropy_target: Annotated[float, Number("(-inf, inf)"), ReadBy("sac", "redq", "tqc")] = -1.0
+    entropy_target: Annotated[float, Number("(-inf, inf)")] = -1.0
     """Entropy that this weight is changed for, for each number of an action."""
     hindsight_reward: Share = 1.0
     """Factor of the reward of a transition whose goal was replaced: below 1, hindsight counts as a better outcome (ARCHER)."""

@@ -16,10 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import lookup
+from mjx_dher import components, lookup
 from mjx_dher.context import View, pick
 from mjx_dher.replay import ReplayState
-from mjx_dher.spec import GENERATORS
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 # generator(key, obs with leading [N], ring, view) -> goals [N, G]
@@ -49,10 +48,7 @@ def make(name: str | Generator | GenerateFn) -> Generator:
     Raises:
       ValueError: no such generator, module or attribute, or no function of (key, obs, ring, view).
     """
-    value: Any = name
-    if isinstance(name, str):
-        lookup.check_name("generator", name, GENERATORS, own=True)
-        value = lookup.load_import_path("generator", GENERATORS.get(name, name))
+    value = components.load("generator", name)
     generator = value if isinstance(value, Generator) else Generator(value)
     lookup.check_function("generator", generator.generate, ("key", "obs", "ring", "view"))
     return generator

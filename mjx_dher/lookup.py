@@ -13,7 +13,7 @@ import os
 import pkgutil
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +76,6 @@ def module_file(value: str) -> Path | None:
     except Exception:  # a package above it cannot be imported, as whoever imports the module will be told
         return None
     return Path(spec.origin) if spec is not None and spec.origin and Path(spec.origin).is_file() else None
-
-
-def resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:
-    """Returns the function that `value` is, or that it names: by a key of `known`, or as "module:attribute".
-
-    Raises:
-      ValueError: no such name, module or attribute, or something that cannot be called with `parameters`.
-    """
-    if not isinstance(value, str):
-        return check_function(field, value, parameters)
-    check_name(field, value, known, own=True)
-    return check_function(field, load_import_path(field, known.get(value, value)), parameters)
 
 
 def check_function(field: str, function: Any, parameters: Sequence[str]) -> Callable[..., Any]:

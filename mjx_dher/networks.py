@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from mjx_dher import lookup
-from mjx_dher.spec import NETWORKS
+from mjx_dher import components
 from mjx_dher.types import Array, PRNGKey, Sizes
 
 
@@ -139,7 +138,7 @@ def make(name: str | NetworksFn) -> NetworksFn:
     Raises:
       ValueError: no such networks, or no function of (action_size, hidden_sizes, dtype).
     """
-    return lookup.resolve("networks", name, NETWORKS, _PARAMETERS)
+    return components.load("networks", name, *_PARAMETERS)
 
 
 def check_heads(make_networks: NetworksFn, learner: str) -> None:

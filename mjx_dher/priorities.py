@@ -17,11 +17,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import lookup, replay
+from mjx_dher import components, lookup, replay
 from mjx_dher.config import HParams
 from mjx_dher.context import View, pick
 from mjx_dher.replay import ReplayState, Sample
-from mjx_dher.spec import PRIORITIES
 from mjx_dher.types import Array, Batch, Episode, PRNGKey, RewardFn
 
 CANDIDATES = 4  # transitions that are drawn for each that a priority of transitions chooses
@@ -64,10 +63,7 @@ def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
       ValueError: no such priority, module or attribute, or neither a function of (episode, compute_reward, hparams) nor a
         `Priority`.
     """
-    value: Any = name
-    if isinstance(name, str):
-        lookup.check_name("priority", name, PRIORITIES, own=True)
-        value = lookup.load_import_path("priority", PRIORITIES.get(name, name))
+    value = components.load("priority", name)
     if not isinstance(value, Priority):
         return lookup.check_function("priority", value, ("episode", "compute_reward", "hparams"))
     given = {

@@ -20,12 +20,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import distance_normalization, lookup
+from mjx_dher import components, distance_normalization, lookup
 from mjx_dher.config import HParams
 from mjx_dher.context import pick
 from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.scores import LearnedMetric, ScoreFn, make_metric, score_of
-from mjx_dher.spec import SAMPLERS, SAMPLERS_ELSEWHERE, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from mjx_dher.types import Array, Episode, PRNGKey
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; of a sampler with a score, (..., hparams, score [T+1])
@@ -191,12 +190,7 @@ def softmax(relative: Array, temperature: Array | float) -> Array:
     return -(relative - 1.0) / temperature
 
 
-_PLAIN: dict[str, Sampler] = {
-    "random": Sampler(episode, cross_episode=True),
-    "episode": Sampler(episode),
-    "future": Sampler(future),
-    "final": Sampler(final),
-}
+random = Sampler(episode, cross_episode=True)
 
 
 def make(
@@ -208,8 +202,8 @@ def make(
     """Makes the sampler called `name`.
 
     Args:
-      name: one of `spec.SAMPLERS`, "module:attribute", a `Sampler`, or a function like `Sampler.log_weights`. `random` chooses
-        as `episode` does, but from a random episode of the ring.
+      name: a built-in name, "module:attribute", a `Sampler`, or a function like `Sampler.log_weights`. `random` chooses as
+        `episode` does, but from a random episode of the ring.
       kernel: for `weighted`: linear, inverse, softmax, "module:attribute", or a function (relative distance [T+1],
         temperature []) -> log weight [T+1].
       metric: for closest, epsilon_closest and weighted: position, "module:attribute", or a function (achieved [T+1, G],
@@ -223,21 +217,15 @@ def make(
     """
     if not isinstance(name, str):
         return _to_sampler(name)
-    lookup.check_name("sampler", name, SAMPLERS, own=True)
-    kernel = lookup.resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
+    sampler = components.load("sampler", name)
+    kernel = components.load("weight_kernel", kernel, "relative", "temperature")
+    normalization = components.load("weight_normalization", normalization, "distance", "candidates", "scale")
     distance = make_metric(metric)
-    parameters = ("distance", "candidates", "scale")
-    normalization = lookup.resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, parameters)
-    by_distance: dict[str, LogWeightsFn] = {
-        "closest": closest,
-        "epsilon_closest": epsilon_closest,
-        "weighted": functools.partial(weighted, kernel=kernel, normalization=normalization),
-    }
-    if name in by_distance:
-        return _by_metric(by_distance[name], distance)
-    if name in _PLAIN:
-        return _PLAIN[name]
-    return _to_sampler(lookup.load_import_path("sampler", SAMPLERS_ELSEWHERE.get(name, name)))
+    if sampler is weighted:
+        sampler = functools.partial(weighted, kernel=kernel, normalization=normalization)
+    elif sampler not in (closest, epsilon_closest):
+        return _to_sampler(sampler)
+    return _by_metric(sampler, distance)
 
 
 def _by_metric(log_weights: LogWeightsFn, metric: MetricFn | LearnedMetric) -> Sampler:

@@ -13,9 +13,8 @@ from typing import Any
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import lookup
+from mjx_dher import components, lookup
 from mjx_dher.context import View, of_each_episode
-from mjx_dher.spec import METRICS
 from mjx_dher.types import Array, Episode
 
 # score(episode, view) -> [T+1]
@@ -35,10 +34,7 @@ def make_metric(metric: Any) -> Any:
     Raises:
       ValueError: no such metric, module or attribute, or something that is none.
     """
-    value = metric
-    if isinstance(metric, str):
-        lookup.check_name("metric", metric, METRICS, own=True)
-        value = lookup.load_import_path("metric", METRICS.get(metric, metric))
+    value = components.load("metric", metric)
     if isinstance(value, LearnedMetric):
         lookup.check_function("metric: score", value.score, ("episode", "view"))
         return value

@@ -1,91 +1,51 @@
-"""A run's description: its parts by name, its sizes, its numbers and its seed. Loads neither JAX nor MuJoCo."""
+"""A run's description: components by name, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
+from typing_extensions import Doc
+
 from mjx_dher import config as config_lib
-from mjx_dher.config import Config, HParams, ReadBy
+from mjx_dher.components import COMPONENTS, help_text
+from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name, is_import_path
 
 Engine = Literal["auto", "native", "jax", "warp"]
 ENGINES = get_args(Engine)
-SAMPLERS = ("random", "episode", "future", "final", "closest", "epsilon_closest", "weighted", "next_future")
-SAMPLERS_ELSEWHERE = {"next_future": "mjx_dher.contrib.goals:next_future"}  # the others are in mjx_dher.samplers
-# Parts by name, and where they are; an own one is named by its place alone.
-WEIGHT_KERNELS = {name: f"mjx_dher.samplers:{name}" for name in ("linear", "inverse", "softmax")}
-WEIGHT_NORMALIZATIONS = {
-    name: f"mjx_dher.distance_normalization:{function}"
-    for name, function in {
-        "mean": "by_mean",
-        "sum": "by_sum",
-        "max": "by_max",
-        "minmax": "by_range",
-        "none": "by_scale",
-        "far": "mirrored",
-    }.items()
-}
-METRICS = {
-    "position": "mjx_dher.samplers:position",
-    **{
-        name: f"mjx_dher.contrib.metrics:{name}"
-        for name in ("velocity", "resting_point", "resting_point_rough", "time_to_goal")
-    },
-}
-# Those that weigh whole episodes, and those that choose among transitions; lanes of a program can differ within either.
-EPISODE_PRIORITIES = {
-    "eventful": "mjx_dher.priorities:eventful",
-    **{name: f"mjx_dher.contrib.episodes:{name}" for name in ("energy", "max_entropy", "diversity")},
-}
-TRANSITION_PRIORITIES = {
-    name: f"mjx_dher.contrib.transitions:{name}" for name in ("dpp", "td_error", "curriculum", "not_misleading")
-}
-PRIORITIES = {**EPISODE_PRIORITIES, **TRANSITION_PRIORITIES}
-GENERATORS = {"reset": "mjx_dher.generators:reset", "hgg": "mjx_dher.contrib.goals:hgg"}
-LEARNERS = {
-    **{name: f"mjx_dher.learners.{name}:make" for name in ("ddpg", "td3", "sac", "redq", "tqc")},
-    "dtqc": "mjx_dher.learners.tqc:make_deterministic",
-}
 Argument = bool | int | float | str  # of an environment's constructor
-NETWORKS = {name: f"mjx_dher.networks:{name}" for name in ("mlp", "layer_norm", "fan_in")}
+
+
+def _doc(field: str, text: str) -> Doc:
+    return Doc(help_text(field, text))
 
 
 @dataclasses.dataclass(frozen=True)
 class RunSpec:
-    """Everything that decides what a run computes. Each part is a name, or an own one as module:attribute."""
+    """Everything that decides what a run computes. Components are built-in names or module:attribute."""
 
-    env: str = "push"
-    """Environment: push, pick_and_place, slide or reach, or module:attribute."""
-    engine: Engine = "auto"
-    """Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto, which picks."""
-    env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment, NAME=VALUE each: reward_type=dense distance_threshold=0.03 episode_length=80."""
-    sampler: str = "future"
-    """Sampler of hindsight goals: random, episode, future, final, closest, epsilon_closest, weighted or next_future, or
-    module:attribute."""
-    weight_kernel: Annotated[str, ReadBy("weighted")] = "linear"
-    """Fall of the weights with distance, for the sampler weighted: linear, inverse or softmax, or module:attribute."""
-    weight_normalization: Annotated[str, ReadBy("weighted")] = "mean"
-    """Normalization of distances, for the sampler weighted: mean, sum, max, minmax, none (by weight_scale, in metres) or far
-    (the weights rise with distance), or module:attribute."""
-    metric: Annotated[str, ReadBy("closest", "epsilon_closest", "weighted")] = "position"
-    """Distance between an achieved and a desired goal that closest, epsilon_closest and weighted go by: position, velocity,
-    resting_point, resting_point_rough or time_to_goal, or module:attribute."""
-    priority: str = "eventful"
-    """Priority in replay, for priority_fraction of each batch: of episodes eventful, energy, max_entropy or diversity, of
-    transitions dpp, td_error, curriculum or not_misleading, or module:attribute."""
-    generator: str = "reset"
-    """Generator of the goals that training episodes are played for: reset (the environment's own), hgg, or
-    module:attribute."""
-    learner: str = "ddpg"
-    """Learner: ddpg, td3, sac, redq, tqc, dtqc (tqc with a deterministic actor), or module:attribute."""
-    networks: str = "mlp"
-    """Networks of the learner: mlp, layer_norm (in its critics), fan_in (mlp that begins as PyTorch's), or
-    module:attribute."""
+    env: Annotated[str, _doc("env", "Environment")] = "push"
+    engine: Annotated[
+        Engine, Doc("Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto, which picks.")
+    ] = "auto"
+    env_kwargs: Annotated[
+        tuple[str, ...],
+        Doc("Arguments of the environment, NAME=VALUE each: reward_type=dense distance_threshold=0.03 episode_length=80."),
+    ] = ()
+    sampler: Annotated[str, _doc("sampler", "Sampler of hindsight goals")] = "future"
+    weight_kernel: Annotated[str, _doc("weight_kernel", "Fall of the weights with distance")] = "linear"
+    weight_normalization: Annotated[str, _doc("weight_normalization", "Normalization of distances")] = "mean"
+    metric: Annotated[str, _doc("metric", "Distance between an achieved and a desired goal")] = "position"
+    priority: Annotated[str, _doc("priority", "Priority of episodes or transitions, for priority_fraction of each batch")] = (
+        "eventful"
+    )
+    generator: Annotated[str, _doc("generator", "Generator of the goals of training episodes")] = "reset"
+    learner: Annotated[str, _doc("learner", "Learner")] = "ddpg"
+    networks: Annotated[str, _doc("networks", "Networks of the learner")] = "mlp"
     seed: int = 0
     """Random seed."""
     config: Config = dataclasses.field(default_factory=Config)
@@ -94,7 +54,7 @@ class RunSpec:
     """Numbers of the algorithm."""
 
     def __post_init__(self) -> None:
-        with contextlib.suppress(ValueError, TypeError):  # `validate` says what is wrong
+        with contextlib.suppress(ValueError, TypeError):  # `validate` reports the problem
             object.__setattr__(self, "env_kwargs", to_texts(to_arguments(self.env_kwargs)))
 
     @property
@@ -109,30 +69,27 @@ class RunSpec:
 
     @property
     def program(self) -> RunSpec:
-        """Description of the compiled program that the run can share: all that its lanes must agree in."""
-        alike = next((own[0] for own in map(list, _PRIORITIES_OF_LANES) if self.priority in own), self.priority)
-        shared = dataclasses.replace(self, sampler="future", weight_kernel="linear", metric="position", seed=0)
-        return dataclasses.replace(shared, weight_normalization="mean", priority=alike, generator="reset", hparams=HParams())
+        """Description of the compiled program that the run can share: the settings in which all its lanes must agree."""
+        table, default = COMPONENTS["priority"], RunSpec(env=self.env)
+        group = table[self.priority].group if self.priority in table else None
+        alike = next((name for name, component in table.items() if component.group == group), self.priority)
+        return dataclasses.replace(self, priority=alike, **{name: getattr(default, name) for name in LANE_FIELDS})
 
 
-_PRIORITIES_OF_LANES = (EPISODE_PRIORITIES, TRANSITION_PRIORITIES)
-PARTS = {  # by field, the names that are built in; each field takes module:attribute, too
-    "sampler": SAMPLERS,
-    "weight_kernel": WEIGHT_KERNELS,
-    "weight_normalization": WEIGHT_NORMALIZATIONS,
-    "metric": METRICS,
-    "priority": PRIORITIES,
-    "generator": GENERATORS,
-    "learner": LEARNERS,
-    "networks": NETWORKS,
-}
+# Fields in which runs that share a compiled program can differ. Priorities can differ within a group.
+LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "generator", "seed", "hparams")
+
+
+def custom_components(spec: RunSpec) -> dict[str, str]:
+    """Custom components of a run, module:attribute by field."""
+    return {field: getattr(spec, field) for field in COMPONENTS if is_import_path(getattr(spec, field))}
 
 
 def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
-    """Returns the arguments that "NAME=VALUE" texts stand for; a value is true, false, a number, or else a text.
+    """Parses "NAME=VALUE" texts; a value is true, false, a number, or else a text.
 
     Raises:
-      ValueError: one is no such text, a number is not finite, or a name comes twice or is that of an option of its own.
+      ValueError: not such a text, a number that is not finite, or a name that is repeated or has its own option.
     """
     arguments: dict[str, Argument] = {}
     for text in texts:
@@ -150,7 +107,7 @@ def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
 
 
 def to_texts(arguments: Mapping[str, Argument]) -> tuple[str, ...]:
-    """Returns arguments as texts "NAME=VALUE" in the order of their names, the inverse of `to_arguments`."""
+    """Formats arguments as texts "NAME=VALUE" in the order of their names, the inverse of `to_arguments`."""
     return tuple(f"{name}={str(x).lower() if isinstance(x, bool) else x}" for name, x in sorted(arguments.items()))
 
 
@@ -163,57 +120,32 @@ def _to_argument(value: str) -> Argument:
     return value
 
 
-def own_parts(spec: RunSpec) -> list[str]:
-    """Returns the fields of a run that name parts of the user's own, as module:attribute."""
-    return [field for field in ("env", *PARTS) if is_import_path(getattr(spec, field))]
-
-
-def read_by() -> dict[str, ReadBy]:
-    """Returns the samplers or learners that read a setting, for those that not every run reads."""
-    return {name: parts for owner in (RunSpec, Config, HParams) for name, parts in config_lib.metadata(owner, ReadBy).items()}
-
-
-def reads(sampler: str, learner: str, field: str, normalization: str = "none") -> bool:
-    """Returns whether a setting makes a difference to runs with this sampler, learner and `weight_normalization`.
-
-    A sampler, learner or normalization of one's own may read any setting that some sampler, learner or normalization reads.
-    """
-    if field == "weight_scale" and sampler in SAMPLERS and normalization in WEIGHT_NORMALIZATIONS and normalization != "none":
-        return False
-    parts = read_by().get(field)
-    if parts is None:
-        return True
-    part, known = (sampler, SAMPLERS) if parts[0] in SAMPLERS else (learner, LEARNERS)
-    return part in parts or part not in known
-
-
 def validate_values(spec: RunSpec) -> None:
-    """Refuses a description with a value that no run has, whatever its environment and its parts are.
+    """Checks each value alone, whatever the environment and the components are.
 
     Raises:
-      ValueError: names every field at fault, its value and what is allowed.
+      ValueError: names every invalid field, its value and what is allowed.
     """
-    names = [(_check_text, name, getattr(spec, name)) for name in ("env", *PARTS)]
-    _check_all(spec, [*names, (to_arguments, spec.env_kwargs), (config_lib.validate, spec.config, spec.hparams, 1)])
+    _raise_all(_problems(spec, [(_check_text, name, getattr(spec, name)) for name in COMPONENTS], 1))
 
 
-def validate(spec: RunSpec, env_names: tuple[str, ...], episode_length: int | None = None) -> None:
-    """Refuses a description that cannot run, without importing a part.
+def validate(spec: RunSpec, episode_length: int | None = None) -> None:
+    """Checks that a run is possible, without importing a component.
 
     Args:
       spec: the run.
-      env_names: the environments known by name.
-      episode_length: of the environment, where it is known; else that of the tasks here, and 1 for an environment of the
-        user's own, of which nothing is assumed.
+      episode_length: of the environment, if it exists already; its name is not checked then. By default 50 or the argument of
+        that name, and 1 for a custom environment.
 
     Raises:
-      ValueError: names every field at fault, its value and what is allowed.
+      ValueError: names every invalid field, its value and what is allowed.
     """
+    names = [(check_name, field, getattr(spec, field), table, True) for field, table in COMPONENTS.items()]
     if episode_length is None:
         episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
-    names = [(check_name, field, getattr(spec, field), known, True) for field, known in (("env", env_names), *PARTS.items())]
-    checks = [(to_arguments, spec.env_kwargs), (config_lib.validate, spec.config, spec.hparams, episode_length)]
-    _check_all(spec, [*names, *checks])
+    else:
+        del names[0]
+    _raise_all(_problems(spec, names, episode_length))
 
 
 def _episode_length(spec: RunSpec) -> Any:
@@ -223,17 +155,21 @@ def _episode_length(spec: RunSpec) -> Any:
         return 50
 
 
-def _check_all(spec: RunSpec, checks: Sequence[tuple[Any, ...]]) -> None:
-    """Makes the calls in `checks`, and those of what any spec must be; raises ValueError with all that they found."""
-    problems: list[str] = []
-    for check, *arguments in (*checks, (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]")):
+def _problems(spec: RunSpec, names: Sequence[tuple[Any, ...]], episode_length: Any) -> Iterator[str]:
+    """Yields the errors of the calls in `names`, and of the checks that every run must pass."""
+    sizes = (config_lib.validate, spec.config, spec.hparams, episode_length)
+    seed = (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]")
+    for check, *arguments in (*names, (to_arguments, spec.env_kwargs), sizes, seed):
         try:
             check(*arguments)
         except ValueError as error:
-            problems.append(str(error))
-    problems += config_lib.choice_problems(spec)
-    if problems:
-        raise ValueError("\n".join(problems))
+            yield str(error)
+    yield from config_lib.choice_problems(spec)
+
+
+def _raise_all(problems: Iterator[str]) -> None:
+    if found := list(problems):
+        raise ValueError("\n".join(found))
 
 
 def _check_text(field: str, value: Any) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher import envs
+from mjx_dher.components import COMPONENTS
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.spec import GENERATORS, PRIORITIES, SAMPLERS, validate
+from mjx_dher.spec import validate
 
 
 @pytest.fixture
@@ -50,14 +50,14 @@ def test_every_arm_is_a_run_of_every_task_and_learner(arms):
         for task in arms.TASKS:
             specs = {arm.name: arms.spec_of(learner, task, arm) for arm in arms.ARMS}
             for spec in specs.values():
-                validate(spec, envs.list_envs())
+                validate(spec)
             assert len(set(specs.values())) == len(arms.ARMS) >= 13
             assert all(spec.config.replay_size == spec.config.total_steps for spec in specs.values())
             for group in arms.BAKEOFF.groups:  # one program each
                 assert len({specs[arm.name].program for arm in arms.ARMS if arm.group == group}) == 1
     built_in = {arm.parts.get("priority") for arm in arms.ARMS} | {arm.parts.get("generator") for arm in arms.ARMS}
-    assert {*PRIORITIES, *GENERATORS} - {"eventful", "reset"} <= built_in
-    assert "next_future" in SAMPLERS
+    assert {*COMPONENTS["priority"], *COMPONENTS["generator"]} - {"eventful", "reset"} <= built_in
+    assert "next_future" in COMPONENTS["sampler"]
 
 
 def test_the_plan_fits_into_two_hours(arms):
@@ -74,7 +74,7 @@ def changes(spec, base):
 def test_every_arm_of_the_ablation_leaves_out_what_its_name_says(ablation, task):
     specs = {arm.name: ablation.spec_of("gpu", task, arm) for arm in ablation.ARMS}
     for spec in specs.values():
-        validate(spec, envs.list_envs())
+        validate(spec)
     told = {name: changes(spec, specs["preset"]) for name, spec in specs.items()}
     slide = task == "slide"
     with_entropy = {"learner": "tqc", "action_l2": 0.0, "entropy_weight": 0.1}
@@ -97,7 +97,7 @@ def test_every_arm_of_the_ablation_leaves_out_what_its_name_says(ablation, task)
 
 def test_every_arm_of_the_ablation_is_a_toy_too(ablation):
     for arm in ablation.ARMS:
-        validate(ablation.spec_of("gpu", "reach", arm, True), envs.list_envs())
+        validate(ablation.spec_of("gpu", "reach", arm, True))
 
 
 def scores(report, areas, first=0):

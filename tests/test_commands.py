@@ -11,10 +11,11 @@ import pytest
 from conftest import EXAMPLES, ROOT
 
 import mjx_dher
-from mjx_dher import RunSpec, cli, envs, presets, spec
+from mjx_dher import RunSpec, cli, presets, spec
 from mjx_dher.cli import completion, listing
 from mjx_dher.cli import train as cli_train
 from mjx_dher.cli.commands import COMMANDS
+from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import fingerprint, run_folder
 
@@ -48,28 +49,16 @@ def test_the_version_is_the_package_s(capsys):
 
 
 def test_list_names_all_that_there_is(capsys):
-    tables = {
-        "tasks": envs.list_envs(),
-        "engines": spec.ENGINES,
-        "presets": ("auto", *presets.PRESETS),
-        "samplers": spec.SAMPLERS,
-        "kernels": spec.WEIGHT_KERNELS,
-        "normalizations": spec.WEIGHT_NORMALIZATIONS,
-        "metrics": spec.METRICS,
-        "priorities": spec.PRIORITIES,
-        "generators": spec.GENERATORS,
-        "learners": spec.LEARNERS,
-        "networks": spec.NETWORKS,
-        "policies": bundled.names(),
-    }
-    assert {kind: set(lines) for kind, lines in listing.KINDS.items()} == {kind: set(names) for kind, names in tables.items()}
-    assert set(listing.OPTIONS) == set(tables)
+    assert set(listing.FIELDS.values()) == set(COMPONENTS)
+    assert tuple(listing.ENGINES) == spec.ENGINES
+    assert tuple(listing.PRESETS) == ("auto", *presets.PRESETS)
     assert cli.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(tables) + sum(map(len, tables.values()))
-    assert "samplers (--sampler)" in lines
+    number = sum(map(len, [*COMPONENTS.values(), listing.ENGINES, listing.PRESETS, bundled.names()]))
+    assert len(lines) == len(listing.KINDS) + number
+    assert "kernels (--weight-kernel)" in lines
     assert cli.main(["list", "tasks", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"tasks": listing.KINDS["tasks"]}
+    assert json.loads(capsys.readouterr().out) == {"tasks": {name: row.line for name, row in COMPONENTS["env"].items()}}
     assert cli.main(["list", "sampler"]) == 2
     assert "error: kind must be one of tasks, engines" in capsys.readouterr().err
 

@@ -3,9 +3,11 @@ import dataclasses
 
 import pytest
 
-from mjx_dher import config, envs, presets, spec
+from mjx_dher import components, config, presets, spec
 from mjx_dher.cli import train as cli_train
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import Config, HParams, Number
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
 
 
@@ -49,7 +51,7 @@ def test_each_reading_of_the_paper_can_be_changed():
 @pytest.mark.parametrize("name", presets.PRESETS)
 @pytest.mark.parametrize("env", ["push", "pick_and_place", "slide", "reach"])
 def test_presets_are_valid(name, env):
-    spec.validate(presets.preset(name, env), envs.list_envs())
+    spec.validate(presets.preset(name, env))
 
 
 def test_a_preset_has_a_priority_of_its_own_where_its_learner_is_taken():
@@ -96,7 +98,7 @@ BAD_PARTS = [
 @pytest.mark.parametrize(("change", "message"), BAD_PARTS)
 def test_a_run_that_cannot_be_is_refused_by_name_value_and_what_is_allowed(change, message):
     with pytest.raises(ValueError, match=message):
-        spec.validate(dataclasses.replace(RunSpec(), **change), envs.list_envs())
+        spec.validate(dataclasses.replace(RunSpec(), **change))
 
 
 BAD_CONFIG = [
@@ -177,29 +179,32 @@ def test_every_field_s_extremes_are_run_or_refused_by_its_name(owner, name, valu
         config.validate(settings[Config], settings[HParams], 50)
 
 
-def test_what_a_sampler_or_a_learner_reads():
-    assert spec.reads("weighted", "ddpg", "temperature")
-    assert not spec.reads("future", "ddpg", "temperature")
-    assert spec.reads("epsilon_closest", "ddpg", "metric")
-    assert not spec.reads("epsilon_closest", "ddpg", "weight_kernel")
-    assert spec.reads("future", "ddpg", "gamma")
-    assert spec.reads("mine:sampler", "ddpg", "temperature")  # an own sampler may read any
-    assert spec.reads("future", "tqc", "num_quantiles")
-    assert not spec.reads("future", "sac", "num_quantiles")
-    assert not spec.reads("mine:sampler", "sac", "noise_std")
-    assert spec.reads("future", "mine:learner", "noise_std")
-    assert not spec.reads("future", "mine:learner", "temperature")
-    assert not spec.reads("future", "ddpg", "weight_normalization")
-    assert spec.reads("weighted", "ddpg", "weight_scale", "none")
-    assert not spec.reads("weighted", "ddpg", "weight_scale", "mean")
-    assert not spec.reads("future", "ddpg", "weight_scale", "none")
-    assert spec.reads("weighted", "ddpg", "weight_scale", "mine:own")
-    assert spec.reads("mine:sampler", "ddpg", "weight_scale", "mean")
+@pytest.mark.parametrize(
+    ("changes", "read", "unread"),
+    [
+        ({"sampler": "weighted"}, "temperature weight_kernel gamma", "weight_scale epsilon"),
+        ({"sampler": "weighted", "weight_normalization": "none"}, "weight_scale", "epsilon"),
+        ({"sampler": "weighted", "weight_normalization": "mine:own"}, "weight_scale", "epsilon"),
+        ({"sampler": "epsilon_closest"}, "metric epsilon", "weight_kernel"),
+        ({"sampler": "mine:sampler", "learner": "sac"}, "temperature weight_scale epsilon", "noise_std"),  # it may read any
+        ({"weight_normalization": "none"}, "gamma noise_std", "temperature weight_normalization weight_scale num_critics"),
+        ({"weight_normalization": "mine:own"}, "gamma", "weight_scale"),
+        ({"learner": "tqc"}, "num_quantiles", "noise_std"),
+        ({"learner": "mine:learner"}, "noise_std num_quantiles", "temperature"),
+    ],
+)
+def test_a_run_reads_the_settings_of_its_components(changes, read, unread):
+    settings = fingerprint.settings(RunSpec(**changes))
+    assert [name for name in read.split() if not components.reads(settings, name)] == []
+    assert [name for name in unread.split() if components.reads(settings, name)] == []
 
 
-def test_each_setting_is_read_by_parts_of_one_kind_that_exist():
-    for name, parts in spec.read_by().items():
-        assert set(parts) <= set(spec.SAMPLERS) or set(parts) <= set(spec.LEARNERS), name
+def test_each_component_is_there_and_reads_settings_that_there_are():
+    settings = fingerprint.settings(RunSpec())
+    for field, table in COMPONENTS.items():
+        for name, row in table.items():
+            assert components.load(field, name) is components.load(field, row.path)
+            assert set(row.reads) <= set(settings)
 
 
 def test_all_problems_are_named_at_once():

@@ -9,6 +9,7 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, generators, learners, make_train, priorities, replay, samplers, testing
+from mjx_dher.components import COMPONENTS
 from mjx_dher.context import View
 from mjx_dher.contrib import goals, metrics
 from mjx_dher.priorities import Priority
@@ -16,7 +17,6 @@ from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.program.loop import state_template
 from mjx_dher.scores import LearnedMetric
-from mjx_dher.spec import GENERATORS, METRICS, PRIORITIES, SAMPLERS
 from mjx_dher.testing import PartError
 from point_mass import PointMass
 
@@ -118,7 +118,7 @@ def test_what_is_half_a_priority_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             priorities.make(wrong)
-    ring = testing.views.ring_of(testing.trial.random_episodes(ENV))
+    ring = testing.methods.ring_of(testing.trial.random_episodes(ENV))
     with pytest.raises(ValueError, match=r"weights \[E\] = \[32\]; this one gives \[2\]"):
         priorities.renewed(Priority(renew=lambda ring, view: jnp.ones(2)), ring, VIEW)
     nan = priorities.renewed(Priority(renew=lambda ring, view: jnp.full(32, jnp.nan)), ring, VIEW)
@@ -195,13 +195,13 @@ def test_a_task_that_changes_more_than_the_goal_is_named():
 def test_every_part_by_name_shares_a_program_with_its_kind():
     base = RunSpec()
     shared = {
-        **{("sampler", name): base for name in SAMPLERS},
-        **{("metric", name): base for name in METRICS},
-        **{("generator", name): base for name in GENERATORS},
+        **{("sampler", name): base for name in COMPONENTS["sampler"]},
+        **{("metric", name): base for name in COMPONENTS["metric"]},
+        **{("generator", name): base for name in COMPONENTS["generator"]},
     }
     for (field, name), other in shared.items():
         assert dataclasses.replace(base, **{field: name}).program == other.program, name
-    kinds = {dataclasses.replace(base, priority=name).program for name in PRIORITIES}
+    kinds = {dataclasses.replace(base, priority=name).program for name in COMPONENTS["priority"]}
     assert len(kinds) == 2
     assert dataclasses.replace(base, priority="my:own").program not in kinds
 
@@ -209,8 +209,8 @@ def test_every_part_by_name_shares_a_program_with_its_kind():
 def test_settings_that_are_new_change_no_name_of_a_trial():
     """As version 0.1.0 had it; tests/test_identity.py has more of them."""
     assert not {"generator", "hindsight_reward"} & set(fingerprint.identity(RunSpec(), "native", {}))
-    named = {fingerprint.trial_name(RunSpec(generator=name)) for name in GENERATORS}
-    assert len(named) == len(GENERATORS)
+    named = {fingerprint.trial_name(RunSpec(generator=name)) for name in COMPONENTS["generator"]}
+    assert len(named) == len(COMPONENTS["generator"])
     assert fingerprint.trial_name(RunSpec(hparams=HParams(hindsight_reward=0.5))) != fingerprint.trial_name(RunSpec())
 
 

@@ -18,6 +18,7 @@ from gymnasium.vector import AutoresetMode
 import mjx_dher.gym
 import mjx_dher.tools.render
 from mjx_dher import envs
+from mjx_dher.components import COMPONENTS, Component
 from mjx_dher.envs.base import GoalEnv
 from mjx_dher.envs.engines import resolve_engine
 from probes import Explodes
@@ -48,7 +49,7 @@ class Probe(Explodes, GoalEnv):
 @pytest.fixture(scope="module", autouse=True)
 def registered():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(envs, "_REGISTRY", envs._REGISTRY | {"probe": Probe})
+        patch.setitem(COMPONENTS["env"], "probe", Component("test_gym:Probe", ""))
         yield
 
 

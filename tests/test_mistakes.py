@@ -10,9 +10,9 @@ import pytest
 
 import mjx_dher
 from mjx_dher import Config, HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
+from mjx_dher.components import COMPONENTS
 from mjx_dher.rollout import rollout
 from mjx_dher.runs import driver
-from mjx_dher.spec import WEIGHT_NORMALIZATIONS
 from mjx_dher.testing import (
     check_env,
     check_kernel,
@@ -58,11 +58,11 @@ def test_each_mistake_is_named_by_its_check(kind, name):
 
 
 def test_what_is_right_passes(capsys):
-    for name in (*samplers.SAMPLERS, soon):
+    for name in (*COMPONENTS["sampler"], soon):
         check_sampler(name, ENV)
     for kernel in ("linear", "inverse", "softmax"):
         check_kernel(kernel)
-    for normalization in WEIGHT_NORMALIZATIONS:
+    for normalization in COMPONENTS["weight_normalization"]:
         check_normalization(normalization)
     assert "0.0952 to 1.9 for distances" in check_normalization("mean")
     check_metric("position", ENV)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mjx_dher import priorities, relabel, replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
-from mjx_dher.spec import PRIORITIES
 from mjx_dher.types import Episode
 from probes import Clock
 
@@ -78,7 +78,7 @@ def test_a_weight_of_the_wrong_shape_is_refused(gives, priority):
 
 
 def test_make_takes_a_name_a_place_or_a_function():
-    assert all(priorities.make(name) is priorities.make(place) for name, place in PRIORITIES.items())
+    assert all(priorities.make(name) is priorities.make(row.path) for name, row in COMPONENTS["priority"].items())
     assert priorities.make("eventful") is priorities.eventful
     assert priorities.make("mjx_dher.priorities:eventful") is priorities.eventful
     assert priorities.make(distance) is distance
@@ -89,7 +89,7 @@ def test_make_takes_a_name_a_place_or_a_function():
     [
         ("eventfull", ["priority", "'eventfull'", "did you mean 'eventful'", "module:attribute"]),
         ("mjx_dher.priorities:evntful", ["priority", "'mjx_dher.priorities:evntful'", "'eventful'"]),
-        ("mjx_dher.spec:PRIORITIES", ["priority", "(episode, compute_reward, hparams)", "'eventful'"]),
+        ("mjx_dher.components:COMPONENTS", ["priority", "(episode, compute_reward, hparams)", "'eventful'"]),
         (lambda episode: 1.0, ["priority", "(episode, compute_reward, hparams)"]),
     ],
 )

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import envs, generators, make_train, priorities, replay, samplers, spec
+from mjx_dher import envs, generators, make_train, priorities, replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.learners import common
 from mjx_dher.runs.program.loop import state_template
 from mjx_dher.runs.program.program import Lane
-from mjx_dher.spec import GENERATORS, METRICS, SAMPLERS, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from point_mass import PointMass
 from probes import Explodes
 
@@ -60,23 +60,27 @@ def test_an_epoch_with_a_priority_of_one_s_own():
 
 
 def test_an_epoch_with_every_sampler_and_kernel_as_a_sweep_has_them():
-    every = [*(samplers.make(name) for name in SAMPLERS), *(samplers.make("weighted", k) for k in WEIGHT_KERNELS)]
-    every += [samplers.make("weighted", normalization=n) for n in WEIGHT_NORMALIZATIONS]
+    every = [
+        *(samplers.make(name) for name in COMPONENTS["sampler"]),
+        *(samplers.make("weighted", k) for k in COMPONENTS["weight_kernel"]),
+    ]
+    every += [samplers.make("weighted", normalization=n) for n in COMPONENTS["weight_normalization"]]
     program = make_train(PointMass(), SMALL, sampler=samplers.one_of(every))
     lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)
     jax.eval_shape(jax.vmap(program.epoch), states)
 
 
-@pytest.mark.parametrize("priorities_", [spec.EPISODE_PRIORITIES, spec.TRANSITION_PRIORITIES], ids=["episodes", "transitions"])
-def test_an_epoch_with_every_priority_and_generator_as_a_sweep_has_them(priorities_):
-    weighted = [samplers.make("weighted", metric=name) for name in METRICS]
+@pytest.mark.parametrize("group", ["episodes", "transitions"])
+def test_an_epoch_with_every_priority_and_generator_as_a_sweep_has_them(group):
+    names = [name for name, row in COMPONENTS["priority"].items() if row.group == group]
+    weighted = [samplers.make("weighted", metric=name) for name in COMPONENTS["metric"]]
     program = make_train(
         PointMass(),
         SMALL,
         sampler=samplers.one_of([samplers.make("random"), *weighted]),
-        priority=priorities.one_of([priorities.make(name) for name in priorities_]),
-        generator=generators.one_of([generators.make(name) for name in GENERATORS]),
+        priority=priorities.one_of([priorities.make(name) for name in names]),
+        generator=generators.one_of([generators.make(name) for name in COMPONENTS["generator"]]),
     )
     lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)

@@ -9,8 +9,8 @@ import pytest
 from test_samplers import ACHIEVED, DESIRED, HP, table
 
 from mjx_dher import samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
-from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS
 from mjx_dher.testing import check_normalization
 
 # The candidates after step 1 are at 1, 3 and 2. At a scale of 2 m, x = d / 2 is 0.5, 1.5 and 1.
@@ -44,8 +44,8 @@ def test_readings(normalization, kernel, temperature, weights):
     np.testing.assert_allclose(got, np.array([0, 0, *weights]) / np.sum(weights), atol=1e-6)
 
 
-@pytest.mark.parametrize("normalization", WEIGHT_NORMALIZATIONS)
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+@pytest.mark.parametrize("normalization", COMPONENTS["weight_normalization"])
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
 @pytest.mark.parametrize("temperature", [0.25, 1.0])
 def test_equal_distances_make_every_reading_exactly_future(normalization, kernel, temperature):
     """Of 0, of a millionth, of twice and a hundred times the scale; and the last step, after which one goal is left."""
@@ -59,14 +59,14 @@ def test_equal_distances_make_every_reading_exactly_future(normalization, kernel
             np.testing.assert_array_equal(got, expected)
 
 
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
-@pytest.mark.parametrize("normalization", [name for name in WEIGHT_NORMALIZATIONS if name != "none"])
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
+@pytest.mark.parametrize("normalization", [name for name in COMPONENTS["weight_normalization"] if name != "none"])
 def test_readings_that_have_no_scale(normalization, kernel):
     sampler = samplers.make("weighted", kernel, normalization=normalization)
     np.testing.assert_allclose(table(sampler, 0), table(sampler, 0, achieved=ACHIEVED * 1e-3), atol=1e-5)
 
 
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
 def test_weights_of_a_length_even_out_as_distances_shrink(kernel):
     """What the paper says of its method 3: "more and more random as the network learns"."""
     sampler, far_off = samplers.make("weighted", kernel, normalization="none"), []
@@ -78,11 +78,11 @@ def test_weights_of_a_length_even_out_as_distances_shrink(kernel):
     assert far_off[-1] < 1e-3
 
 
-@pytest.mark.parametrize("normalization", WEIGHT_NORMALIZATIONS)
+@pytest.mark.parametrize("normalization", COMPONENTS["weight_normalization"])
 def test_a_candidate_on_the_goal_is_no_trouble(normalization):
     """The candidates after step 0 are at 0, 0, 3 and 2; of the nearest two neither is preferred."""
     achieved = ACHIEVED.at[1:3].set(0.0)
-    for kernel in WEIGHT_KERNELS:
+    for kernel in COMPONENTS["weight_kernel"]:
         got = table(samplers.make("weighted", kernel, normalization=normalization), 0, achieved=achieved)
         assert np.isfinite(got).all()
         assert got[0] == 0
@@ -91,8 +91,8 @@ def test_a_candidate_on_the_goal_is_no_trouble(normalization):
 
 
 def test_a_distance_that_is_none_leaves_no_goal_in_any_reading():
-    for normalization in WEIGHT_NORMALIZATIONS:
-        for kernel in WEIGHT_KERNELS:
+    for normalization in COMPONENTS["weight_normalization"]:
+        for kernel in COMPONENTS["weight_kernel"]:
             sampler = samplers.make("weighted", kernel, lambda a, d: a[:, 0].at[3].set(jnp.nan), normalization)
             log_weights = sampler.log_weights(ACHIEVED, DESIRED, jnp.array(1), HP)
             assert samplers.draw(jax.random.key(0), log_weights[None])[0] == 5, (normalization, kernel)
@@ -100,7 +100,11 @@ def test_a_distance_that_is_none_leaves_no_goal_in_any_reading():
 
 def test_readings_are_lanes_of_one_program():
     """The choice is traced, so one compiled function serves all."""
-    every = [samplers.make("weighted", k, normalization=n) for n in WEIGHT_NORMALIZATIONS for k in WEIGHT_KERNELS]
+    every = [
+        samplers.make("weighted", k, normalization=n)
+        for n in COMPONENTS["weight_normalization"]
+        for k in COMPONENTS["weight_kernel"]
+    ]
     lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))
     joined = jax.jit(lambda choice: samplers.one_of(every).log_weights(ACHIEVED, DESIRED, jnp.array(1), lane(*HP, choice)))
     for choice, sampler in enumerate(every):
@@ -108,7 +112,7 @@ def test_readings_are_lanes_of_one_program():
     assert joined._cache_size() == 1
 
 
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
 def test_a_scale_of_any_size_that_is_allowed_leaves_goals(kernel):
     """With a micrometre the nearest is likeliest, by however little; with 1,000 km it is `future` but for rounding."""
     sampler, future = samplers.make("weighted", kernel, normalization="none"), table(samplers.make("future"), 0)

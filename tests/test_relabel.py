@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mjx_dher import replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
 from mjx_dher.relabel import draw_batches, hindsight_goals, look_ahead, relabel
 from mjx_dher.rollout import rollout
-from mjx_dher.spec import SAMPLERS
 from mjx_dher.types import Batch, Episode
 from probes import Clock
 
@@ -32,7 +32,7 @@ def index_of(goal, episode_goals):
     return np.where(equal.any(-1), equal.argmax(-1), -1)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", COMPONENTS["sampler"])
 def test_goals_come_from_where_the_sampler_may_look(ring, name):
     sample = replay.sample(ring, jax.random.key(1), 5000)
     goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(2))

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import distance_normalization, lookup, samplers, spec
+from mjx_dher import samplers, spec
+from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
-from mjx_dher.contrib import metrics
-from mjx_dher.spec import METRICS, SAMPLERS, WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS, RunSpec
+from mjx_dher.spec import RunSpec
 
 HP = HParams()
 # One episode of T = 4 steps; the desired goal is the origin, so the distances are 5, 4, 1, 3 and 2.
@@ -59,7 +59,7 @@ def test_weight_kernels(kernel, temperature, weights):
     np.testing.assert_allclose(got, np.array([0, 0, *weights]) / np.sum(weights), atol=1e-6)
 
 
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
 @pytest.mark.parametrize("distance", [0.0, 1e-6, 0.3])
 def test_equal_distances_make_weighted_exactly_future(kernel, distance):
     # Distances that are equal to the last bit: the same point again and again, and the axes of the plane.
@@ -72,7 +72,7 @@ def test_equal_distances_make_weighted_exactly_future(kernel, distance):
             )
 
 
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
+@pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
 def test_weights_do_not_depend_on_scale(kernel):
     sampler = samplers.make("weighted", kernel)
     np.testing.assert_allclose(table(sampler, 0), table(sampler, 0, achieved=ACHIEVED * 1e-3), atol=1e-6)
@@ -113,30 +113,11 @@ def test_draw_never_takes_what_has_no_weight():
     assert bool(jnp.all(mask[jnp.arange(len(index)), index]))
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", COMPONENTS["sampler"])
 def test_every_name_makes_a_sampler_and_random_alone_crosses_episodes(name):
     sampler = samplers.make(name)
     assert sampler.log_weights(ACHIEVED, DESIRED, jnp.array(0), HP).shape == (5,)
     assert sampler.cross_episode == (name == "random")
-
-
-@pytest.mark.parametrize(("field", "known"), [("weight_kernel", WEIGHT_KERNELS), ("metric", METRICS)])
-def test_names_are_those_of_functions(field, known):
-    for name, place in known.items():
-        module = metrics if "methods" in place else samplers
-        assert lookup.load_import_path(field, place) is getattr(module, name)
-
-
-def test_normalizations_are_those_of_the_module():
-    functions = [lookup.load_import_path("weight_normalization", place) for place in WEIGHT_NORMALIZATIONS.values()]
-    by = (
-        distance_normalization.by_mean,
-        distance_normalization.by_sum,
-        distance_normalization.by_max,
-        distance_normalization.by_range,
-        distance_normalization.by_scale,
-    )
-    assert functions == [*by, distance_normalization.mirrored]
 
 
 def first(achieved, desired, step, hparams):
@@ -164,12 +145,12 @@ def test_a_sampler_of_one_s_own(mine):
         np.testing.assert_allclose(table(sampler, 2), [1, 0, 0, 0, 0])
         assert sampler.cross_episode is crosses
     assert samplers.make("mine:elsewhere") is mine.elsewhere
-    spec.validate(RunSpec(sampler="mine:first"), ("push",))
+    spec.validate(RunSpec(sampler="mine:first"))
 
 
 def test_a_metric_of_one_s_own(mine):
     """Distance along x alone: of the goals after step 1, (0, 0, 1) and (0, 2, 0) lie on the desired one."""
-    spec.validate(RunSpec(metric="mine:along_x"), ("push",))
+    spec.validate(RunSpec(metric="mine:along_x"))
     for metric in ("mine:along_x", mine.along_x):
         np.testing.assert_allclose(table(samplers.make("closest", metric=metric), 1), [0, 0, 0.5, 0, 0.5])
         # At 0, 3, 0 the mean is 1 and the relative distances are 0, 3, 0: weights 2, 0, 2.
@@ -181,14 +162,14 @@ def test_a_metric_of_one_s_own(mine):
 
 def test_a_kernel_of_one_s_own(mine):
     """The candidates after step 2 are at 3 and 2, so that their weights are as 1 / 9 to 1 / 4."""
-    spec.validate(RunSpec(weight_kernel="mine:squared"), ("push",))
+    spec.validate(RunSpec(weight_kernel="mine:squared"))
     for kernel in ("mine:squared", mine.squared):
         np.testing.assert_allclose(table(samplers.make("weighted", kernel), 2), [0, 0, 0, 4 / 13, 9 / 13], atol=1e-6)
 
 
 def test_a_normalization_of_one_s_own(mine):
     """The candidates after step 1 are at 1, 3 and 2, so that their weights are 1, exp(-2) and exp(-1)."""
-    spec.validate(RunSpec(weight_normalization="mine:nearest_is_1"), ("push",))
+    spec.validate(RunSpec(weight_normalization="mine:nearest_is_1"))
     weights = np.array([0, 0, 1, np.exp(-2.0), np.exp(-1.0)])
     for normalization in ("mine:nearest_is_1", mine.nearest_is_1):
         got = table(samplers.make("weighted", "softmax", normalization=normalization), 1)
@@ -198,7 +179,7 @@ def test_a_normalization_of_one_s_own(mine):
 
 
 REFUSED = [  # arguments of `make`, and what the message names: the field, the value and what is allowed
-    ({"name": "futur"}, ["sampler", "'futur'", ", ".join(SAMPLERS), "did you mean 'future'"]),
+    ({"name": "futur"}, ["sampler", "'futur'", ", ".join(COMPONENTS["sampler"]), "did you mean 'future'"]),
     ({"name": "weighted", "kernel": "softmx"}, ["weight_kernel", "'softmx'", "linear, inverse, softmax", "'softmax'?"]),
     (
         {"name": "weighted", "normalization": "meam"},
@@ -233,4 +214,4 @@ def test_what_cannot_be_used_is_refused(mine, arguments, parts):
 )
 def test_a_run_with_a_name_that_is_not_built_in_is_refused(field, value):
     with pytest.raises(ValueError, match=f"{field} must be one of .*module:attribute; got '{value}'"):
-        spec.validate(RunSpec(**{field: value}), ("push",))
+        spec.validate(RunSpec(**{field: value}))

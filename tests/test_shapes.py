@@ -14,9 +14,9 @@ from jax import Array
 from jaxtyping import Bool, Float, Float32, Int, Key, TypeCheckError, jaxtyped
 
 from mjx_dher import HParams, priorities, relabel, replay, samplers
+from mjx_dher.components import COMPONENTS
 from mjx_dher.learners import common, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
-from mjx_dher.spec import SAMPLERS
 from mjx_dher.types import Batch, Episode, Sizes
 
 E, N, B, T, D, G, A = 11, 3, 5, 7, 13, 2, 4
@@ -94,7 +94,7 @@ def test_replay():
         jax.eval_shape(function, from_ring(RING), KEY, shape(B, dtype=jnp.int32))
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", COMPONENTS["sampler"])
 def test_samplers(name):
     @typed
     def log_weights(achieved: Float[Array, "T1 G"], desired: Float[Array, "G"], step: Int[Array, ""]) -> Float[Array, "T1"]:

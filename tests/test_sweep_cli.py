@@ -5,11 +5,11 @@ import signal
 import pytest
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 
-from mjx_dher import HParams, cli, config, envs
+from mjx_dher import HParams, cli, config
 from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
+from mjx_dher.components import COMPONENTS, Component
 from mjx_dher.sweeps import tables
-from probes import PointMass
 
 
 def test_two_commands_share_a_sweep_and_the_last_one_s_tables_have_it_all(tmp_path, point_mass, capsys):
@@ -26,7 +26,7 @@ def test_two_commands_share_a_sweep_and_the_last_one_s_tables_have_it_all(tmp_pa
 
 @pytest.fixture
 def point_mass(monkeypatch):
-    monkeypatch.setitem(envs._REGISTRY, "point_mass", lambda engine, **options: PointMass())
+    monkeypatch.setitem(COMPONENTS["env"], "point_mass", Component("point_mass:PointMass", ""))
 
 
 COMMAND = [

@@ -21,7 +21,7 @@ from mjx_dher.config import check_count, check_number
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.spec import ENGINES, RunSpec, own_parts, to_arguments, to_texts
+from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
 
 CURVE_WIDTH = 24  # characters of the live curve
 Devices = int | Literal["all"]  # of the option --devices
@@ -120,7 +120,7 @@ def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
     """
     tried: set[str] = set()
     for spec in specs:
-        if own_parts(spec):
+        if custom_components(spec):
             from mjx_dher.testing import check_parts
 
             for line in check_parts(env, dataclasses.replace(spec, seed=0)):

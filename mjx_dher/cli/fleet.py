@@ -146,7 +146,7 @@ def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
     """Tries out parts of the user's own on this machine, before a cluster is asked for anything."""
     for _, group in itertools.groupby(specs, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
-        if any(map(spec.own_parts, own)):
+        if any(map(spec.custom_components, own)):
             settle_compiler(engine)
             try_parts(_env_here(own[0]), own, console)
 

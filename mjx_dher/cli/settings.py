@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher import config as config_lib
+from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec, reads
+from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
@@ -98,7 +99,7 @@ def groups(run: RunSpec) -> Iterator[tuple[str, str]]:
     sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
     parts = [name for name in values if name not in (*sizes, *numbers)]
     for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
-        read_here = [name for name in names if reads(run.sampler, run.learner, name)]
+        read_here = [name for name in names if reads(values, name)]
         yield title, "; ".join(f"{name} {text(values[name])}" for name in read_here)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, lookup, presets, spec
+from mjx_dher import lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import Devices, Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
@@ -177,7 +177,7 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
         base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))
         for point in itertools.product(*axes.values()):
             run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))
-            spec.validate(run, envs.list_envs())
+            spec.validate(run)
             specs.append(run)
     return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds))
 
@@ -270,7 +270,7 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         program = group[0].program
         env = make_env(program)
         for run in group:
-            spec.validate(run, envs.list_envs(), env.episode_length)
+            spec.validate(run, env.episode_length)
         samplers = ", ".join(dict.fromkeys(run.sampler for run in group))
         console.print(f"{program.env}, learner {program.learner}: {len(group)} runs; samplers {samplers}", soft_wrap=True)
         for line in (settings.amount(program.config, env.episode_length, len(group)), *settings.memory_lines(env, group)):
@@ -287,7 +287,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console, team: Any) ->
     prepare()
     for _, group in itertools.groupby(todo, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
-        if any(map(spec.own_parts, own)):
+        if any(map(spec.custom_components, own)):
             try_parts(make_env(own[0]), own, console)
     stop, screen = Stop(console, args.out), Screen(console, todo)
     try:

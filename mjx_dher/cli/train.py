@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, lookup, presets, spec
+from mjx_dher import lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.common import (
     Devices,
@@ -137,7 +137,7 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     settle_compiler(args.spec.engine)
     check_platform()
     env = make_env(args.spec)
-    spec.validate(args.spec, envs.list_envs(), env.episode_length)
+    spec.validate(args.spec, env.episode_length)
     memory = settings.memory_lines(env, [args.spec])
     for title, told in settings.groups(args.spec):
         console.print(f"{title}: {told}", soft_wrap=True)
@@ -184,7 +184,7 @@ def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> t
         )
     if args.total_steps is not None:
         run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
-    spec.validate(run, envs.list_envs())
+    spec.validate(run)
     fields = [field.name for field in dataclasses.fields(Options)]
     given = {name: getattr(args, name) for name in fields if getattr(args, name) is not None}
     options = Options(**{**{name: content[name] for name in fields if name in content}, **given})
@@ -262,7 +262,7 @@ def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     )
     problems = []
     settled = (args.options.check, lambda: check_devices(args.devices), lambda: check_out(args.hosts, args.out))
-    for check in (lambda: spec.validate(args.spec, envs.list_envs()), *settled):
+    for check in (lambda: spec.validate(args.spec), *settled):
         try:
             check()
         except ValueError as error:

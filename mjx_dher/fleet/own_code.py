@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_dher.spec import RunSpec, own_parts
+from mjx_dher.spec import RunSpec, custom_components
 
 INSTALLED = {"site-packages", "dist-packages"}
 
@@ -19,7 +19,7 @@ def folder_of(specs: Sequence[RunSpec]) -> Path | None:
     """
     roots: dict[Path, str] = {}
     for spec in specs:
-        for field in own_parts(spec):
+        for field in custom_components(spec):
             value = str(getattr(spec, field))
             if (root := _root_of(value)) is not None:
                 roots.setdefault(root, f"{field} {value} in {root}")
@@ -32,7 +32,7 @@ def folder_of(specs: Sequence[RunSpec]) -> Path | None:
 
 def with_own_parts(specs: Sequence[RunSpec]) -> list[RunSpec]:
     """Returns a run for each set of own parts among `specs`: what nodes are asked about."""
-    by_parts = {tuple((field, getattr(spec, field)) for field in own_parts(spec)): spec for spec in specs}
+    by_parts = {tuple((field, getattr(spec, field)) for field in custom_components(spec)): spec for spec in specs}
     return [spec for parts, spec in by_parts.items() if parts]
 
 

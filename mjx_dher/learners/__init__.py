@@ -8,12 +8,11 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import lookup, networks
+from mjx_dher import components, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Values
 from mjx_dher.networks import NetworksFn
 from mjx_dher.parallel.split import Split
-from mjx_dher.spec import LEARNERS
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
 
 # What the loop and the log call theirs: a learner's metrics have other names.
@@ -74,7 +73,7 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     """Makes the learner called `name`.
 
     Args:
-      name: one of `spec.LEARNERS`, "module:attribute", or a function (config, sizes, networks) -> Learner.
+      name: a built-in name, "module:attribute", or a function (config, sizes, networks) -> Learner.
       config: sizes of the networks, dtype and kernels.
       sizes: of the environment.
       network: what `networks.make` takes.
@@ -82,7 +81,7 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     Raises:
       ValueError: no such learner or networks, something that lacks a method of `Learner`, or parts that do not combine.
     """
-    make_learner = lookup.resolve("learner", name, LEARNERS, ("config", "sizes", "networks"))
+    make_learner = components.load("learner", name, "config", "sizes", "networks")
     learner = make_learner(config, sizes, networks.make(network))
     check_methods(name, learner)
     check_discount(learner, config)

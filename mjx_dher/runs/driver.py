@@ -137,7 +137,7 @@ def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], opt
     if sweep or len(specs) > 1:
         options.check_many()
     for spec in specs:
-        spec_lib.validate(spec, (spec.env,), env.episode_length)
+        spec_lib.validate(spec, env.episode_length)
     if len({spec.program for spec in specs}) != 1 or len({folder.absolute() for folder in folders}) != len(specs):
         raise ValueError("train_runs takes one or more runs that agree in RunSpec.program, and a folder of its own for each")
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import stats
+from mjx_dher.components import COMPONENTS, reads
 from mjx_dher.runs.folder.run_folder import FAILED
-from mjx_dher.spec import SAMPLERS, reads
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
@@ -51,10 +51,9 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     varying = [name for name in settings[0] if name not in ("sampler", "env") and len({str(s[name]) for s in settings}) > 1]
     by_setting: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
     for trial, setting in zip(trials, settings):
-        parts = setting["sampler"], setting["learner"]
-        own = {name: setting[name] for name in varying if reads(*parts, name, setting["weight_normalization"])}
+        own = {name: setting[name] for name in varying if reads(setting, name)}
         by_setting.setdefault(str((setting["sampler"], own)), (own, []))[1].append(trial)
-    order = {name: number for number, name in enumerate(SAMPLERS)}
+    order = {name: number for number, name in enumerate(COMPONENTS["sampler"])}
     labels = [_label(alike[0], own, _format) for own, alike in by_setting.values()]
     exact = [_label(alike[0], own, lambda name, value: f"{name} {value!r}") for own, alike in by_setting.values()]
     labels = [label if labels.count(label) == 1 else digits for label, digits in zip(labels, exact)]

@@ -7,9 +7,10 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
+from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint, results, run_folder
-from mjx_dher.spec import RunSpec, read_by, reads
+from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 
 CELLS = "cells"
@@ -38,7 +39,8 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
 
 def _with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
     """Returns `spec` with those settings of `base` that neither its sampler nor its learner reads."""
-    unread = [name for name in read_by() if not reads(spec.sampler, spec.learner, name, spec.weight_normalization)]
+    settings = fingerprint.settings(spec)
+    unread = [name for name in settings if not reads(settings, name)]
     numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
     sizes = {name: getattr(base.config, name) for name in unread if name in _SIZES}
     parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher import __version__
+from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
-from mjx_dher.spec import RunSpec, reads
+from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import comparison, plotting, tables
 from mjx_dher.tools import curves, figures, html
 from mjx_dher.tools.curves import Curve
@@ -67,7 +68,7 @@ def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
     sizes, numbers = [field.name for field in dataclasses.fields(Config)], HParams._fields
     parts = [name for name in values if name not in (*sizes, *numbers)]
     for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
-        own = [name for name in names if reads(spec.sampler, spec.learner, name)]
+        own = [name for name in names if reads(values, name)]
         rows = [[n, _value(values[n]), _value(defaults[n]) if n in defaults and defaults[n] != values[n] else ""] for n in own]
         if title == "run":
             rows.append(["physics", content["physics"], ""])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import learners, lookup, priorities, samplers, scores
+from mjx_dher import components, learners, priorities, samplers, scores
+from mjx_dher.components import reads
 from mjx_dher.config import HParams
 from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
@@ -20,7 +21,7 @@ from mjx_dher.priorities import Priority, PriorityFn
 from mjx_dher.rollout import env_sizes
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.scores import LearnedMetric
-from mjx_dher.spec import WEIGHT_KERNELS, WEIGHT_NORMALIZATIONS, RunSpec, own_parts, reads
+from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
 from mjx_dher.testing.methods import check_choice, check_generator, trial_view
@@ -43,7 +44,7 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
     if is_import_path(spec.env):
         check_env(env)
         yield f"env {spec.env}: as it should be, in random episodes"
-    if own_parts(spec) in ([], ["env"]):
+    if not custom_components(spec).keys() - {"env"}:
         return
     episodes = random_episodes(env)
     learner = attempt("learner", learners.make, spec.learner, spec.config, env_sizes(env), spec.networks)
@@ -61,7 +62,7 @@ def _check_replayed(env: Env, spec: RunSpec, episodes: Episode, learner: Learner
         yield check_kernel(spec.weight_kernel)
     if is_import_path(spec.weight_normalization):
         yield check_normalization(spec.weight_normalization)
-    read = [field for field in ("metric", "weight_kernel", "weight_normalization") if reads(spec.sampler, spec.learner, field)]
+    read = [field for field in ("metric", "weight_kernel", "weight_normalization") if reads(vars(spec), field)]
     if any(is_import_path(getattr(spec, field)) for field in ("sampler", *read)):
         yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes, learner)}"
     if is_import_path(spec.priority):
@@ -180,7 +181,7 @@ def check_kernel(kernel: str | KernelFn) -> str:
     Raises:
       PartError: names the first violation.
     """
-    made = _resolve("weight_kernel", kernel, WEIGHT_KERNELS, ("relative", "temperature"))
+    made = attempt("weight_kernel", components.load, "weight_kernel", kernel, "relative", "temperature")
     relative = jnp.linspace(0.0, 3.0, 31)
     for temperature in (0.3, 1.0, 3.0):
         compute = jax.jit(lambda r, t: jnp.asarray(made(r, t)))
@@ -212,7 +213,8 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
     Raises:
       PartError: names the first violation.
     """
-    made = _resolve("weight_normalization", normalization, WEIGHT_NORMALIZATIONS, ("distance", "candidates", "scale"))
+    parameters = ("distance", "candidates", "scale")
+    made = attempt("weight_normalization", components.load, "weight_normalization", normalization, *parameters)
     later, last = jnp.arange(30) >= 10, jnp.arange(30) == 29
     rising = jnp.where(later, jnp.linspace(-0.09, 0.2, 30), 0.0)
     cases = {
@@ -284,10 +286,6 @@ def _check_weights(weights: NDArray) -> None:
         raise PartError("priority: weights must be finite; one is not")
     if weights.min() < 0:
         raise PartError(f"priority: weights must not be negative; the least is {weights.min():.3g}")
-
-
-def _resolve(field: str, value: Any, known: Mapping[str, str], parameters: Sequence[str]) -> Callable[..., Any]:
-    return attempt(field, lookup.resolve, field, value, known, parameters)
 
 
 def _as_arrays(hparams: HParams) -> HParams:

@@ -12,7 +12,7 @@ from typing import Any
 
 from mjx_dher import lookup
 from mjx_dher.config import HParams
-from mjx_dher.spec import PARTS, RunSpec
+from mjx_dher.spec import RunSpec, custom_components
 
 RENAMED = {"eventful_share": "priority_fraction"}  # HParams of schema 1, and what they are called now
 MAY_CHANGE = ("total_steps", "physics", "sources")  # what a run that is resumed may have other than it had
@@ -44,8 +44,7 @@ def sources(spec: RunSpec) -> dict[str, str]:
     It is the file of the module that is named, not of those that it imports. It is read once in a process, which goes on with
     what it has imported.
     """
-    values = {name: str(getattr(spec, name)) for name in ("env", *PARTS)}
-    read = {name: _source(value) for name, value in values.items() if lookup.is_import_path(value)}
+    read = {name: _source(value) for name, value in custom_components(spec).items()}
     return {name: source for name, source in read.items() if source is not None}
 
 

@@ -1,0 +1,209 @@
+"""The built-in components of a run, one row each. Loads neither JAX nor MuJoCo, nor a component before `load`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mjx_dher.lookup import check_function, check_name, load_import_path
+
+
+class Component(NamedTuple):
+    """A built-in component: one row of `COMPONENTS` and one function."""
+
+    path: str  # module:attribute
+    line: str  # what it is, for `list`
+    reads: tuple[str, ...] = ()  # settings that only some components of its field read
+    group: str = ""  # runs that share a compiled program can differ within a group
+
+
+_BY_METRIC = ("metric",)
+_WEIGHTED = ("metric", "weight_kernel", "weight_normalization", "temperature", "weight_scale")
+_NOISE = ("noise_std", "random_noise")
+_CRITICS = ("num_critics", "policy_delay")
+_SMOOTHING = ("target_noise", "target_noise_clip")
+_ENTROPY = ("entropy_weight", "entropy_target")
+_QUANTILES = ("num_quantiles", "dropped_quantiles")
+
+# Built-in components by field of `RunSpec` and by name. Each field also takes "module:attribute", a custom component.
+COMPONENTS: dict[str, dict[str, Component]] = {
+    "env": {
+        "pick_and_place": Component(
+            "mjx_dher.envs.pick_and_place:PickAndPlace",
+            "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)",
+        ),
+        "push": Component("mjx_dher.envs.push:Push", "push a block on the table to a goal (FetchPush-v4)"),
+        "reach": Component("mjx_dher.envs.reach:Reach", "move the gripper to a goal (FetchReach-v4)"),
+        "slide": Component("mjx_dher.envs.slide:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
+    },
+    "sampler": {
+        "random": Component("mjx_dher.samplers:random", "any goal of any episode"),
+        "episode": Component("mjx_dher.samplers:episode", "any goal of the episode"),
+        "future": Component("mjx_dher.samplers:future", "any goal after the step (Andrychowicz et al. 2017)"),
+        "final": Component("mjx_dher.samplers:final", "the last goal of the episode"),
+        "closest": Component(
+            "mjx_dher.samplers:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
+        ),
+        "epsilon_closest": Component(
+            "mjx_dher.samplers:epsilon_closest",
+            "any future goal with probability epsilon, else the closest (method 2)",
+            (*_BY_METRIC, "epsilon"),
+        ),
+        "weighted": Component("mjx_dher.samplers:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
+        "next_future": Component(
+            "mjx_dher.contrib.goals:next_future",
+            "the step's own next goal, one time in her_k, else any future one (Next-Future)",
+        ),
+    },
+    "weight_kernel": {
+        "linear": Component("mjx_dher.samplers:linear", "weights that fall linearly with the relative distance"),
+        "inverse": Component("mjx_dher.samplers:inverse", "weights that fall as a power of the relative distance"),
+        "softmax": Component("mjx_dher.samplers:softmax", "weights that fall exponentially with the relative distance"),
+    },
+    "weight_normalization": {
+        "mean": Component("mjx_dher.distance_normalization:by_mean", "distances relative to their mean"),
+        "sum": Component("mjx_dher.distance_normalization:by_sum", "distances relative to their sum: nearly future"),
+        "max": Component("mjx_dher.distance_normalization:by_max", "distances relative to the largest"),
+        "minmax": Component(
+            "mjx_dher.distance_normalization:by_range", "distances from the smallest to the largest, as 0 to 1"
+        ),
+        "none": Component(
+            "mjx_dher.distance_normalization:by_scale", "distances relative to weight_scale, in metres", ("weight_scale",)
+        ),
+        "far": Component("mjx_dher.distance_normalization:mirrored", "mean, mirrored: farther goals likelier"),
+    },
+    "metric": {
+        "position": Component("mjx_dher.samplers:position", "Euclidean distance between goals"),
+        "velocity": Component("mjx_dher.contrib.metrics:velocity", "distance in position and velocity to rest at the goal"),
+        "resting_point": Component(
+            "mjx_dher.contrib.metrics:resting_point", "distance of where Slide's puck would come to rest"
+        ),
+        "resting_point_rough": Component(
+            "mjx_dher.contrib.metrics:resting_point_rough", "the same with the friction of Push's and PickAndPlace's block"
+        ),
+        "time_to_goal": Component(
+            "mjx_dher.contrib.metrics:time_to_goal", "steps from there to the goal, by the learner's critic"
+        ),
+    },
+    "priority": {
+        "eventful": Component(
+            "mjx_dher.priorities:eventful",
+            "episodes whose last achieved goal was not yet reached at their start",
+            (),
+            "episodes",
+        ),
+        "energy": Component(
+            "mjx_dher.contrib.episodes:energy", "episodes by the energy given to the object (EBP)", (), "episodes"
+        ),
+        "max_entropy": Component(
+            "mjx_dher.contrib.episodes:max_entropy",
+            "episodes by how rare their achieved goals are in the ring (MEP)",
+            (),
+            "episodes",
+        ),
+        "diversity": Component(
+            "mjx_dher.contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)", (), "episodes"
+        ),
+        "dpp": Component(
+            "mjx_dher.contrib.transitions:dpp",
+            "diversity, and of transitions two with goals apart (DTGSH's k-DPP)",
+            (),
+            "transitions",
+        ),
+        "td_error": Component(
+            "mjx_dher.contrib.transitions:td_error",
+            "episodes, and transitions with hindsight goals, by their errors of one step (HGR)",
+            (),
+            "transitions",
+        ),
+        "curriculum": Component(
+            "mjx_dher.contrib.transitions:curriculum",
+            "transitions with goals diverse at first, near later (CHER)",
+            (),
+            "transitions",
+        ),
+        "not_misleading": Component(
+            "mjx_dher.contrib.transitions:not_misleading",
+            "transitions whose hindsight goal was not reached before they began (bias-reduced HER)",
+            (),
+            "transitions",
+        ),
+    },
+    "generator": {
+        "reset": Component("mjx_dher.generators:reset", "the goals that the resets drew"),
+        "hgg": Component(
+            "mjx_dher.contrib.goals:hgg", "goals achieved before, on the way to those of the resets (Hindsight Goal Generation)"
+        ),
+    },
+    "learner": {
+        "ddpg": Component(
+            "mjx_dher.learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE
+        ),
+        "td3": Component(
+            "mjx_dher.learners.td3:make",
+            "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
+            (*_NOISE, *_CRITICS, *_SMOOTHING),
+        ),
+        "sac": Component(
+            "mjx_dher.learners.sac:make",
+            "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
+            (*_CRITICS, *_ENTROPY),
+        ),
+        "redq": Component(
+            "mjx_dher.learners.redq:make",
+            "REDQ (Chen et al. 2021): SAC with many critics, some of them drawn for each target",
+            (*_CRITICS, "subset_critics", *_ENTROPY),
+        ),
+        "tqc": Component(
+            "mjx_dher.learners.tqc:make",
+            "TQC (Kuznetsov et al. 2020): SAC with quantile critics, the largest quantiles dropped",
+            (*_CRITICS, *_QUANTILES, *_ENTROPY),
+        ),
+        "dtqc": Component(
+            "mjx_dher.learners.tqc:make_deterministic",
+            "tqc with a deterministic actor",
+            (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING),
+        ),
+    },
+    "networks": {
+        "mlp": Component("mjx_dher.networks:mlp", "hidden layers with ReLU"),
+        "layer_norm": Component("mjx_dher.networks:layer_norm", "mlp with layer normalization in the critics"),
+        "fan_in": Component("mjx_dher.networks:fan_in", "mlp with first weights and biases as PyTorch's"),
+    },
+}
+
+
+def load(field: str, value: Any, *parameters: str) -> Any:
+    """Imports the component that `value` names, by its built-in name or as module:attribute. Other values are the component.
+
+    Raises:
+      ValueError: no such name, module or attribute, or not a function of `parameters`, if any are given.
+    """
+    if isinstance(value, str):
+        table = COMPONENTS[field]
+        check_name(field, value, table, own=True)
+        value = load_import_path(field, table[value].path if value in table else value)
+    return check_function(field, value, parameters) if parameters else value
+
+
+def help_text(field: str, text: str) -> str:
+    """Help of the option of a component: the text, the built-in names, and the components that read it."""
+    readers = [name for table in COMPONENTS.values() for name, component in table.items() if field in component.reads]
+    read = f" Read by {', '.join(readers)}." if readers else ""
+    return f"{text}: {', '.join(COMPONENTS[field])}, or module:attribute.{read}"
+
+
+@functools.cache
+def _owners(setting: str) -> tuple[str, ...]:
+    """Fields with components that read a setting which not every component reads."""
+    return tuple(field for field, table in COMPONENTS.items() if any(setting in row.reads for row in table.values()))
+
+
+def reads(settings: Mapping[str, Any], setting: str) -> bool:
+    """Whether a setting makes a difference to the run with these settings.
+
+    A custom component may read any setting that a built-in component of its field reads.
+    """
+    rows = [COMPONENTS[field].get(settings[field]) for field in _owners(setting) if reads(settings, field)]
+    return None in rows or (len(rows) == len(_owners(setting)) and all(row and setting in row.reads for row in rows))
