@@ -168,8 +168,8 @@ def _problems(spec: RunSpec, names: Sequence[tuple[Any, ...]], episode_length: A
 
 
 def _raise_all(problems: Iterator[str]) -> None:
-    if found := list(problems):
-        raise ValueError("\n".join(found))
+    if messages := list(problems):
+        raise ValueError("\n".join(messages))
 
 
 def _check_text(field: str, value: Any) -> None:
