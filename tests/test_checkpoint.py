@@ -184,7 +184,6 @@ def test_another_dtype_is_refused(saved, program):
 
 
 def test_a_checkpoint_in_orbax_s_default_format_is_read(saved, program, tmp_path, monkeypatch):
-    """As earlier versions wrote them."""
     state = restore(saved[0], program).state
     handler = orbax.checkpoint.PyTreeCheckpointHandler
     with monkeypatch.context() as patch:

@@ -3,20 +3,19 @@
 import csv
 import dataclasses
 import json
-import tarfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import EXAMPLES, ROOT
+from conftest import EXAMPLES
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
 from mjx_dher.learners import ddpg
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
-from mjx_dher.sweeps import comparison, grid, tables
+from mjx_dher.sweeps import comparison, tables
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass
 from probes import held
@@ -244,35 +243,3 @@ def test_a_folder_that_another_program_trains_in_is_refused_before_anything_is_c
     (tmp_path / "a").mkdir()
     with held(tmp_path / "a"), pytest.raises(FolderError, match="being trained by another program"):
         mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "a"])
-
-
-@pytest.fixture
-def earlier(tmp_path, monkeypatch):
-    """A run that 0.1.0 was stopped in after two of four epochs, how it went on there, and a sweep's finished runs."""
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    with tarfile.open(ROOT / "tests" / "data" / "runs_0.1.0.tar.gz") as archive:
-        archive.extractall(tmp_path, filter="data")
-    return tmp_path
-
-
-def test_a_run_of_an_earlier_version_is_resumed(earlier):
-    """Half of each batch is drawn by priority. Rows, and with them draws and updates, are those that 0.1.0 went on with."""
-    assert cli.main(["resume", str(earlier / "run")]) == 0
-    ours, theirs = rows_of(earlier / "run"), rows_of(earlier / "run_resumed")
-    assert [row["epoch"] for row in ours] == ["1", "2", "3", "4"]
-    for a, b in zip(ours, theirs, strict=True):
-        assert {name: float(value) for name, value in a.items()} == pytest.approx(
-            {name: float(value) for name, value in b.items()}, rel=1e-3
-        )
-    mjx_dher.load_policy(earlier / "run")
-
-
-def test_a_sweep_of_an_earlier_version_is_read_and_gone_on_with(earlier):
-    trials = tables.read(earlier / "sweep")
-    assert [(t["settings"]["sampler"], t["seed"], t["status"]) for t in trials] == [
-        (sampler, seed, "finished") for sampler in ("future", "weighted") for seed in (0, 1)
-    ]
-    assert trials[0]["settings"]["priority_fraction"] == 0.5
-    assert trials[0]["curve"]["priority_mean"] == [1, 1]
-    specs = [run_folder.read_spec(path) for path in (earlier / "sweep" / "cells").iterdir() if path.is_dir()]
-    assert all(grid.is_done(earlier / "sweep", spec) for spec in specs)

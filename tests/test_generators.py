@@ -207,7 +207,6 @@ def test_every_part_by_name_shares_a_program_with_its_kind():
 
 
 def test_settings_that_are_new_change_no_name_of_a_trial():
-    """As version 0.1.0 had it; tests/test_identity.py has more of them."""
     assert not {"generator", "hindsight_reward"} & set(fingerprint.identity(RunSpec(), "native", {}))
     named = {fingerprint.trial_name(RunSpec(generator=name)) for name in COMPONENTS["generator"]}
     assert len(named) == len(COMPONENTS["generator"])

@@ -160,15 +160,15 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (("config",), [], "without config, an object"),
-        (("config", "hidden_sizes"), 10**20, "without hidden_sizes, a list"),
+        (("config",), [], "config must be a dict"),
+        (("config", "hidden_sizes"), 10**20, "config.hidden_sizes must be a list"),
         (("config", "hidden_sizes"), None, "('hidden_sizes')"),
-        (("hparams",), "x", "without hparams, an object"),
-        (("physics",), 1, "without physics, a name"),
+        (("hparams",), "x", "hparams must be a dict"),
+        (("physics",), 1, "physics must be a str"),
         (("physics",), None, "('physics')"),
         (("config", "total_steps"), None, "('total_steps')"),
-        (("sources",), [], "without sources, an object"),
-        (("sources",), {"env": 10**20}, "without sources.env, a text"),
+        (("sources",), [], "sources must be a dict"),
+        (("sources",), {"env": 10**20}, "sources.env must be a str"),
     ],
 )
 def test_parts_of_another_kind_are_named(stopped, capsys, path, value, message):

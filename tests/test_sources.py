@@ -3,14 +3,13 @@
 import dataclasses
 import sys
 
-import numpy as np
 import pytest
 from sweep_helpers import compile_once  # noqa: F401
 from test_driver import FLAGS
-from test_identity import SPEC, edit, resume, train
+from test_identity import SPEC, resume, train
 
 from mjx_dher import cli
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import tables
 
 TASK = """
@@ -71,21 +70,3 @@ def test_eval_and_resume_say_which_file_changed_since(own, tmp_path, capsys):
     assert (status, "own_task.py has changed (env)" in text) == (0, True), text
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
     assert "has changed" not in capsys.readouterr().out
-
-
-def test_trials_of_a_version_that_did_not_look_at_own_code_stay(own, tmp_path, capsys):
-    command = ["sweep", *flags_of(tmp_path / "sweep"), "--seeds", "1"]
-    assert cli.main(command) == 0
-    (cell,) = (path for path in (tmp_path / "sweep" / "cells").iterdir() if path.is_dir())
-    spec = run_folder.read_spec(cell)
-    for name in ("digest", "sources"):
-        edit(cell, (name,), None)
-    with np.load(cell / "policy.npz") as arrays:
-        kept = {name: arrays[name] for name in arrays.files if name != "settings"}
-    np.savez(cell / "policy.npz", **kept)
-    cell.rename(cell.with_name(fingerprint.trial_name(spec, {})))
-    capsys.readouterr()
-    assert cli.main(command) == 0
-    text = capsys.readouterr().out
-    assert "1 of them are done already" in text
-    assert "whether own_task.py (env own_task:Mine) has changed is not known of 1 of the runs" in text

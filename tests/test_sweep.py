@@ -13,7 +13,7 @@ from filelock import Timeout
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 
 import mjx_dher
-from mjx_dher import HParams, RunSpec, config
+from mjx_dher import HParams
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder.fingerprint import trial_name
 from mjx_dher.runs.program import loop, program
@@ -21,8 +21,6 @@ from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import memory
 from mjx_dher.system.files import FolderError
 from probes import PointMass, held
-
-OLD_NAMES = {"future": "ae61a35cbf", "weighted": "56c3ede079"}
 
 
 def test_trials_are_all_combinations_seed_by_seed():
@@ -36,15 +34,6 @@ def test_trials_are_all_combinations_seed_by_seed():
     other = dataclasses.replace(trials[0], config=dataclasses.replace(trials[0].config, batch_size=33))
     assert trial_name(other) != names[0]
     assert trial_name(dataclasses.replace(trials[0], priority="my:priority")) != names[0]
-
-
-def test_a_trial_s_name_is_that_of_an_earlier_version():
-    """A sweep of 0.1.0 made these folders: point_mass:PointMass, future and weighted."""
-    sizes = {"num_envs": 2, "cycles_per_epoch": 2, "updates_per_cycle": 4, "target_period": 1, "batch_size": 16}
-    static = config.Config(**sizes, total_steps=80, replay_size=100, hidden_sizes=(8, 8), eval_episodes=4)
-    hparams = mjx_dher.preset("cpu", "push", learner="ddpg").hparams
-    names = [trial_name(RunSpec("point_mass:PointMass", sampler=s, config=static, hparams=hparams), {}) for s in OLD_NAMES]
-    assert names == [f"point_mass-pointmass-{sampler}-s0-{digest}" for sampler, digest in OLD_NAMES.items()]
 
 
 def test_what_a_sampler_does_not_read_makes_no_trials_of_its_own():

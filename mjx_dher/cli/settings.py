@@ -46,7 +46,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     versions = content.get("versions", {})
     version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
     now = fingerprint.digest(run_folder.identity_of(content, run))
-    edited = "; edited since" if content.get("digest", now) != now else ""
+    edited = "; edited since" if content["digest"] != now else ""
     return (
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
         f" {content['physics']}{edited}"

@@ -157,7 +157,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     args.hosts.place(os.environ)
     content = run_folder.read_content(args.run)
     settle_compiler(args.engine or content["physics"])
-    described = {name: str(value) for name, value in vars(args).items() if name != "hosts"} | {"digest": content.get("digest")}
+    described = {name: str(value) for name, value in vars(args).items() if name != "hosts"} | {"digest": content["digest"]}
     with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
         team.share(lambda: stack.enter_context(files.lock(args.run)))
         run, options = _to_resume(args, content, screen)

@@ -239,7 +239,7 @@ def _open(
     `ended` is the number of epochs that its metrics have.
     """
     digest = fingerprint.digest(run)
-    if ended == 0 or run_folder.read_content(folder).get("digest", digest) != digest:
+    if ended == 0 or run_folder.read_content(folder)["digest"] != digest:
         placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
         run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)

@@ -58,9 +58,7 @@ def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 def folder_of(sweep: Path, spec: RunSpec) -> Path:
     """Returns the run folder of a trial."""
-    folder = sweep / CELLS / fingerprint.trial_name(spec)
-    earlier = sweep / CELLS / fingerprint.trial_name(spec, own_sources={})  # of a version that did not look at own code
-    return earlier if earlier.exists() and not folder.exists() else folder
+    return sweep / CELLS / fingerprint.trial_name(spec)
 
 
 def is_done(sweep: Path, spec: RunSpec) -> bool:
@@ -69,7 +67,7 @@ def is_done(sweep: Path, spec: RunSpec) -> bool:
 
 
 def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
-    """Returns what a reader is told of own code that is not what trials in the folder were trained with."""
+    """Sentences about custom source files that have changed since trials in the folder were trained."""
     now = {(field, getattr(spec, field)): source for spec in specs for field, source in fingerprint.sources(spec).items()}
     told: dict[str, int] = {}
     for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
@@ -78,13 +76,7 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
         except FolderError:
             continue  # whoever reads its result will say so
         for (field, value), source in now.items():
-            if content.get(field) == value:
-                before = content.get("sources", {}).get(field)
-                if before is None:
-                    text = f"whether {source.split()[0]} ({field} {value}) has changed is not known of"
-                elif before != source:
-                    text = f"{source.split()[0]} ({field} {value}) has changed since"
-                else:
-                    continue
+            if content.get(field) == value and content["sources"].get(field) != source:
+                text = f"{source.split()[0]} ({field} {value}) has changed since"
                 told[text] = told.get(text, 0) + 1
     return [f"{text} {count} of the runs in {sweep}" for text, count in told.items()]

@@ -48,7 +48,7 @@ def _read_trial(path: Path) -> dict[str, Any]:
             "settings": {
                 **fingerprint.settings(spec),
                 "engine": content["physics"],
-                "source": ", ".join(dict.fromkeys(content.get("sources", {}).values())),
+                "source": ", ".join(dict.fromkeys(content["sources"].values())),
             },
             "seed": spec.seed,
             "status": result["status"],

@@ -41,7 +41,7 @@ class Restored(NamedTuple):
     epoch: int  # epochs that had ended
     wall_seconds: float
     state: Any
-    runs: list[dict[str, Any]]  # `identity.identity` of each; none of an earlier version
+    runs: list[dict[str, Any]]  # `fingerprint.identity` of each
     refused: dict[Path, str]  # newer checkpoints that are not used, and why
     failed: dict[int, tuple[int, str]]  # of runs side by side, those that had failed: the epoch, and why
 
@@ -66,7 +66,7 @@ def save(
       epoch: epochs that have ended.
       wall_seconds: of training, so far.
       keep: at least 1.
-      runs: `identity.identity` of the run, or of each of those side by side.
+      runs: `fingerprint.identity` of the run, or of each of those side by side.
       refused: checkpoints that cannot be used, which go.
       failed: of runs side by side, those that have failed: in which epoch, and why.
 
@@ -140,8 +140,7 @@ def read(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
         try:
             failed = _check_lines(path, lines)
             manifest, arrays = _load(path, template)
-            runs = manifest.get("runs", [])
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], arrays, runs, refused, failed)
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], arrays, manifest["runs"], refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
@@ -150,7 +149,7 @@ def read(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
 def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
     """Returns the runs that had failed; raises CheckpointError where one's metrics.csv lacks epochs that had ended."""
     manifest = _read_manifest(path)
-    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest.get("failed", {}).items()}
+    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
     for lane, whole in enumerate(lines):
         if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
             raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {whole}")
@@ -175,20 +174,8 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
             read = _say([name, list(array.shape), str(array.dtype)])
             raise CheckpointError(f"{path} was read as {read}, and was written as {_say(saved[name])}")
     shapes = _to_shapes(template)
-    if manifest["schema"] == 1:
-        arrays = _upgraded(arrays, shapes)
-    arrays = regroup(arrays, shapes, len(manifest.get("runs", [])))
+    arrays = regroup(arrays, shapes, len(manifest["runs"]))
     return manifest, _fit(path, arrays, shapes)
-
-
-def _upgraded(arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
-    """Returns the arrays of schema 1 as today's: two have other names, and one lane had an axis of its own."""
-    names = {".replay.eventful": ".replay.priority", ".hparams.eventful_share": ".hparams.priority_fraction"}
-    arrays = {names.get(name, name): array for name, array in arrays.items()}
-    if ".replay.priority" in arrays:
-        arrays[".replay.priority"] = arrays[".replay.priority"].astype(np.float32)
-    lane = {name for name, leaf in shapes.items() if name in arrays and arrays[name].shape == (1, *leaf.shape)}
-    return {name: array[0] if name in lane else array for name, array in arrays.items()}
 
 
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
@@ -218,7 +205,7 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        content = read_versioned(path / MANIFEST, 1, SCHEMA)
+        content = read_versioned(path / MANIFEST, SCHEMA)
     except FileNotFoundError:
         raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
     if content.pop("sha256", None) != sha256_of(content):

@@ -14,11 +14,10 @@ from mjx_dher import lookup
 from mjx_dher.config import HParams
 from mjx_dher.spec import RunSpec, custom_components
 
-RENAMED = {"eventful_share": "priority_fraction"}  # HParams of schema 1, and what they are called now
-MAY_CHANGE = ("total_steps", "physics", "sources")  # what a run that is resumed may have other than it had
-# Settings of schema 1. Later ones are part of a run's digest only where they differ from their defaults, so that the trials of
-# an older sweep keep their names.
-_FIRST_SETTINGS = frozenset(
+MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
+# A digest always includes these settings. It includes any other setting only if it differs from its default, so that a new
+# setting changes no digest and no trial's name.
+_ALWAYS = frozenset(
     (
         *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
         *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype", "learner_kernels"),
@@ -57,7 +56,7 @@ def _source(import_path: str) -> str | None:
 def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
     """Returns what a run computes with, as JSON has it: settings, seed, the engine that runs, the files of its own code."""
     defaults = settings(RunSpec())
-    kept = {name: x for name, x in settings(spec).items() if name in _FIRST_SETTINGS or x != defaults[name]}
+    kept = {name: x for name, x in settings(spec).items() if name in _ALWAYS or x != defaults[name]}
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
@@ -69,18 +68,14 @@ def digest(content: Mapping[str, Any]) -> str:
     return sha256_of(content)[:10]
 
 
-def trial_name(spec: RunSpec, own_sources: Mapping[str, str] | None = None) -> str:
-    """Returns the name of a trial's folder: readable settings plus a digest of every setting and of own code.
-
-    `own_sources` are those of now where None. Empty, as a version that did not look at own code had them, they leave the name
-    as that version gave it.
-    """
+def trial_name(spec: RunSpec) -> str:
+    """Name of a trial's folder: readable settings, and a digest of all settings and of custom code."""
     values, defaults = settings(spec), settings(RunSpec())
-    kept = {name: value for name, value in values.items() if name in _FIRST_SETTINGS or value != defaults[name]}
-    old_names = {new: old for old, new in RENAMED.items()}
-    numbers = {old_names.get(name, name): kept.pop(name) for name in HParams._fields if name in kept}
-    own_sources = sources(spec) if own_sources is None else own_sources
-    hashed = sha256_of([1, kept, numbers, spec.seed, *([dict(own_sources)] if own_sources else [])])
+    kept = {name: value for name, value in values.items() if name in _ALWAYS or value != defaults[name]}
+    numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
+    numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests
+    own_sources = sources(spec)
+    hashed = sha256_of([1, kept, numbers, spec.seed, *([own_sources] if own_sources else [])])
     return f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{hashed[:10]}"
 
 

@@ -20,7 +20,6 @@ from mjx_dher.system.files import FolderError
 # The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
 COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
 FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
-OLD_NAMES = {"eventful_share": "priority_mean"}  # metrics of earlier versions, and what they are called now
 LOGS = ("jsonl", "tensorboard", "wandb")
 JSON_FILE = "metrics.jsonl"
 DIGEST = "digest"  # the last column of metrics.csv
@@ -56,7 +55,7 @@ class CsvSink:
         _write(path, kept)
         self._file = path.open("a", newline="")
         if kept:
-            self._writer = self._make_writer([OLD_NAMES.get(name, name) for name in kept[0].strip().split(",")])
+            self._writer = self._make_writer(kept[0].strip().split(","))
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:
@@ -70,7 +69,7 @@ class CsvSink:
         self._file.close()
 
     def _make_writer(self, columns: Sequence[str]) -> csv.DictWriter[str]:
-        # The file of a run that an earlier version began goes on with the columns that it has.
+        # A resumed run keeps the columns of its file.
         return csv.DictWriter(self._file, columns, extrasaction="ignore")
 
 
@@ -103,10 +102,9 @@ def whole_epochs(folder: Path) -> int:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Returns the whole lines of a metrics.csv as numbers by today's names, the digest as it is."""
+    """Returns the whole lines of a metrics.csv as numbers; the digest stays text."""
     head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
-    names = [OLD_NAMES.get(name, name) for name in head]
-    return [{name: x if name == DIGEST else _to_number(x) for name, x in zip(names, line)} for line in lines]
+    return [{name: x if name == DIGEST else _to_number(x) for name, x in zip(head, line)} for line in lines]
 
 
 def _whole_lines(path: Path) -> list[str]:
@@ -176,10 +174,8 @@ class WandbSink:
         import wandb
 
         run = run_folder.to_spec(folder, content)
-        # What a run can be resumed with has no part in its name; earlier versions named it after all of config.json.
+        # A resumed run keeps its id, so settings that may change are not part of it.
         described = {name: x for name, x in run_folder.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
-        if "digest" not in content:
-            described = json.loads((folder / run_folder.CONFIG_FILE).read_text())
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
             name=folder.absolute().name,

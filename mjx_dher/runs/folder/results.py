@@ -10,8 +10,6 @@ from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.system.files import FolderError
 
-_OLD_STATUSES = {"diverged": FAILED}  # as a failed run was called before runs could fail in several ways
-
 
 def exists(folder: Path) -> bool:
     """Returns whether the run has a result, believable or not."""
@@ -29,8 +27,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise FolderError(f"{path} is damaged: it is not a file")  # a FIFO, whose reader would wait for ever
     try:
         content = json.loads(path.read_text())
-        status = content.get("status", FINISHED)
-        return {"reason": "", **content, "status": _OLD_STATUSES.get(status, status), "epochs": int(content["epochs"])}
+        return {"reason": "", **content, "status": str(content["status"]), "epochs": int(content["epochs"])}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(f"{path} is damaged ({type(error).__name__}: {error})") from error
 
@@ -59,17 +56,13 @@ def problem(folder: Path) -> str | None:
         return f"{folder / run_folder.METRICS_FILE} has whole lines of {whole} of {epochs} epochs"
     if result["status"] == FINISHED and not (folder / run_folder.POLICY_FILE).exists():
         return f"{folder} has no {run_folder.POLICY_FILE}"
-    digest = content.get("digest")
-    if digest is not None:
-        rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
-        for name, other in ((run_folder.RESULT_FILE, result.get("digest")), (run_folder.METRICS_FILE, _last_digest(rows))):
-            if other not in (None, digest):
-                return f"{folder / name} is of a run with other settings: its digest is {other}, that of config.json {digest}"
+    digest = content["digest"]
+    rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
+    last = {run_folder.RESULT_FILE: result, run_folder.METRICS_FILE: rows[-1] if rows else {loggers.DIGEST: digest}}
+    for name, values in last.items():
+        if (other := values.get(loggers.DIGEST)) != digest:
+            return f"{folder / name} is of a run with other settings: its digest is {other}, that of config.json {digest}"
     return None
-
-
-def _last_digest(rows: list[dict[str, Any]]) -> str | None:
-    return rows[-1].get(loggers.DIGEST) if rows else None
 
 
 def is_whole(folder: Path) -> bool:

@@ -119,8 +119,8 @@ def checkpoints_to_resume(path: Path) -> list[Path]:
     )
 
 
-def read_versioned(file: Path, *schemas: int) -> dict[str, Any]:
-    """Returns an object of JSON that names its schema, one of `schemas`.
+def read_versioned(file: Path, schema: int) -> dict[str, Any]:
+    """Reads a JSON object whose key "schema" is `schema`.
 
     Raises:
       FileNotFoundError: there is no such file.
@@ -134,14 +134,14 @@ def read_versioned(file: Path, *schemas: int) -> dict[str, Any]:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise FolderError(f"{file} cannot be read ({error})") from error
-    schema = content.get("schema") if isinstance(content, dict) else None
-    if schema not in schemas:
-        raise FolderError(f"{file} is not of this program's schema {schemas[-1]} (found {schema!r})")
+    found = content.get("schema") if isinstance(content, dict) else None
+    if found != schema:
+        raise FolderError(f"{file} is not of this program's schema {schema} (found {found!r})")
     return content
 
 
 def read_content(path: Path) -> dict[str, Any]:
-    """Returns the config.json of the run in `path`, in today's schema.
+    """Reads config.json of the run in `path`.
 
     Raises:
       FolderError: no run folder, or one of another schema; the message says which.
@@ -155,15 +155,14 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def read_file(file: Path) -> dict[str, Any]:
-    """Returns the content of a run's config.json, wherever it lies and whatever its name is, in today's schema.
+    """Reads a run's config.json, wherever it lies and whatever its name is.
 
     Raises:
       FileNotFoundError: there is no such file.
       FolderError: it does not describe a run, or is of another schema.
     """
     try:
-        content = read_versioned(file, 1, SCHEMA)
-        content = _upgraded(content) if content["schema"] == 1 else content
+        content = read_versioned(file, SCHEMA)
         _check_kinds(content)
         return content
     except (KeyError, AttributeError, TypeError) as error:
@@ -171,28 +170,15 @@ def read_file(file: Path) -> dict[str, Any]:
 
 
 def _check_kinds(content: dict[str, Any]) -> None:
-    """Raises TypeError where a part of config.json is of another kind than it is read as."""
-    sources = content.get("sources", {})  # earlier versions did not look at own code
-    texts = sources if isinstance(sources, dict) else {}
-    right = {
-        "config, an object": isinstance(content["config"], dict),
-        "hparams, an object": isinstance(content["hparams"], dict),
-        "hidden_sizes, a list": isinstance(content["config"], dict) and isinstance(content["config"]["hidden_sizes"], list),
-        "physics, a name": isinstance(content["physics"], str),
-        "env_kwargs, a list": isinstance(content.get("env_kwargs", []), list),
-        "sources, an object": isinstance(sources, dict),
-        **{f"sources.{name}, a text": isinstance(text, str) for name, text in texts.items()},
-    }
-    if wrong := [name for name, is_right in right.items() if not is_right]:
-        raise TypeError(f"without {'; without '.join(wrong)}")
-
-
-def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
-    """Returns the content of schema 1 in that of schema 2: the parts left `config`, and a number got another name."""
-    config = dict(content["config"])
-    parts = {name: config.pop(name) for name in ("env", "engine", "sampler", "weight_kernel", "metric")}
-    hparams = {fingerprint.RENAMED.get(name, name): value for name, value in content["hparams"].items()}
-    return {**content, "schema": SCHEMA, **parts, "physics": content["engine"], "config": config, "hparams": hparams}
+    """Raises TypeError if a value in config.json has another type than the readers need."""
+    kinds = {"config": dict, "hparams": dict, "physics": str, "env_kwargs": list, "sources": dict, "digest": str}
+    values = {name: (content[name], kind) for name, kind in kinds.items()}
+    if isinstance(content["config"], dict):
+        values["config.hidden_sizes"] = content["config"]["hidden_sizes"], list
+    if isinstance(content["sources"], dict):
+        values |= {f"sources.{name}": (text, str) for name, text in content["sources"].items()}
+    if wrong := [f"{name} must be a {kind.__name__}" for name, (value, kind) in values.items() if not isinstance(value, kind)]:
+        raise TypeError("; ".join(wrong))
 
 
 def read_spec(path: Path) -> RunSpec:
@@ -219,25 +205,23 @@ def read(path: Path) -> tuple[dict[str, Any], RunSpec]:
 
 def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
     """Returns the `identity` of the run that config.json describes."""
-    return fingerprint.identity(spec, content["physics"], content.get("sources", {}))
+    return fingerprint.identity(spec, content["physics"], content["sources"])
 
 
 def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
-    """Returns which settings in config.json are not those that the run was trained with, by name, as a reader is told.
+    """Settings in config.json that differ from those that the run was trained with: a sentence for each, by name.
 
-    Its policy knows them, or else its newest checkpoint; those of earlier versions do not.
+    The settings of training are in the newest checkpoint, or else in the policy.
     """
     now, written = identity_of(content, spec), written_identity(path)
     changed = {} if written is None else fingerprint.differences(written, now)
-    if content.get("digest", fingerprint.digest(now)) == fingerprint.digest(now):  # by `resume`, if at all
+    if content["digest"] == fingerprint.digest(now):  # by `resume`, if at all
         return {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
     return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {fingerprint.digest(now)}"}
 
 
 def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
-    """Returns what a reader is told of own code that is not what the run was trained with."""
-    if "sources" not in content:
-        return []
+    """Sentences about custom source files that have changed since the run was trained."""
     before = identity_of(content, spec)
     return list(fingerprint.differences(before, {**before, "sources": fingerprint.sources(spec)}).values())
 
@@ -246,9 +230,9 @@ def written_identity(path: Path) -> dict[str, Any] | None:
     """Returns the `identity` that the run's newest checkpoint has, or else its policy; None where neither can tell."""
     for checkpoint in checkpoints(path):
         try:
-            (content,) = read_versioned(checkpoint / MANIFEST, 2)["runs"]
+            (content,) = read_versioned(checkpoint / MANIFEST, SCHEMA)["runs"]
             return dict(content)
-        except (OSError, ValueError, KeyError, TypeError):  # damaged, or of an earlier version
+        except (OSError, ValueError, KeyError, TypeError):  # damaged, or of several runs
             continue
     try:
         if not (path / POLICY_FILE).is_file():
@@ -275,7 +259,7 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
             config=Config(**config),
             hparams=HParams(**content["hparams"]),
             **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
-            env_kwargs=tuple(content.get("env_kwargs", ())),
+            env_kwargs=tuple(content["env_kwargs"]),
         )
         spec_lib.validate_values(spec)
         return spec
