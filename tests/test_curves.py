@@ -2,10 +2,10 @@
 
 import base64
 import dataclasses
-import html.parser
 import json
 import math
 import re
+from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -176,7 +176,7 @@ def test_files_that_were_changed_are_not_drawn(tmp_path, capsys):
 # The command `report`
 
 
-class Page(html.parser.HTMLParser):
+class Page(HTMLParser):
     """What a page refers to, and whether its elements are closed in order."""
 
     VOID = ("meta", "img", "br")

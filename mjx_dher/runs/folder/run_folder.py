@@ -134,9 +134,9 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise FolderError(f"{file} cannot be read ({error})") from error
-    found = content.get("schema") if isinstance(content, dict) else None
-    if found != schema:
-        raise FolderError(f"{file} is not of this program's schema {schema} (found {found!r})")
+    written = content.get("schema") if isinstance(content, dict) else None
+    if written != schema:
+        raise FolderError(f"{file} is not of this program's schema {schema} (found {written!r})")
     return content
 
 
