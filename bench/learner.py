@@ -84,8 +84,8 @@ class Timed:
 
     def update(self, state: Any, batches: Any) -> Any:
         for i in range(self.delay):
-            make = self.learner.update if i == self.delay - 1 else self.learner.update_critic
-            state, losses = make(state, jax.tree.map(lambda x, i=i: x[i], batches), self.hparams)
+            flags: Any = {} if i == self.delay - 1 else {"with_actor": False}
+            state, losses = self.learner.update(state, jax.tree.map(lambda x, i=i: x[i], batches), self.hparams, **flags)
             state = self.learner.update_target(state, self.hparams)
         return state, losses
 

@@ -141,27 +141,27 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             "mjx_dher.learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE
         ),
         "td3": Component(
-            "mjx_dher.learners.td3:make",
+            "mjx_dher.learners.actor_critic:td3",
             "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
             (*_NOISE, *_CRITICS, *_SMOOTHING),
         ),
         "sac": Component(
-            "mjx_dher.learners.sac:make",
+            "mjx_dher.learners.actor_critic:sac",
             "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
             (*_CRITICS, *_ENTROPY),
         ),
         "redq": Component(
-            "mjx_dher.learners.redq:make",
+            "mjx_dher.learners.actor_critic:redq",
             "REDQ (Chen et al. 2021): SAC with many critics, some of them drawn for each target",
             (*_CRITICS, "subset_critics", *_ENTROPY),
         ),
         "tqc": Component(
-            "mjx_dher.learners.tqc:make",
+            "mjx_dher.learners.actor_critic:tqc",
             "TQC (Kuznetsov et al. 2020): SAC with quantile critics, the largest quantiles dropped",
             (*_CRITICS, *_QUANTILES, *_ENTROPY),
         ),
         "dtqc": Component(
-            "mjx_dher.learners.tqc:make_deterministic",
+            "mjx_dher.learners.actor_critic:dtqc",
             "tqc with a deterministic actor",
             (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING),
         ),

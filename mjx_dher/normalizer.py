@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.types import Array
 
 
@@ -19,25 +19,33 @@ class NormalizerState:
 
 
 def init(size: int) -> NormalizerState:
-    """Makes the state before any value: mean 0, variance 1."""
+    """State before any value: mean 0, variance 1."""
     return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
 
 
 def update(
-    state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None, split: Split = ALONE
+    state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None, axis_name: str | None = None
 ) -> NormalizerState:
     """Returns the moments with `values` [..., D] added, after clipping them to +- `clip`.
 
-    `valid` broadcasts against [..., 1] and says which of them to add, whatever the others hold; all, where None. Of a run in
-    parts, the values of all parts are added, and all have the same moments.
+    Args:
+      state: moments so far.
+      values: what to add.
+      clip: bound of the values' magnitudes.
+      valid: mask that broadcasts against [...]; the other values are left out, even NaN. All are valid if None.
+      axis_name: mapped axis of the devices, if each has a part of the values; all devices get the moments of all values.
     """
+
+    def total(x: Array) -> Array:
+        return x if axis_name is None else jax.lax.psum(x, axis_name)
+
     mask = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
     mask = mask.reshape(-1, 1)
     values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
-    number = split.sum(jnp.sum(mask)).astype(jnp.float32)
-    batch_mean = split.sum(jnp.sum(jnp.where(mask, values, 0.0), axis=0)) / jnp.maximum(number, 1.0)
+    number = total(jnp.sum(mask)).astype(jnp.float32)
+    batch_mean = total(jnp.sum(jnp.where(mask, values, 0.0), axis=0)) / jnp.maximum(number, 1.0)
     squares = jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0)
-    batch_var = split.sum(jnp.sum(squares, axis=0)) / jnp.maximum(number, 1.0)
+    batch_var = total(jnp.sum(squares, axis=0)) / jnp.maximum(number, 1.0)
     count = state.count + number
     share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean

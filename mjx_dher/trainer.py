@@ -152,7 +152,7 @@ def make_train(
         sampler=samplers.make("future" if sampler is None else sampler),
         priority=priorities.whole(priorities.make("eventful" if priority is None else priority)),
         generator=generators.make("reset" if generator is None else generator),
-        learner=learner if split.number == 1 else learners.split_over(learner, split),
+        learner=learner if split.number == 1 else learners.over_axis(learner, split.axis),
         template=episode_template(env),
         split=split,
     )
@@ -177,7 +177,6 @@ def _check_arguments(env: Env, config: Config, learner: Learner | None) -> None:
     config_lib.validate(config, HParams(), env.episode_length)
     if learner is not None:
         learners.check_methods(learner, learner)
-        learners.check_discount(learner, config)
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:

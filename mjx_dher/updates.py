@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax
 
@@ -33,8 +34,8 @@ def _delayed_update(learner: Learner, period: int, hparams: HParams, state: PyTr
     delay = learners.policy_delay(learner)
     for number in range(1, delay + 1):
         batch = jax.tree.map(lambda x, i=number - 1: x[i], batches)
-        method = "update" if number == delay else "update_critic"
-        state, losses = learners.check_update(state, getattr(learner, method)(state, batch, hparams), method)
+        flags: dict[str, Any] = {} if number == delay else {"with_actor": False}
+        state, losses = learners.check_update(state, learner.update(state, batch, hparams, **flags))
         if delay > period and number % period == 0:
             state = _move_targets(learner, hparams, state)
     return state, losses

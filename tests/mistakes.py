@@ -199,7 +199,7 @@ def _but(**methods):
     def make(config, sizes, networks):
         learner = ddpg.make(config, sizes, networks)
         kind = type("Own", (ddpg.DDPG,), methods)
-        return kind(*(getattr(learner, field.name) for field in dataclasses.fields(learner)))
+        return kind(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
 
     return make
 
@@ -251,7 +251,7 @@ LEARNERS = {
     "forgets": "must change the state",
     "loses": r"must give \(state, metrics\)",
     "halves": "must keep the state's structure, shapes and types",
-    "losses_of_each": r"must be scalars, \[\]; critic_loss is \[8\]",
+    "losses_of_each": r"critic_loss of learner.update must be numbers of shape \[\]; got float32\[8\]",
     "breaks": "must be finite",
     "noise_by_env": r"must give arrays that lead with \[T, N\]",
     "exports_a_dict": r"must give a policy.Policy or None; it gives a dict",

@@ -59,7 +59,7 @@ def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
     state = learner.init(jax.random.key(0))
 
     def update(split, state, batch):
-        own = learner if split.number == 1 else learners.split_over(learner, split)
+        own = learner if split.number == 1 else learners.over_axis(learner, split.axis)
         state, metrics = own.update(state, batch, trainer.as_arrays(HParams()))
         return state, split.mean(metrics)
 
@@ -88,7 +88,7 @@ def test_moments_of_the_normalizers_are_those_of_all_parts():
     before = normalizer.update(normalizer.init(2), values[:3] - 1.0, 200.0)
 
     def update(split, state, values, valid):
-        return normalizer.update(state, values, 200.0, valid[:, None], split)
+        return normalizer.update(state, values, 200.0, valid[:, None], split.axis)
 
     kept = np.concatenate([np.asarray(values[:3] - 1.0).reshape(-1, 2), np.asarray(values[valid]).reshape(-1, 2)])
     for number in DEVICES:
@@ -266,7 +266,7 @@ def test_a_learner_that_cannot_be_split_is_refused():
                     setattr(self, method, getattr(learner, method))
 
     own = Own(learners.make("ddpg", CONFIG, trainer.env_sizes(ENV)))
-    with pytest.raises(ValueError, match="one run of learner Own cannot be on 2 devices, because it has no split_over"):
+    with pytest.raises(ValueError, match=r"learner Own .* axis_name"):
         next(loop.train(ENV, CONFIG, learner=own, devices=2))
 
 

@@ -86,4 +86,5 @@ BATCH = Batch(
     desired_goal=jnp.array([[-1.0], [-4.0]]),
     action=jnp.array([[1.0], [-1.0]]),
     reward=jnp.array([-1.0, 0.0]),
+    discount=jnp.array([0.5, 0.5]),
 )

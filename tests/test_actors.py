@@ -13,7 +13,6 @@ from mjx_dher.config import HParams
 from mjx_dher.learners import actors
 from mjx_dher.learners.actors import Deterministic, Gaussian
 from mjx_dher.networks import Actor, GaussianActor
-from mjx_dher.types import Sizes
 
 KEY = jax.random.key(0)
 HP = HParams(target_noise=0.3, target_noise_clip=0.2, action_l2=0.0, entropy_weight=0.5, entropy_target=-2.0)
@@ -46,15 +45,19 @@ def zeros(*shape):
     return jnp.zeros(shape)
 
 
+def normal(*shape):
+    return jax.random.normal(KEY, shape)
+
+
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def draw(params, number, size=2):
     """Actions of as many states, and their log probabilities."""
-    return actors.draw(Fixed(), params, zeros(number, size), zeros(number, 1), KEY)
+    return actors.sample_action(Fixed(), params, zeros(number, size), zeros(number, 1), normal(number, size))
 
 
 def test_a_target_s_actions_are_smoothed_within_bounds():
     actions = jnp.tile(jnp.array([[0.0, 0.95]]), (20_000, 1))
-    smoothed, cost = Deterministic().next_action(Straight(), {}, actions, zeros(20_000, 1), KEY, HP)
+    smoothed, cost = Deterministic().next_action(Straight(), {}, actions, zeros(20_000, 1), normal(20_000, 2), HP)
     assert not cost.any()
     noise = np.asarray(smoothed[:, 0])
     assert np.abs(noise).max() == pytest.approx(0.2)
@@ -67,7 +70,7 @@ def test_a_target_s_actions_are_smoothed_within_bounds():
 def test_a_deterministic_actor_s_loss_by_hand():
     judge = lambda action: action[:, 0] - 2 * action[:, 1]  # noqa: E731
     loss, metrics = Deterministic().loss(
-        Straight(), {}, jnp.array([[0.5, 0.1], [-0.5, 0.3]]), zeros(2, 1), judge, KEY, HP._replace(action_l2=0.5)
+        Straight(), {}, jnp.array([[0.5, 0.1], [-0.5, 0.3]]), zeros(2, 1), judge, normal(2, 2), HP._replace(action_l2=0.5)
     )
     np.testing.assert_allclose(loss, 0.4 + 0.5 * (0.25 + 0.01 + 0.25 + 0.09) / 4, rtol=1e-6)
     assert metrics == {}
@@ -103,7 +106,7 @@ def test_far_out_log_probabilities_stay_finite():
 
 def test_a_gaussian_actor_s_target_costs_alpha_log_pi():
     params = gaussian(0.3, 0.5, log_alpha=np.log(4.0))
-    action, cost = Gaussian().next_action(Fixed(), params, zeros(16, 2), zeros(16, 1), KEY, HP)
+    action, cost = Gaussian().next_action(Fixed(), params, zeros(16, 2), zeros(16, 1), normal(16, 2), HP)
     drawn, log_prob = draw(params, 16)
     np.testing.assert_allclose(action, drawn, rtol=1e-6)
     np.testing.assert_allclose(cost, 0.5 * 4.0 * log_prob, rtol=1e-6)
@@ -113,7 +116,7 @@ def test_a_gaussian_actor_s_loss_by_hand():
     params, judge = gaussian(0.3, 0.5, log_alpha=np.log(4.0)), lambda action: 3.0 * action[:, 0]
     arguments = zeros(16, 2), zeros(16, 1)
     (loss, metrics), gradient = jax.value_and_grad(
-        lambda params: Gaussian().loss(Fixed(), params, *arguments, judge, KEY, HP), has_aux=True
+        lambda params: Gaussian().loss(Fixed(), params, *arguments, judge, normal(16, 2), HP), has_aux=True
     )(params)
     action, log_prob = draw(params, 16)
     target = -2.0 * 2  # entropy_target for each of two numbers
@@ -127,7 +130,7 @@ def test_a_gaussian_actor_s_loss_by_hand():
 def test_the_weight_of_entropy_rises_where_there_is_too_little(std, sign):
     """Gradient descent raises log_alpha where its gradient is below 0: at entropies under the target."""
     gradient = jax.grad(
-        lambda params: Gaussian().loss(Fixed(), params, zeros(99, 2), zeros(99, 1), lambda a: a[:, 0], KEY, HP)[0]
+        lambda params: Gaussian().loss(Fixed(), params, zeros(99, 2), zeros(99, 1), lambda a: a[:, 0], normal(99, 2), HP)[0]
     )(gaussian(0.0, std))
     assert np.sign(gradient["log_alpha"]) == sign
 
@@ -152,8 +155,8 @@ def test_exploring_without_a_distribution_adds_noise():
 
 
 def test_layers_for_export_are_those_of_the_means():
-    sizes, network = Sizes(5, 3, 2), GaussianActor(2, (8,))
-    params = Gaussian().init(network, KEY, sizes)
+    inputs, network = (jnp.zeros(5), jnp.zeros(3)), GaussianActor(2, (8,))
+    params = Gaussian().init(network, KEY, *inputs)
     layers = Gaussian().dense(network, params)
     assert layers["Dense_1"]["kernel"].shape == (8, 2)
     mean, _ = network.apply(params["network"], jnp.ones(5), jnp.ones(3))
@@ -161,7 +164,7 @@ def test_layers_for_export_are_those_of_the_means():
     np.testing.assert_allclose(hidden @ layers["Dense_1"]["kernel"] + layers["Dense_1"]["bias"], mean, rtol=1e-5)
     assert Gaussian().dense(Fixed(), params) is None
     assert Deterministic().dense(Straight(), {}) is None
-    assert set(Deterministic().dense(Actor(2, (8,)), Deterministic().init(Actor(2, (8,)), KEY, sizes))) == {
+    assert set(Deterministic().dense(Actor(2, (8,)), Deterministic().init(Actor(2, (8,)), KEY, *inputs))) == {
         "Dense_0",
         "Dense_1",
     }

@@ -9,7 +9,6 @@ import pytest
 from mjx_dher.learners import critics
 from mjx_dher.learners.critics import Critics
 from mjx_dher.networks import Critic
-from mjx_dher.types import Sizes
 
 KEY = jax.random.key(0)
 TWO = jnp.array([[[-1.0], [-4.0]], [[-2.0], [-3.0]]])  # two critics, two samples
@@ -114,9 +113,9 @@ def test_judges_of_actions():
 
 
 def test_critics_begin_apart_and_are_each_that_critic_alone():
-    sizes, network = Sizes(5, 3, 2), Critic((16,), size=4)
-    params = Critics(3, 4, critics.smallest, critics.squared_error, critics.mean).init(network, KEY, sizes)
-    inputs = [jax.random.normal(jax.random.key(i), (7, size)) for i, size in enumerate(sizes)]
+    network = Critic((16,), size=4)
+    params = Critics(3, 4, critics.smallest, critics.squared_error, critics.mean).init(network, KEY, *map(jnp.zeros, (5, 3, 2)))
+    inputs = [jax.random.normal(jax.random.key(i), (7, size)) for i, size in enumerate((5, 3, 2))]
     values = critics.values(network, params, *inputs)
     assert values.shape == (3, 7, 4)
     assert not np.allclose(values[0], values[1])

@@ -1,4 +1,5 @@
 import dataclasses
+import types
 
 import flax.linen as nn
 import jax
@@ -8,7 +9,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from mjx_dher.config import HParams
-from mjx_dher.learners import common, ddpg
+from mjx_dher.learners import actors, ddpg
+from mjx_dher.learners.actors import Deterministic
 from mjx_dher.learners.common import Params
 from mjx_dher.learners.ddpg import DDPG
 from mjx_dher.networks import Actor, Critic, Networks, fan_in, mlp
@@ -37,44 +39,50 @@ def state():
     return LEARNER.init(jax.random.key(0))
 
 
-def test_target_value_by_hand(state):
-    # Q' of the next states: -0.5 * 0 - 0.25 + 0.5 * tanh(0) = -0.25 and -1 - 1 + 0.5 * tanh(2).
-    q = np.array([-0.25, -2 + 0.5 * np.tanh(2)])
-    got = ddpg.target_value(NETWORKS, state.target, BATCH, HP)
-    np.testing.assert_allclose(got, [-1 + 0.5 * q[0], 0.5 * q[1]], rtol=1e-6)
+def losses_of(batch, state, hparams=HP):
+    return ddpg.compute_gradients(NETWORKS, state.params, state.target, batch, hparams)[1]
 
 
-@pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
-def test_target_value_is_clipped_to_what_returns_can_be(state, reward, clipped):
-    batch = BATCH.replace(reward=jnp.full(2, reward))
-    np.testing.assert_allclose(ddpg.target_value(NETWORKS, state.target, batch, HP), [clipped, clipped])
+Q = np.array([-0.25, -1.5])  # of the batch: -0.5 - 0.25 + 0.5 and 0 - 1 - 0.5
 
 
 def test_losses_by_hand(state):
-    # Q of the batch: -0.5 - 0.25 + 0.5 = -0.25 and 0 - 1 - 0.5 = -1.5.
-    loss, q_mean = ddpg.critic_loss(NETWORKS, state.params.critic, BATCH, jnp.array([-1.25, -1.0]))
-    np.testing.assert_allclose([loss, q_mean], [(1 + 0.25) / 2, -0.875], rtol=1e-6)
+    losses = losses_of(BATCH, state)
+    # Q' of the next states: -0.5 * 0 - 0.25 + 0.5 * tanh(0) = -0.25 and -1 - 1 + 0.5 * tanh(2).
+    y = np.array([-1 + 0.5 * -0.25, 0.5 * (-2 + 0.5 * np.tanh(2))])
+    np.testing.assert_allclose([losses.critic_loss, losses.q_mean], [np.mean((Q - y) ** 2), -0.875], rtol=1e-6)
     # pi: tanh(1) and 0; Q: -0.75 + tanh(1) / 2 and -1.
     a = np.tanh(1.0)
-    loss = ddpg.actor_loss(NETWORKS, state.params.actor, state.params.critic, BATCH, HP)
-    np.testing.assert_allclose(loss, -((-0.75 + a / 2) - 1) / 2 + 0.25 * a * a / 2, rtol=1e-6)
+    np.testing.assert_allclose(losses.actor_loss, -((-0.75 + a / 2) - 1) / 2 + 0.25 * a * a / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
+def test_targets_are_clipped_to_what_returns_can_be(state, reward, clipped):
+    loss = losses_of(BATCH.replace(reward=jnp.full(2, reward)), state).critic_loss
+    np.testing.assert_allclose(loss, np.mean((Q - clipped) ** 2), rtol=1e-6)
 
 
 def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
     updated, losses = update(state, BATCH, HP._replace(critic_lr=0.1, actor_lr=0.01))
-    target = ddpg.target_value(NETWORKS, state.target, BATCH, HP)
-    c_grad = jax.grad(lambda p: ddpg.critic_loss(NETWORKS, p, BATCH, target)[0])(state.params.critic)
-    a_grad = jax.grad(lambda p: ddpg.actor_loss(NETWORKS, p, state.params.critic, BATCH, HP))(state.params.actor)
+    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, HP)
     # Adam's first step moves each parameter by the step size, against the sign of its gradient.
-    for new, old, grad, lr in (
-        (updated.params.critic, state.params.critic, c_grad, 0.1),
-        (updated.params.actor, state.params.actor, a_grad, 0.01),
-    ):
-        jax.tree.map(lambda n, o, g, lr=lr: np.testing.assert_allclose(n, o - lr * np.sign(g), rtol=1e-4), new, old, grad)
+    for name, lr in (("critic", 0.1), ("actor", 0.01)):
+        step = lambda new, old, g, lr=lr: np.testing.assert_allclose(new, old - lr * np.sign(g), rtol=1e-4)  # noqa: E731
+        jax.tree.map(step, *(getattr(x, name) for x in (updated.params, state.params, gradients)))
     jax.tree.map(np.testing.assert_array_equal, updated.target, state.target)
     assert updated.num_updates == 1
     assert losses.keys() == {"critic_loss", "actor_loss", "q_mean"}
     np.testing.assert_allclose(losses["q_mean"], -0.875, rtol=1e-6)
+
+
+def test_gradients_are_those_of_each_loss_by_its_own_network(state):
+    """By differences: a step along one network's parameters changes the loss by its gradient, and the other does not count."""
+    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, HP)
+    for name, loss in (("critic", "critic_loss"), ("actor", "actor_loss")):
+        moved = [jax.tree.map(lambda x, d=d: x + d, getattr(state.params, name)) for d in (0.01, -0.01)]
+        up, down = (losses_of(BATCH, state.replace(params=state.params.replace(**{name: params}))) for params in moved)
+        slope = (getattr(up, loss) - getattr(down, loss)) / 0.02
+        np.testing.assert_allclose(slope, sum(x.sum() for x in jax.tree.leaves(getattr(gradients, name))), rtol=1e-3)
 
 
 def test_summed_gradients_are_averaged_ones_with_a_smaller_adam_eps(state):
@@ -120,28 +128,34 @@ def test_the_summary_is_the_norms_of_all_parameters(state):
 
 def test_exploring_is_acting_under_noise(state):
     """The noise of one step: to the first action it is added, and the second one takes its place."""
-    noise = common.Noise(jnp.array([[0.1], [0.1]]), jnp.array([False, True]), jnp.array([[0.9], [-0.9]]))
+    noise = actors.Noise(jnp.array([[0.1], [0.1]]), jnp.array([False, True]), jnp.array([[0.9], [-0.9]]))
     obs = {"observation": jnp.array([[0.5], [0.5]]), "desired_goal": jnp.zeros((2, 1))}
     action = LEARNER.explore(state, obs, noise, HP)
     np.testing.assert_allclose(action, [LEARNER.act(state, obs, HP)[0] + 0.1, [-0.9]], rtol=1e-6)
     whole = LEARNER.noise(jax.random.key(0), 3, 2, HP)
-    jax.tree.map(np.testing.assert_array_equal, whole, common.exploration_noise(jax.random.key(0), 3, 2, 1, HP))
+    jax.tree.map(np.testing.assert_array_equal, whole, actors.exploration_noise(jax.random.key(0), 3, 2, 1, HP))
+
+
+def explored(noise, policy):
+    """Actions of a policy that gives `policy`, under noise."""
+    network = types.SimpleNamespace(apply=lambda params, observation, goal: observation)
+    return Deterministic().explore(network, (), policy, policy, noise)
 
 
 def make_noise(**hparams):
-    return common.exploration_noise(jax.random.key(1), 100, 1000, 2, HParams(**hparams))
+    return actors.exploration_noise(jax.random.key(1), 100, 1000, 2, HParams(**hparams))
 
 
 def test_exploration_is_a_mixture_of_uniform_and_clipped_gaussian():
     policy = jnp.tile(jnp.array([0.0, 0.9]), (100, 1000, 1))
-    noisy = common.add_noise(make_noise(random_eps=0.0, noise_std=0.2), policy)
+    noisy = explored(make_noise(random_eps=0.0, noise_std=0.2), policy)
     assert abs(float(noisy[..., 0].std()) - 0.2) < 0.002
     assert abs(float(noisy[..., 0].mean())) < 0.002
     assert float(noisy.max()) == 1.0
-    uniform = common.add_noise(make_noise(random_eps=1.0, noise_std=0.2), policy)
+    uniform = explored(make_noise(random_eps=1.0, noise_std=0.2), policy)
     assert abs(float(uniform.mean())) < 0.005
     assert abs(float(uniform.std()) - 1 / np.sqrt(3)) < 0.005
-    mixed = common.add_noise(make_noise(random_eps=0.3, noise_std=0.0), policy)
+    mixed = explored(make_noise(random_eps=0.3, noise_std=0.0), policy)
     is_random = ~np.asarray(mixed == policy).all(-1)
     assert abs(is_random.mean() - 0.3) < 0.006
     np.testing.assert_array_equal(np.asarray(mixed != policy).any(-1), is_random)  # an action is random as a whole
@@ -201,19 +215,17 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     observation, following, goal, action = (
         jax.random.normal(jax.random.key(i), (512, size)) for i, size in enumerate((25, 25, 3, 4))
     )
-    batch = Batch(observation, following, goal, jnp.tanh(action), -jnp.ones(512))
+    batch = Batch(observation, following, goal, jnp.tanh(action), -jnp.ones(512), jnp.full(512, 0.98))
     hparams = HParams()
 
     def passes(networks):
         action = networks.actor.apply(params.actor, observation, goal)
         assert action.dtype == networks.critic.apply(params.critic, observation, goal, action).dtype == jnp.float32
-        target = ddpg.target_value(networks, params, batch, hparams)
-        critic = jax.grad(lambda critic: ddpg.critic_loss(networks, critic, batch, target)[0])(params.critic)
-        actor = jax.grad(lambda actor: ddpg.actor_loss(networks, actor, params.critic, batch, hparams))(params.actor)
-        return target, ravel_pytree(critic)[0], ravel_pytree(actor)[0]
+        gradients, losses = ddpg.compute_gradients(networks, params, params, batch, hparams)
+        return losses.critic_loss, ravel_pytree(gradients.critic)[0], ravel_pytree(gradients.actor)[0]
 
-    (target, *gradients), (near, *others) = passes(exact), passes(rounded)
-    assert 0 < float(jnp.abs(target - near).max()) < 0.05
+    (loss, *gradients), (near, *others) = passes(exact), passes(rounded)
+    assert 0 < abs(float(loss - near)) < 0.05 * float(loss)
     for ours, other in zip(gradients, others, strict=True):
         assert other.dtype == jnp.float32
         assert float(ours @ other / jnp.linalg.norm(ours) / jnp.linalg.norm(other)) > np.cos(np.radians(5))

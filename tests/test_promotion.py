@@ -24,12 +24,12 @@ def strict(monkeypatch):
     """Optax's own arithmetic is exempt: Adam raises a float to the power of its count."""
     adam = common.adam
 
-    def as_ever(hparams=None):
+    def as_ever(*numbers):
         def update(*args):
             with jax.numpy_dtype_promotion("standard"):
-                return adam(hparams).update(*args)
+                return adam(*numbers).update(*args)
 
-        return adam(hparams)._replace(update=update)
+        return adam(*numbers)._replace(update=update)
 
     monkeypatch.setattr(common, "adam", as_ever)
     with jax.numpy_rank_promotion("raise"), jax.numpy_dtype_promotion("strict"):

@@ -1,18 +1,19 @@
-"""Learners as values: each is one file, over shared pieces. `Learner` says what one has, `make` makes one by name."""
+"""Learners: `Learner` is the protocol, `make` makes one by name."""
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 from collections.abc import Callable, Collection
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import components, networks
+from mjx_dher import check, components, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Values
 from mjx_dher.networks import NetworksFn
-from mjx_dher.parallel.split import Split
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
 
 # What the loop and the log call theirs: a learner's metrics have other names.
@@ -26,43 +27,66 @@ RESERVED = frozenset(
 
 
 class Learner(Protocol):
-    """A learner: pure functions of a state of its own, a pytree of arrays. Numbers come in as HParams, traced.
+    """A learner: pure functions of a state, which is a pytree of arrays. `hparams` holds traced numbers.
 
-    It may have `policy_delay`, an integer of more than 1, and `update_critic`, which is called like `update`: of so many
-    updates all but the last are then made by `update_critic`. It has `uses_discount`, True, where it takes the `discount` of a
-    batch, as returns of several steps need. It may have `value(state, obs, action, hparams)`, the estimated return [...] of
-    actions [..., A] and then following the policy, at observations [..., D] and goals [..., G]: priorities, distances and goal
-    generators that ask for the learner's values need it. It has `split_over`, a method that takes a `split.Split` and returns
-    a learner, where one run of it can be on several devices: that learner's `update` averages gradients by `Split.mean`, and
-    its `update_normalizers` takes in the values of all parts.
+    A learner defines `init`, `act`, `explore` and `update`. A subclass of this class inherits the other methods; any other
+    object must have them, too. Optional members:
+
+      value(state, obs, action [..., A], hparams) -> [...]: estimated return of taking an action and then following the policy.
+        Priorities, metrics and goal generators that use the learner's values need it.
+      axis_name: a field, None by default, of a dataclass. A run that is split over devices replaces it by the name of a mapped
+        axis. `update` then averages its gradients over this axis (`jax.lax.pmean`), and `update_normalizers` its moments.
     """
 
-    def init(self, key: PRNGKey) -> PyTree:
-        """Makes a first state."""
+    policy_delay: int = 1
+    """Updates for each update of the actor. If it is above 1, all updates but every policy_delay-th are called with the further
+    argument `with_actor=False`."""
 
-    def update_normalizers(self, state: Any, observation: Array, goal: Array, hparams: HParams, valid: Array) -> PyTree:
-        """Returns the state after it has taken in new observations [N, T+1, D], of valid [N] episodes, and goals [B, G]."""
+    def init(self, key: PRNGKey) -> PyTree:
+        """Makes the first state."""
 
     def act(self, state: Any, obs: GoalObs, hparams: HParams) -> Array:
-        """Returns the deterministic policy's actions [..., A] in [-1, 1]."""
+        """Deterministic policy: actions [..., A] in [-1, 1] for observations [..., D] and goals [..., G].
 
-    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> PyTree:
-        """Draws what `explore` takes in the steps of a rollout; leaves lead with [T, N]."""
+        Evaluation and the exported policy use it. Any leading axes are possible, or none.
+        """
 
     def explore(self, state: Any, obs: GoalObs, noise: Any, hparams: HParams) -> Array:
-        """Returns the exploring policy's actions [N, A]; leaves of `noise` lead with [N]."""
+        """Exploring policy: actions [N, A] in [-1, 1] for the N environments of a rollout.
+
+        `noise` is what `noise` drew for this step; its leaves lead with [N]. By default it is a key [N] for each environment.
+        """
 
     def update(self, state: Any, batch: Batch, hparams: HParams) -> tuple[PyTree, Metrics]:
-        """Takes one gradient step on a batch [B]; returns metrics [] to be averaged over an epoch, not called as `RESERVED`."""
+        """Takes one gradient step on a batch [B] of transitions.
+
+        The value of the next observation counts `batch.discount` [B]: gamma, 0 after a terminal transition, or with n-step
+        returns gamma^n. Targets stay as they are. Returns the next state, which has the same structure, shapes and types, and
+        metrics []. These are averaged over an epoch and logged; their names are not in `RESERVED`.
+        """
+
+    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> PyTree:
+        """Draws the randomness of exploration for a whole rollout, at once, because that is faster; leaves lead with [T, N]."""
+        return jax.random.split(key, (num_steps, num_envs))
+
+    def update_normalizers(self, state: Any, observation: Array, goal: Array, hparams: HParams, valid: Array) -> PyTree:
+        """Returns the state after a rollout's observations [N, T+1, D] and relabelled goals [B, G].
+
+        Observations with `valid` [N] False may be NaN and must be ignored. By default nothing is learned from either.
+        """
+        return state
 
     def update_target(self, state: Any, hparams: HParams) -> PyTree:
-        """Moves the target networks; called once every `target_period` updates."""
+        """Moves the target networks, if there are any; called once every `target_period` updates."""
+        return state
 
     def summary(self, state: Any) -> Metrics:
-        """Returns metrics [] of the state at the end of an epoch, with names that `update` does not use."""
+        """Metrics [] of the state, logged at the end of an epoch; their names differ from those of `update`."""
+        return {}
 
     def export(self, state: Any, hparams: HParams) -> Any:
-        """Returns the policy as a `policy.Policy`, which needs NumPy alone, or None where that cannot be."""
+        """Policy as a `policy.Policy`, which needs only NumPy. If None, the policy is saved as the learner's state."""
+        return None
 
 
 # make(config, sizes, networks) -> Learner
@@ -84,31 +108,22 @@ def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | Net
     make_learner = components.load("learner", name, "config", "sizes", "networks")
     learner = make_learner(config, sizes, networks.make(network))
     check_methods(name, learner)
-    check_discount(learner, config)
     return learner
 
 
 def check_methods(name: Any, learner: Any) -> None:
     """Raises ValueError unless `learner`, which messages call `name`, has the methods of a `Learner`."""
-    methods = [method for method in vars(Learner) if not method.startswith("_")]
+    methods = [method for method, function in vars(Learner).items() if callable(function) and not method.startswith("_")]
     if missing := [method for method in methods if not callable(getattr(learner, method, None))]:
         raise ValueError(f"learner {name!r} is no learner: it has no {', '.join(missing)} (see mjx_dher.learners.Learner)")
     delay = policy_delay(learner)
     check_size("policy_delay of the learner", delay)
-    if delay > 1 and not callable(getattr(learner, "update_critic", None)):
-        raise ValueError(f"learner {name!r} has a policy_delay of {delay}, and no update_critic")
-
-
-def check_discount(learner: Any, config: Config) -> None:
-    """Raises ValueError where batches have returns of several steps and the learner does not take their discount."""
-    if config.n_step > 1 and not getattr(learner, "uses_discount", False):
-        raise ValueError(
-            f"n_step {config.n_step} needs a learner that takes a batch's discount; {learner!r} has no uses_discount"
-        )
+    if delay > 1 and "with_actor" not in inspect.signature(learner.update).parameters:
+        raise ValueError(f"learner {name!r} has a policy_delay of {delay}, and its update no parameter with_actor")
 
 
 def check_values(learner: Any) -> None:
-    """Raises ValueError where a part of a run asks for a learner's values and it has no method for them."""
+    """Raises ValueError unless a learner has values, which a component of this run uses."""
     if not callable(getattr(learner, "value", None)):
         raise ValueError(
             f"a priority, metric or generator of this run asks for the learner's values, and {learner!r} has no method"
@@ -117,76 +132,71 @@ def check_values(learner: Any) -> None:
 
 
 def values_of(learner: Any, state: PyTree, hparams: HParams) -> Values:
-    """Returns a learner's policy and values, as it is in `state`, as functions of observations and goals."""
+    """A learner's policy and values at `state`, as functions of observations and goals."""
 
     def obs_of(observation: Array, goal: Array) -> GoalObs:
         return GoalObs(observation=observation, achieved_goal=goal, desired_goal=goal)
 
     def value(observation: Array, goal: Array, action: Array) -> Array:
         result = learner.value(state, obs_of(observation, goal), action, hparams)
-        if getattr(result, "shape", None) != action.shape[:-1]:
-            given = list(result.shape) if hasattr(result, "shape") else f"a {type(result).__name__}"
-            raise ValueError(f"learner.value must give one number for each action, {list(action.shape[:-1])}; it gives {given}")
-        return result
+        return check.array("learner.value, one number for each action,", result, action.shape[:-1])
 
     return Values(lambda observation, goal: learner.act(state, obs_of(observation, goal), hparams), value)
 
 
-def split_over(learner: Any, split: Split) -> Learner:
-    """Returns the learner of a run in parts.
+def over_axis(learner: Any, axis_name: str | None) -> Learner:
+    """Learner of a run that is split over the devices of a mapped axis.
 
     Raises:
-      ValueError: it has no `split_over`, so that its parts would learn apart.
+      ValueError: it has no field `axis_name`, so that the devices' copies would diverge.
     """
-    if not callable(getattr(learner, "split_over", None)):
+    if not hasattr(learner, "axis_name"):
         raise ValueError(
-            f"devices: one run of learner {type(learner).__name__} cannot be on {split.number} devices, because it has no"
-            " split_over (see mjx_dher.learners.Learner); runs side by side can"
+            f"devices: one run of learner {type(learner).__name__} cannot be on several devices, because it has no field"
+            " axis_name (see mjx_dher.learners.Learner); runs side by side can"
         )
-    made: Learner = learner.split_over(split)
-    check_methods(type(learner).__name__, made)
+    made: Learner = dataclasses.replace(learner, axis_name=axis_name)
     return made
 
 
 def policy_delay(learner: Any) -> int:
-    """Returns how many updates a learner makes for one of its actor; 1 where it does not say."""
+    """Updates of a learner for each update of its actor."""
     return getattr(learner, "policy_delay", 1)
 
 
 def check_kept(method: str, before: PyTree, after: PyTree) -> None:
-    """Raises ValueError unless a method of a learner keeps its state's structure, shapes and types, as `lax.scan` needs."""
+    """Raises ValueError unless a learner's method keeps its state's structure, shapes and types, as `lax.scan` needs."""
     old, new = (
         {jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x))}" for path, x in _leaves(state)}
         for state in (before, after)
     )
-    differing = [f"{name} is {old[name]} and becomes {new[name]}" for name in old if name in new and old[name] != new[name]]
-    differing += [f"only one of them has {name}" for name in {**old, **new} if (name in old) != (name in new)]
+    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    differing = [f"{name} is {old.get(name, 'absent')} and becomes {new.get(name, 'absent')}" for name in names]
     structure: Any = jax.tree.structure(before)
     if structure != jax.tree.structure(after) or differing:
         reason = (differing or ["its type or its static fields differ"])[0]
         raise ValueError(f"learner.{method} must keep the state's structure, shapes and types; {reason}")
 
 
-def check_update(state: PyTree, result: Any, method: str = "update") -> tuple[PyTree, Metrics]:
-    """Returns what a learner's `update` gave for `state`; raises ValueError unless it is a state like it, and metrics."""
+def check_update(state: PyTree, result: Any) -> tuple[PyTree, Metrics]:
+    """Returns the result of a learner's `update` of `state`; raises ValueError unless it is a state like it, and metrics."""
     if not (isinstance(result, tuple) and len(result) == 2):
-        raise ValueError(f"learner.{method} must give (state, metrics); it gives a {type(result).__name__}")
+        raise ValueError(f"learner.update must give (state, metrics); it gives a {type(result).__name__}")
     updated, metrics = result
-    check_kept(method, state, updated)
-    check_metrics(method, metrics)
+    check_kept("update", state, updated)
+    check_metrics("update", metrics)
     return updated, metrics
 
 
 def check_metrics(method: str, metrics: Any, taken: Collection[str] = ()) -> None:
-    """Raises ValueError unless a learner's metrics are scalars [] by names that are not in `RESERVED`, nor `taken`."""
+    """Raises ValueError unless a learner's metrics are scalars [] with names that are neither in `RESERVED` nor `taken`."""
     if not isinstance(metrics, dict):
         raise ValueError(f"metrics of learner.{method} must be a dict of scalars; they are a {type(metrics).__name__}")
     for name, value in metrics.items():
         if not isinstance(name, str) or name in RESERVED or name in taken:
-            reason = "is another's" if isinstance(name, str) else "is no text"
+            reason = "is taken" if isinstance(name, str) else "is no text"
             raise ValueError(f"metrics of learner.{method} must have names of their own; {name!r} {reason}")
-        if jnp.shape(value) != ():
-            raise ValueError(f"metrics of learner.{method} must be scalars, []; {name} is {list(jnp.shape(value))}")
+        check.array(f"metric {name} of learner.{method}", value, (), jnp.number)
 
 
 def check_noise(noise: PyTree, num_steps: int, num_envs: int) -> None:

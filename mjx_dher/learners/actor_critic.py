@@ -1,16 +1,15 @@
-"""An actor and several critics, as values: the update that td3, sac, tqc, redq and dtqc share.
+"""TD3, SAC, REDQ, TQC and DTQC: one update, with an actor (`actors`) and what is made of several critics (`critics`).
 
-    y = clip(r + gamma (combine(Q'_1..C(s', a')) - cost(a')), -1/(1-gamma), 0)
+    y = clip(r + discount (combine(Q'_1..C(s', a')) - cost(a')))
     critics: one step of Adam down loss(Q_1..C(s, a), y)
     actor:   one step of Adam down its own loss, once every `policy_delay` steps of the critics
 
-The bounds are those of returns whose rewards lie in [-1, 0], for entropy's pay, too (Hiraoka 2023).
+Targets, entropy's pay included, are clipped to the bounds of returns (Hiraoka 2023).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,13 +19,11 @@ from flax import struct
 from mjx_dher import normalizer
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common, critics
-from mjx_dher.learners.actors import ActorKind
-from mjx_dher.learners.common import Params
+from mjx_dher.learners.actors import ActorKind, Deterministic, Gaussian
+from mjx_dher.learners.common import ActorCriticBase, Params
 from mjx_dher.learners.critics import Critics
-from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, check_outputs
+from mjx_dher.networks import Heads, NetworksFn, check_heads, check_outputs
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.parallel.split import ALONE, Split
-from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
 
 
@@ -35,7 +32,7 @@ class ActorCriticState:
     """Everything that learning changes. The critics' parameters lead with [C]."""
 
     params: Params
-    target: Params  # its actor is () where targets take their actions from the actor itself
+    target: Params  # its actor is () if targets take their actions from the actor itself
     actor_moments: PyTree  # Adam's
     critic_moments: PyTree
     observation_norm: NormalizerState  # [D]
@@ -45,158 +42,163 @@ class ActorCriticState:
 
 
 @dataclasses.dataclass(frozen=True)
-class ActorCritic:
-    """The learner: pure functions of an `ActorCriticState`. `learners.Learner` says what each does."""
+class ActorCritic(ActorCriticBase):
+    """The learner: pure functions of an `ActorCriticState`. `learners.Learner` describes the methods."""
 
-    sizes: Sizes
-    networks: Networks  # float32; these play
-    learning: Networks  # of the learner's dtype, with the same parameters; these learn
-    actor: ActorKind
-    critics: Critics
-    policy_delay: int = 1  # steps of the critics for one of the actor
-    split: Split = ALONE
-    uses_discount: ClassVar[bool] = True
+    critics: Critics = dataclasses.field(kw_only=True)
+    policy_delay: int = 1
 
     def init(self, key: PRNGKey) -> ActorCriticState:
         """Makes fresh networks, targets equal to them, and empty normalizers."""
         actor_key, critic_key, update_key = jax.random.split(key, 3)
+        observation, goal, action = (jnp.zeros(size) for size in self.sizes)
         params = Params(
-            actor=self.actor.init(self.networks.actor, actor_key, self.sizes),
-            critic=self.critics.init(self.networks.critic, critic_key, self.sizes),
+            actor=self.actor.init(self.networks.actor, actor_key, observation, goal),
+            critic=self.critics.init(self.networks.critic, critic_key, observation, goal, action),
         )
         return ActorCriticState(
             params=params,
-            target=jax.tree.map(jnp.copy, self._lagging(params)),
-            actor_moments=common.adam().init(params.actor),
-            critic_moments=common.adam().init(params.critic),
+            target=jax.tree.map(jnp.copy, self.lagging(params)),
+            actor_moments=common.adam(0.0).init(params.actor),
+            critic_moments=common.adam(0.0).init(params.critic),
             observation_norm=normalizer.init(self.sizes.observation),
             goal_norm=normalizer.init(self.sizes.goal),
             key=jax.random.key_data(update_key),
             num_updates=jnp.zeros((), jnp.int32),
         )
 
-    def _lagging(self, params: Params) -> Params:
-        return params if self.actor.has_target else Params(actor=(), critic=params.critic)
-
-    def split_over(self, split: Split) -> ActorCritic:
-        """Returns the learner of a run in parts: gradients and the normalizers' moments are those of all of them."""
-        return dataclasses.replace(self, split=split, actor=self.actor.split_over(split))
-
-    def update_normalizers(
-        self, state: ActorCriticState, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
-    ) -> ActorCriticState:
-        """Takes new observations and goals into the normalizers."""
-        return common.update_normalizers(state, observation, goal, hparams, valid, self.split)
-
-    def act(self, state: ActorCriticState, obs: GoalObs, hparams: HParams) -> Array:
-        """Returns the deterministic policy's actions [..., A] in [-1, 1]."""
-        return self.actor.act(self.networks.actor, state.params.actor, *common.normalize_obs(state, obs, hparams))
-
     def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
-        """Returns what the critics, as judges of the actor, say [...] of actions [..., A]."""
+        """The critics' judgement [...] of actions [..., A]."""
         observation, goal = common.normalize_obs(state, obs, hparams)
         flat = [x.reshape(-1, x.shape[-1]) for x in (observation, goal, action)]
         judges = self.critics.judges(state.params.critic)
         return self.critics.judge(critics.values(self.networks.critic, judges, *flat)).reshape(action.shape[:-1])
 
-    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> common.Noise:
-        """Draws what `explore` takes; leaves lead with [T, N]."""
-        return self.actor.noise(key, num_steps, num_envs, self.sizes.action, hparams)
-
-    def explore(self, state: ActorCriticState, obs: GoalObs, noise: common.Noise, hparams: HParams) -> Array:
-        """Returns the exploring policy's actions [N, A] under the noise of one step."""
-        inputs = common.normalize_obs(state, obs, hparams)
-        return self.actor.explore(self.networks.actor, state.params.actor, *inputs, noise)
-
-    def update(self, state: ActorCriticState, batch: Batch, hparams: HParams) -> tuple[ActorCriticState, Metrics]:
-        """Takes one step of Adam for the critics, and then for the actor, whose judge they are. Targets stay as they are."""
-        return self._update(state, batch, hparams, with_actor=True)
-
-    def update_critic(self, state: ActorCriticState, batch: Batch, hparams: HParams) -> tuple[ActorCriticState, Metrics]:
-        """Takes one step of Adam for the critics alone."""
-        return self._update(state, batch, hparams, with_actor=False)
-
-    def _update(
-        self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool
+    def update(
+        self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool = True
     ) -> tuple[ActorCriticState, Metrics]:
+        """Takes one step of Adam for the critics and then, `with_actor`, for the actor, which these critics judge."""
         batch = common.normalize_batch(state, batch, hparams)
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates)
         target_key, actor_key = jax.random.split(key)
         atoms = self.target(state, batch, hparams, target_key)
-        (loss, q_mean), gradient = jax.value_and_grad(self._critic_loss, has_aux=True)(state.params.critic, batch, atoms)
-        direction, critic_moments = common.adam(hparams).update(self.split.mean(gradient), state.critic_moments)
-        critic = jax.tree.map(lambda p, d: p - hparams.critic_lr * d, state.params.critic, direction)
-        metrics = {"critic_loss": loss, "q_mean": q_mean}
+
+        def critic_loss(critic: PyTree) -> tuple[Array, Array]:
+            values = critics.values(self.learning.critic, critic, batch.observation, batch.desired_goal, batch.action)
+            return self.critics.loss(values, atoms), jnp.mean(values)
+
+        (loss, q_mean), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.params.critic)
+        adam = common.adam(hparams.critic_lr, hparams.adam_eps)
+        updates, critic_moments = adam.update(self.mean(gradient), state.critic_moments)
+        critic = optax.apply_updates(state.params.critic, updates)
         state = dataclasses.replace(
             state,
             params=dataclasses.replace(state.params, critic=critic),
             critic_moments=critic_moments,
             num_updates=state.num_updates + 1,
         )
-        return self._update_actor(state, batch, hparams, actor_key, metrics) if with_actor else (state, metrics)
+        metrics = {"critic_loss": loss, "q_mean": q_mean}
+        if not with_actor:
+            return state, metrics
+        state, more = self._update_actor(state, batch, hparams, actor_key)
+        return state, metrics | more
 
     def target(self, state: ActorCriticState, batch: Batch, hparams: HParams, key: PRNGKey) -> Array:
-        """Returns the atoms [B, K] of the critics' target; `batch` is normalized.
-
-        Episodes end by the clock alone, so every next state has a value.
-        """
+        """Atoms [B, K] of the critics' target; `batch` is normalized."""
         action_key, combine_key = jax.random.split(key)
         params = state.target.actor if self.actor.has_target else state.params.actor
-        inputs = batch.next_observation, batch.desired_goal
-        action, cost = self.actor.next_action(self.learning.actor, params, *inputs, action_key, hparams)
+        inputs, normal = (batch.next_observation, batch.desired_goal), self.normal(action_key, batch.action.shape)
+        action, cost = self.actor.next_action(self.learning.actor, params, *inputs, normal, hparams)
         following = critics.values(self.learning.critic, state.target.critic, *inputs, action)
         future = (self.critics.combine(following, combine_key) - cost[:, None]).T  # [K, B]
-        target = batch.reward + common.discount(batch, hparams) * future
-        return jnp.clip(target, -1.0 / (1.0 - hparams.gamma), 0.0).T
-
-    def _critic_loss(self, critic: PyTree, batch: Batch, atoms: Array) -> tuple[Array, Array]:
-        values = critics.values(self.learning.critic, critic, batch.observation, batch.desired_goal, batch.action)
-        return self.critics.loss(values, atoms), jnp.mean(values)
+        assert batch.discount is not None
+        return jnp.clip(batch.reward + batch.discount * future, -1.0 / (1.0 - hparams.gamma), 0.0).T
 
     def _update_actor(
-        self, state: ActorCriticState, batch: Batch, hparams: HParams, key: PRNGKey, metrics: Metrics
+        self, state: ActorCriticState, batch: Batch, hparams: HParams, key: PRNGKey
     ) -> tuple[ActorCriticState, Metrics]:
-        inputs, judges = (batch.observation, batch.desired_goal), self.critics.judges(state.params.critic)
+        inputs, normal = (batch.observation, batch.desired_goal), self.normal(key, batch.action.shape)
+        judges = self.critics.judges(state.params.critic)
 
         def judge(action: Array) -> Array:
             return self.critics.judge(critics.values(self.learning.critic, judges, *inputs, action))
 
-        def loss_of(actor: PyTree) -> tuple[Array, Metrics]:
-            return self.actor.loss(self.learning.actor, actor, *inputs, judge, key, hparams)
+        def actor_loss(actor: PyTree) -> tuple[Array, Metrics]:
+            return self.actor.loss(self.learning.actor, actor, *inputs, judge, normal, hparams)
 
-        (loss, more), gradient = jax.value_and_grad(loss_of, has_aux=True)(state.params.actor)
-        direction, moments = common.adam(hparams).update(self.split.mean(gradient), state.actor_moments)
-        actor = jax.tree.map(lambda p, d: p - hparams.actor_lr * d, state.params.actor, direction)
+        (loss, metrics), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.params.actor)
+        adam = common.adam(hparams.actor_lr, hparams.adam_eps)
+        updates, moments = adam.update(self.mean(gradient), state.actor_moments)
+        actor = optax.apply_updates(state.params.actor, updates)
         state = dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor), actor_moments=moments)
-        return state, {**metrics, "actor_loss": loss, **more}
-
-    def update_target(self, state: ActorCriticState, hparams: HParams) -> ActorCriticState:
-        """Moves the targets softly: they keep a fraction `polyak` of themselves and take the rest from the networks."""
-        target = optax.incremental_update(self._lagging(state.params), state.target, 1.0 - hparams.polyak)
-        return dataclasses.replace(state, target=target)
-
-    def summary(self, state: ActorCriticState) -> Metrics:
-        """Returns the Euclidean norms of all parameters: actor_norm and critic_norm."""
-        return {"actor_norm": optax.tree.norm(state.params.actor), "critic_norm": optax.tree.norm(state.params.critic)}
-
-    def export(self, state: ActorCriticState, hparams: HParams) -> Policy | None:
-        """Returns the deterministic policy as NumPy arrays; None for networks of one's own, which NumPy cannot compute."""
-        dense = self.actor.dense(self.networks.actor, state.params.actor)
-        return None if dense is None else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
+        return state, {"actor_loss": loss, **metrics}
 
 
-def make(name: str, config: Config, sizes: Sizes, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
-    """Makes the learner called `name`, after `config`: its dtype, and its `policy_delay` where it has one.
-
-    Raises:
-      ValueError: networks without the outputs that it needs, or kernels, which compute ddpg alone.
-    """
+def _make(name: str, config: Config, sizes: Sizes, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
     if config.learner_kernels == "hopper":
         raise ValueError(f"learner_kernels hopper computes learner ddpg; it is {name}")
     check_heads(networks, name)
     heads = Heads(gaussian=actor.is_gaussian, critic_size=parts.size)
-    playing, learning = (
+    acting, learning = (
         networks(sizes.action, config.hidden_sizes, dtype, heads) for dtype in ("float32", config.learner_dtype)
     )
-    check_outputs(name, playing, sizes, heads)
-    return ActorCritic(sizes, playing, learning, actor, parts, config.policy_delay)
+    check_outputs(name, acting, sizes, heads)
+    return ActorCritic(sizes, acting, learning, actor, critics=parts, policy_delay=config.policy_delay)
+
+
+def td3(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+    """TD3 (Fujimoto et al. 2018): two critics whose smaller value is the target, smoothed targets, a delayed actor.
+
+    y = r + gamma min_i Q'_i(s', clip(pi'(s') + clip(eps, -c, c)))  (equations 10 and 14)
+    critics: mean (Q_i(s, a) - y)^2;  actor: -mean Q_1(s, pi(s))
+    """
+    parts = Critics(config.num_critics, 1, critics.smallest, critics.squared_error, critics.lowest, num_judges=1)
+    return _make("td3", config, sizes, networks, Deterministic(), parts)
+
+
+def sac(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+    """SAC (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications"): entropy is paid, with a learned weight.
+
+    y = r + gamma (min_i Q'_i(s', a') - alpha log pi(a'|s')),  a' ~ pi(s')  (equations 2, 3 and 5)
+    critics: mean (Q_i(s, a) - y)^2;  actor: mean(alpha log pi(a|s) - min_i Q_i(s, a))
+    """
+    parts = Critics(config.num_critics, 1, critics.smallest, critics.squared_error, critics.lowest)
+    return _make("sac", config, sizes, networks, Gaussian(), parts)
+
+
+def redq(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+    """REDQ (Chen et al. 2021): SAC with many critics, of which `subset_critics` drawn at random make the target.
+
+    y = r + gamma (min_{i in M} Q'_i(s', a') - alpha log pi(a'|s'))  (algorithm 1)
+    critics: mean (Q_i(s, a) - y)^2;  actor: mean(alpha log pi(a|s) - mean_i Q_i(s, a))
+    The paper has 10 critics, subsets of 2, and 20 updates for each step.
+    """
+    if config.subset_critics > config.num_critics:
+        raise ValueError(f"subset_critics must be at most num_critics ({config.num_critics}); got {config.subset_critics}")
+    combine = critics.smallest_of(config.subset_critics)
+    parts = Critics(config.num_critics, 1, combine, critics.squared_error, critics.mean)
+    return _make("redq", config, sizes, networks, Gaussian(), parts)
+
+
+def tqc(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+    """TQC (Kuznetsov et al. 2020): SAC whose critics give quantiles of the return; the largest are left out of the target.
+
+    y_k = r + gamma (z_k(s', a') - alpha log pi(a'|s')),  z_1 <= z_2 <= ... the pooled quantiles without the largest
+    critics: the quantile Huber loss (equation 12);  actor: mean(alpha log pi(a|s) - the mean of all quantiles)
+    The paper has 5 critics of 25 quantiles each, and drops 2 of each.
+    """
+    return _make("tqc", config, sizes, networks, Gaussian(), _quantiles(config))
+
+
+def dtqc(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+    """The critics of TQC with TD3's actor, which is deterministic and explores under noise."""
+    return _make("dtqc", config, sizes, networks, Deterministic(), _quantiles(config))
+
+
+def _quantiles(config: Config) -> Critics:
+    if config.dropped_quantiles >= config.num_quantiles:
+        raise ValueError(
+            f"dropped_quantiles must be less than num_quantiles ({config.num_quantiles}); got {config.dropped_quantiles}"
+        )
+    combine = critics.truncated(config.dropped_quantiles)
+    return Critics(config.num_critics, config.num_quantiles, combine, critics.quantile_huber, critics.mean)

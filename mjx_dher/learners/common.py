@@ -1,4 +1,4 @@
-"""Shared pieces of learners: parameters, normalized inputs, exploration noise."""
+"""What the built-in learners share: normalized inputs, acting, moving targets, and exporting the policy."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ from flax import struct
 
 from mjx_dher import normalizer
 from mjx_dher.config import HParams
+from mjx_dher.learners import Learner
+from mjx_dher.learners.actors import ActorKind, Deterministic, Noise
+from mjx_dher.networks import Networks
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.parallel.split import ALONE, Split
-from mjx_dher.types import Array, Batch, GoalObs, PRNGKey, PyTree
+from mjx_dher.policy import Policy, from_mlp
+from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+
+State = TypeVar("State", bound=Any)  # has params, target, observation_norm and goal_norm
+Tree = TypeVar("Tree", bound=Any)
 
 
 @struct.dataclass
@@ -33,80 +39,105 @@ class Losses(NamedTuple):
     q_mean: Array  # mean Q value of the critic on the batch
 
 
-def adam(hparams: HParams | None = None) -> optax.GradientTransformation:
-    """Returns Adam without its step size, which is applied apart, because it is traced; None where moments alone are made."""
-    return optax.scale_by_adam() if hparams is None else optax.scale_by_adam(eps=hparams.adam_eps)
+def adam(learning_rate: Any, eps: Any = 1e-8) -> optax.GradientTransformation:
+    """Adam, with a learning rate that may be traced: one number, or a tree with one for each subtree of the parameters.
 
-
-State = TypeVar("State", bound=Any)  # has observation_norm and goal_norm, NormalizerStates [D] and [G]
-
-
-class Noise(NamedTuple):
-    """What exploration adds to the actions of whole episodes; drawn at once, because it does not depend on them."""
-
-    gaussian: Array  # [T, N, A] added to the policy's action
-    is_random: Array  # [T, N] whether a uniformly random action takes the place of the policy's
-    uniform: Array  # [T, N, A] that random action, in [-1, 1]
-
-
-def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-    """Draws noise for `num_envs` episodes of `num_steps` steps: a fraction `random_eps` of the actions is uniformly random.
-
-    Random actions have a fraction `random_noise` of the noise of the others.
+    Its state is that of `optax.scale_by_adam`; `optax.adam` would wrap it in a tuple, and older checkpoints could not be read.
     """
-    gaussian_key, uniform_key = jax.random.split(key)
-    shape = (num_steps, num_envs)
-    uniform = jax.random.uniform(uniform_key, (*shape, action_size + 1), jnp.float32)
-    gaussian = hparams.noise_std * jax.random.normal(gaussian_key, (*shape, action_size), jnp.float32)
-    return Noise(
-        gaussian=gaussian,
-        is_random=uniform[..., -1] < hparams.random_eps,
-        uniform=jnp.clip(2.0 * uniform[..., :-1] - 1.0 + hparams.random_noise * gaussian, -1.0, 1.0),
-    )
+    moments = optax.scale_by_adam(eps=eps)
+
+    def update(gradients: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        directions, state = moments.update(gradients, state, params)
+        scale = lambda rate, subtree: jax.tree.map(lambda d: -rate * d, subtree)  # noqa: E731
+        return jax.tree.map(scale, learning_rate, directions), state
+
+    return optax.GradientTransformation(moments.init, update)
 
 
-def add_noise(noise: Noise, action: Array) -> Array:
-    """Returns `action` [N, A] with the noise of one step (leaves lead with [N])."""
-    return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
+@dataclasses.dataclass(frozen=True)
+class ActorCriticBase(Learner):
+    """A learner with an actor, a critic, their targets and normalizers. Subclasses add `init`, `update` and `value`."""
 
+    sizes: Sizes
+    networks: Networks  # float32; used to act
+    learning: Networks  # in the learner's dtype, with the same parameters; used in updates
+    actor: ActorKind = dataclasses.field(default_factory=Deterministic)
+    axis_name: str | None = None  # mapped axis of the devices that one run is split over
 
-def update_normalizers(
-    state: State, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None, split: Split = ALONE
-) -> State:
-    """Returns the state after its normalizers have taken in observations [..., D] and goals [..., G].
+    def update_normalizers(
+        self, state: State, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
+    ) -> State:
+        """Adds observations [N, T+1, D], where `valid` [N] or [N, T+1] is true, and goals [B, G] to the normalizers."""
+        if valid is not None:
+            valid = valid.reshape(*valid.shape, *(1,) * (observation.ndim - 1 - valid.ndim))
+        any_valid = None if valid is None else jnp.any(valid)
+        clip, axis = hparams.obs_clip, self.axis_name
+        return dataclasses.replace(
+            state,
+            observation_norm=normalizer.update(state.observation_norm, observation, clip, valid, axis),
+            goal_norm=normalizer.update(state.goal_norm, goal, clip, any_valid, axis),
+        )
 
-    `valid`, where given, is [N] and says which of the observations [N, ..., D] to take in; the goals are taken in if any of
-    it is true. Of a run in parts, those of all parts are taken in.
-    """
-    mask = None if valid is None else valid.reshape(-1, *(1,) * (observation.ndim - 2))
-    return dataclasses.replace(
-        state,
-        observation_norm=normalizer.update(state.observation_norm, observation, hparams.obs_clip, mask, split),
-        goal_norm=normalizer.update(state.goal_norm, goal, hparams.obs_clip, None if valid is None else jnp.any(valid), split),
-    )
+    def act(self, state: State, obs: GoalObs, hparams: HParams) -> Array:
+        """Deterministic policy's actions [..., A]."""
+        return self.actor.act(self.networks.actor, state.params.actor, *normalize_obs(state, obs, hparams))
 
+    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> Noise:
+        """Exploration noise of `num_envs` episodes; leaves lead with [T, N]."""
+        return self.actor.noise(key, num_steps, num_envs, self.sizes.action, hparams)
 
-def discount(batch: Batch, hparams: HParams) -> Array | float:
-    """Returns what the values of a batch's next observations count: [B], or gamma for all."""
-    return hparams.gamma if batch.discount is None else batch.discount
+    def explore(self, state: State, obs: GoalObs, noise: Noise, hparams: HParams) -> Array:
+        """Exploring policy's actions [N, A]."""
+        inputs = normalize_obs(state, obs, hparams)
+        return self.actor.explore(self.networks.actor, state.params.actor, *inputs, noise)
+
+    def lagging(self, params: Params) -> Params:
+        """Those of `params` that have a target."""
+        return params if self.actor.has_target else Params(actor=(), critic=params.critic)
+
+    def update_target(self, state: State, hparams: HParams) -> State:
+        """Moves the targets softly: they keep a fraction `polyak` of themselves and take the rest from the networks."""
+        target = optax.incremental_update(self.lagging(state.params), state.target, 1.0 - hparams.polyak)
+        return dataclasses.replace(state, target=target)
+
+    def summary(self, state: State) -> Metrics:
+        """Euclidean norms of all parameters: actor_norm and critic_norm."""
+        return {"actor_norm": optax.tree.norm(state.params.actor), "critic_norm": optax.tree.norm(state.params.critic)}
+
+    def export(self, state: State, hparams: HParams) -> Policy | None:
+        """Deterministic policy as NumPy arrays, or None for custom networks."""
+        dense = self.actor.dense(self.networks.actor, state.params.actor)
+        return None if dense is None else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
+
+    def mean(self, gradients: Tree) -> Tree:
+        """Mean of the gradients over the devices of a split run."""
+        return gradients if self.axis_name is None else jax.lax.pmean(gradients, self.axis_name)
+
+    def normal(self, key: PRNGKey, shape: tuple[int, ...]) -> Array:
+        """Standard normal numbers of `shape` [B, ...]: in a split run, this device's rows of those for all devices."""
+        if self.axis_name is None:
+            return jax.random.normal(key, shape, jnp.float32)
+        whole = jax.random.normal(key, (shape[0] * jax.lax.axis_size(self.axis_name), *shape[1:]), jnp.float32)
+        return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(self.axis_name) * shape[0], shape[0])
 
 
 def normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:
-    """Returns normalized, clipped `values` [..., D]."""
+    """Normalized, clipped `values` [..., D]."""
     return normalizer.normalize(state, values, hparams.norm_eps, hparams.norm_clip, hparams.obs_clip)
 
 
 def normalize_obs(state: Any, obs: GoalObs, hparams: HParams) -> tuple[Array, Array]:
-    """Returns the normalized observation [..., D] and desired goal [..., G] of `obs`."""
+    """Normalized observation [..., D] and desired goal [..., G] of `obs`."""
     observation = normalize(state.observation_norm, obs["observation"], hparams)
     return observation, normalize(state.goal_norm, obs["desired_goal"], hparams)
 
 
 def normalize_batch(state: Any, batch: Batch, hparams: HParams) -> Batch:
-    """Returns `batch` with normalized observations and goals."""
+    """`batch` with normalized observations and goals."""
     return dataclasses.replace(
         batch,
         observation=normalize(state.observation_norm, batch.observation, hparams),
         next_observation=normalize(state.observation_norm, batch.next_observation, hparams),
         desired_goal=normalize(state.goal_norm, batch.desired_goal, hparams),
+        discount=jnp.asarray(hparams.gamma) if batch.discount is None else batch.discount,
     )

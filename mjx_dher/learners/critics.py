@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.types import Array, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, PRNGKey, PyTree
 
 CombineFn = Callable[[Array, PRNGKey], Array]  # values of the target critics [C, B, M], key -> atoms [B, K]
 LossFn = Callable[[Array, Array], Array]  # values [C, B, M], atoms [B, K] -> []
@@ -32,9 +32,8 @@ class Critics:
     judge: JudgeFn
     num_judges: int | None = None  # of the critics, those that judge the actor's actions; all where None
 
-    def init(self, network: Any, key: PRNGKey, sizes: Sizes) -> PyTree:
-        """Makes parameters; leaves lead with [C]."""
-        inputs = [jnp.zeros(size) for size in sizes]
+    def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
+        """Makes parameters for an observation [D], a goal [G] and an action [A]; leaves lead with [C]."""
         return jax.vmap(lambda key: network.init(key, *inputs))(jax.random.split(key, self.number))
 
     def judges(self, params: PyTree) -> PyTree:
