@@ -22,15 +22,7 @@ TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
 
 def test_each_is_short():
     lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py")}
-    assert set(lengths) == {
-        "any_model.py",
-        "many_copies.py",
-        "many_seeds.py",
-        "own_episodes.py",
-        "own_learner.py",
-        "own_methods.py",
-        "point_mass.py",
-    }
+    assert lengths.pop("ddpg_her.py") < 350
     assert max(lengths.values()) < 80
     assert lengths["own_methods.py"] < 25
 
