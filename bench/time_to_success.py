@@ -19,7 +19,6 @@ import jax
 from timing import print_table
 
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats, trainer
-from mjx_dher.runs.play import play
 from mjx_dher.runs.program.loop import train
 from mjx_dher.system.caches import keep_compiled_programs
 
@@ -55,7 +54,7 @@ def main() -> None:
             if first is None and success >= args.threshold:
                 first = progress
             last = progress
-        outcome = play(env, learner.export(jax.device_get(last.state.learner), hparams), 500, seed=1000 + seed)
+        outcome = play_policy(env, learner.export(jax.device_get(last.state.learner), hparams), 500, seed=1000 + seed)
         low, high = stats.wilson_interval(int(outcome.success.sum()), len(outcome.success))
         reached = (f"{first.wall_seconds:.0f}", f"{first.env_steps:,}", f"{first.updates:,}") if first else ("never",) * 3
         total = (f"{last.wall_seconds:.0f}", f"{last.env_steps:,}")

@@ -124,8 +124,8 @@ def check(folder: Path, run: RunSpec) -> None:
 def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) -> dict[str, Any]:
     """Plays the policy here, on native, and in the original where `python` has it; returns both summaries."""
     from mjx_dher.envs.engines.native import usable_cores
+    from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, check_plain, load_policy
-    from mjx_dher.runs.play import play, summarize
     from mjx_dher.system.caches import keep_compiled_programs
     from mjx_dher.tools import transfer
 
@@ -134,7 +134,7 @@ def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) 
     keep_compiled_programs()
     env = envs.make(run.env, engine="native")
     check_fits(policy, env)
-    here = {**summarize(*play(env, policy, episodes, seed)), "seed": seed, "physics": "native"}
+    here = {**summarize(*play_policy(env, policy, episodes, seed)[:4]), "seed": seed, "physics": "native"}
     if not transfer.is_ready(python):
         return {"here": here, "original": None}
     theirs = transfer.play_apart(folder, python, episodes, seed, workers=usable_cores())

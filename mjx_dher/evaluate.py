@@ -1,13 +1,24 @@
-"""Evaluation of a policy without exploration."""
+"""Evaluation of a policy without exploration: episodes, their outcomes, and a summary of these.
+
+`evaluate` is traced: the trainer and compiled programs call it. `play_policy` evaluates a trained policy from Python, and
+`summarize` adds confidence intervals. More than `CHUNK` episodes are played one chunk after the other, each with its own key.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjx_dher.rollout import Outcome, rollout
+from mjx_dher import stats
+from mjx_dher.rollout import Outcome, check_steps, rollout
 from mjx_dher.types import Array, Env, GoalObs, PRNGKey
+
+CHUNK = 500  # episodes at once
 
 
 def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
@@ -15,8 +26,51 @@ def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episod
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
+def play_policy(env: Env, policy: Any, num_episodes: int, seed: int) -> Outcome:
+    """Plays a trained policy, as `load_policy` returns it; the outcomes [num_episodes] are NumPy arrays."""
+    chunk = min(num_episodes, CHUNK)
+
+    @jax.jit
+    def play(key: PRNGKey) -> Outcome:
+        return evaluate(env, lambda obs: policy.forward(obs["observation"], obs["desired_goal"], jnp), key, chunk)
+
+    outcome = in_chunks(play, jax.random.split(jax.random.key(seed), math.ceil(num_episodes / chunk)), num_episodes)
+    check_steps(env)
+    return outcome
+
+
+def in_chunks(
+    play: Callable[[Any], Outcome], keys: Iterable[Any], num_episodes: int, fetch: Callable[[Any], Any] = jax.device_get
+) -> Outcome:
+    """Joins the outcomes [..., chunk] that `play` returns for each of `keys` to NumPy arrays [..., num_episodes]."""
+    outcomes = [fetch(play(key)) for key in keys]
+    return jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=-1)[..., :num_episodes], *outcomes)
+
+
+def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> dict[str, Any]:
+    """Computes the means of outcomes [N], and the 95 % interval of the success rate (Wilson 1927).
+
+    An episode that is not `valid` counts as a failure and has no return.
+
+    Raises:
+      ValueError: a success that is neither 0 nor 1.
+    """
+    if wrong := [float(x) for x in np.ravel((success, reset_success)) if x not in (0.0, 1.0)]:
+        raise ValueError(f"success must be 0 or 1; of {np.size(success)} episodes it is {wrong[0]:g} in {len(wrong)}")
+    ret = np.asarray(ret, np.float64)[slice(None) if valid is None else np.asarray(valid, bool)]
+    low, high = stats.wilson_interval(int(np.sum(success)), len(success))
+    return {
+        "episodes": len(success),
+        "success_rate": float(np.mean(success, dtype=np.float64)),
+        "success_low": low,
+        "success_high": high,
+        "reset_success_rate": float(np.mean(reset_success, dtype=np.float64)),
+        "return_mean": float(ret.mean()) if len(ret) else math.nan,
+    }
+
+
 def summary(outcome: Outcome) -> dict[str, Array]:
-    """Returns means over the episodes; all []. An episode that is not valid counts as a failure and has no return."""
+    """Means over the episodes, [] each, traced. An episode that is not valid counts as a failure and has no return."""
     return {
         "success_rate": jnp.mean(outcome.success),
         "reset_success_rate": jnp.mean(outcome.reset_success),
@@ -25,14 +79,14 @@ def summary(outcome: Outcome) -> dict[str, Array]:
 
 
 def return_mean(outcome: Outcome) -> Array:
-    """Returns the mean return [] of the valid episodes; NaN where there is none."""
+    """Mean return [] of the valid episodes; NaN if there is none."""
     count = jnp.sum(outcome.valid, dtype=outcome.ret.dtype)
     total = jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0))
     return jnp.where(count > 0, total / jnp.maximum(count, 1.0), jnp.nan)
 
 
 def faults(outcome: Outcome) -> dict[str, Array]:
-    """Returns the shares [] of rewards outside [-1, 0] and of successes, at the end and at the reset, that are not 0 or 1."""
+    """Fractions [] of rewards outside their range, and of successes, at the end and at the reset, other than 0 or 1."""
     successes = jnp.stack([outcome.success, outcome.reset_success])
     return {
         "bad_rewards": jnp.mean(outcome.bad_rewards),

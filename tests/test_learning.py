@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mjx_dher import envs, learners, presets, samplers, trainer
-from mjx_dher.runs import play
+from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.program.loop import train
 
 
@@ -18,7 +18,7 @@ def test_reach_is_learned():
     for progress in train(env, spec.config, spec.hparams, seed=0, sampler=samplers.make(*spec.sampler_choice), learner=learner):
         trained = progress.state.learner
     before, after = (
-        play.play(env, learner.export(jax.device_get(state), spec.hparams), 300, seed=1)
+        play_policy(env, learner.export(jax.device_get(state), spec.hparams), 300, seed=1)
         for state in (learner.init(jax.random.key(0)), trained)
     )
     np.testing.assert_array_equal(before.reset_success, after.reset_success)

@@ -12,7 +12,7 @@ import pytest
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
 from mjx_dher.cli import sweep as cli_sweep
-from mjx_dher.runs import play
+from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.folder import fingerprint, run_folder
 from point_mass import PointMass, soon
 
@@ -191,7 +191,7 @@ def test_its_policy_needs_no_module(folder):
 
 
 def test_a_policy_is_played_where_there_is_no_check(folder):
-    outcome = play.play(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
+    outcome = play_policy(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
     assert outcome.success.shape == (4,)
 
 

@@ -17,7 +17,6 @@ from test_driver import CONFIG
 
 import mjx_dher
 from mjx_dher import Options, cli, envs
-from mjx_dher.runs.play import play
 from mjx_dher.system.files import FolderError
 from mjx_dher.testing import check_env
 from point_mass import PointMass
@@ -203,7 +202,7 @@ def test_a_run_under_jax_s_switches(switch, tmp_path, option, value):
     spec = mjx_dher.RunSpec(env="point_mass", config=CONFIG, sampler="weighted")
     (result,) = mjx_dher.train_runs(PointMass(), [spec], [tmp_path / "run"], options=Options(final_episodes=4))
     assert result.status == "finished"
-    play(PointMass(), mjx_dher.load_policy(tmp_path / "run"), 3, 0)
+    play_policy(PointMass(), mjx_dher.load_policy(tmp_path / "run"), 3, 0)
 
 
 @pytest.mark.parametrize("platform", ["tpu", "cuda", "nonsense"])

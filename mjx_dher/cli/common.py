@@ -156,7 +156,7 @@ def read_run(path: Path, console: Console) -> RunSpec:
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
-    """Prints what `play.summarize` gave."""
+    """Prints what `evaluate.summarize` returned."""
     console.print(
         f"success {summary['success_rate']:.3f} (95 % interval {summary['success_low']:.3f} to {summary['success_high']:.3f},"
         f" {summary['episodes']} episodes); already at reset {summary['reset_success_rate']:.3f};"

@@ -68,19 +68,19 @@ def eval_command(argv: list[str], console: Console) -> int:
 
 
 def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Console) -> None:
-    """Plays the policy of one run, and prints how it went."""
+    """Plays the policy of one run, and prints the summary."""
+    from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits
-    from mjx_dher.runs.play import play, summarize
 
     env = make_env(run, args.engine)
     check_fits(policy, env)
     physics = run_folder.engine_name(env)
     if args.json:
         head = {"run": str(path), "env": run.env, "env_kwargs": run.env_arguments, "physics": physics, "seed": args.seed}
-        summary = summarize(*play(env, policy, args.episodes, args.seed))
+        summary = summarize(*play_policy(env, policy, args.episodes, args.seed)[:4])
         plain = {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in summary.items()}
         print(json.dumps({**head, **plain}), flush=True)
         return
     where = f"{path}: " if len(args.runs) > 1 else ""
     console.print(f"{where}{run.env}: {args.episodes} episodes, seed {args.seed}, physics {physics} ...", soft_wrap=True)
-    print_summary(summarize(*play(env, policy, args.episodes, args.seed)), console)
+    print_summary(summarize(*play_policy(env, policy, args.episodes, args.seed)[:4]), console)

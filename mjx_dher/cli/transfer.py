@@ -44,8 +44,8 @@ def transfer_command(argv: list[str], console: Console) -> int:
     run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)
     from mjx_dher.envs.engines.native import usable_cores
+    from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, check_plain, load_policy
-    from mjx_dher.runs.play import play, summarize
     from mjx_dher.stats import difference_interval
     from mjx_dher.tools import transfer
 
@@ -67,8 +67,8 @@ def transfer_command(argv: list[str], console: Console) -> int:
     summary_original = summarize(theirs["success"], theirs["reset_success"], theirs["ret"])
     print_summary(summary_original, console)
     console.print(f"{run.env} here, {args.episodes} episodes, physics {run_folder.engine_name(env)} ...")
-    here = play(env, policy, args.episodes, args.seed)
-    summary_here = summarize(*here)
+    here = play_policy(env, policy, args.episodes, args.seed)
+    summary_here = summarize(*here[:4])
     print_summary(summary_here, console)
     low, high = difference_interval(
         int(theirs["success"].sum()), len(theirs["success"]), int(here.success.sum()), len(here.success)

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_dher import config as config_lib
+from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel.processes import ALONE, Team
 from mjx_dher.policy.learner_policy import StoredPolicy
-from mjx_dher.runs import diagnostics, play
+from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
 from mjx_dher.runs.folder.locks import Claims, Run, named
@@ -337,7 +338,7 @@ def _finish(
             "digest": fingerprint.digest(runs[lane]),
         }
         if not reason:
-            content |= play.summarize(*(x[lane] for x in outcome))
+            content |= evaluate.summarize(*(x[lane] for x in outcome[:4]))
         if team.leads:
             if not reason:
                 _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import config as config_lib
+from mjx_dher import evaluate as evaluate_lib
 from mjx_dher import generators, learners, priorities, samplers, trainer
 from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
@@ -23,7 +24,6 @@ from mjx_dher.parallel import mesh, sharded
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.parallel.split import ALONE, Split
 from mjx_dher.rollout import Outcome, check_steps
-from mjx_dher.runs import play
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program.loop import Compiled
@@ -162,7 +162,7 @@ def _compile_evaluation(
 
     Compiling takes memory, too, to try kernels in.
     """
-    episodes = min(final_episodes, play.CHUNK)
+    episodes = min(final_episodes, evaluate_lib.CHUNK)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
         return trainer.evaluate_state(env, train.learner, state, key, episodes, train.split)
@@ -210,15 +210,16 @@ def evaluate(
 ) -> Outcome:
     """Plays the last evaluation of each lane; returns the outcomes [lanes, episodes] as NumPy arrays.
 
-    `fetch` gives arrays as NumPy's. `keys` are those of the runs; the i-th `play.CHUNK` episodes of a run follow
-    `fold_in(key, i)`, i from 1.
+    `keys` are those of the runs: chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`. `fetch` turns arrays of
+    all devices into NumPy arrays.
     """
-    play_chunk = program.evaluate.result()
-    outcomes = []
-    for number in range(1, 1 + math.ceil(episodes / play.CHUNK)):
+
+    def key_of(number: int) -> Any:
         fold_in = functools.partial(jax.random.fold_in, data=number)
         own = jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)
-        outcome = fetch(play_chunk(state, sharded.to_host(own)[0] if program.layout.devices else own))
-        outcomes.append(jax.tree.map(np.atleast_2d, outcome))
+        return sharded.to_host(own)[0] if program.layout.devices else own
+
+    chunks = map(key_of, range(1, 1 + math.ceil(episodes / evaluate_lib.CHUNK)))
+    outcome = evaluate_lib.in_chunks(functools.partial(program.evaluate.result(), state), chunks, episodes, fetch)
     check_steps(env)
-    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :episodes], *outcomes)
+    return jax.tree.map(np.atleast_2d, outcome)
