@@ -19,6 +19,7 @@ import jax
 from timing import print_table
 
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats, trainer
+from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.program.loop import train
 from mjx_dher.system.caches import keep_compiled_programs
 

@@ -129,8 +129,7 @@ def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) 
     from mjx_dher.system.caches import keep_compiled_programs
     from mjx_dher.tools import transfer
 
-    policy = load_policy(folder)
-    check_plain(policy, run, "the package")
+    policy = check_plain(load_policy(folder), run, "the package")
     keep_compiled_programs()
     env = envs.make(run.env, engine="native")
     check_fits(policy, env)

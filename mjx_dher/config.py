@@ -239,7 +239,7 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
 
 
 def delay_problem(config: Config, delay: int) -> str | None:
-    """Returns what is wrong with a learner's `policy_delay` for the updates of a cycle, or None."""
+    """Error message if `target_period` or a learner's `policy_delay` does not fit the updates of a cycle, or None."""
     period, updates = config.target_period, config.updates_per_cycle
     if updates % period:
         divisors = [str(n) for n in range(1, updates + 1) if updates % n == 0]
@@ -287,12 +287,6 @@ def _number_problem(field: str, value: Any, number: Number, kind: type) -> str |
 
 def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
     """Yields what is wrong with sizes that depend on one another."""
-    if c.updates_per_cycle % c.target_period:
-        divisors = [str(n) for n in range(1, c.updates_per_cycle + 1) if c.updates_per_cycle % n == 0]
-        yield (
-            f"target_period must divide updates_per_cycle ({c.updates_per_cycle}); got {c.target_period},"
-            f" allowed: {', '.join(divisors)}"
-        )
     if problem := delay_problem(c, c.policy_delay):
         yield problem
     cycle = c.num_envs * episode_length

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import stats
+from mjx_dher.policy import TrainedPolicy
 from mjx_dher.rollout import Outcome, check_steps, rollout
 from mjx_dher.types import Array, Env, GoalObs, PRNGKey
 
@@ -26,7 +27,7 @@ def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episod
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
-def play_policy(env: Env, policy: Any, num_episodes: int, seed: int) -> Outcome:
+def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:
     """Plays a trained policy, as `load_policy` returns it; the outcomes [num_episodes] are NumPy arrays."""
     chunk = min(num_episodes, CHUNK)
 

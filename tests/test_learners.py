@@ -259,7 +259,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
     run_folder.create(tmp_path / "run", SPEC, "none", {})
-    learner_policy.StoredPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    learner_policy.LearnerPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
 

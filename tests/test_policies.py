@@ -77,7 +77,7 @@ def test_they_load_anywhere_and_need_numpy_alone(tmp_path):
 import sys
 import numpy as np
 import mjx_dher
-from mjx_dher import policies
+from mjx_dher.policy import bundled
 sizes = {SIZES!r}
 for name in bundled.names():
     policy = mjx_dher.load_policy(name)

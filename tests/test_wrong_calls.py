@@ -17,6 +17,7 @@ from test_driver import CONFIG
 
 import mjx_dher
 from mjx_dher import Options, cli, envs
+from mjx_dher.evaluate import play_policy
 from mjx_dher.system.files import FolderError
 from mjx_dher.testing import check_env
 from point_mass import PointMass

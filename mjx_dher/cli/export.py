@@ -44,8 +44,7 @@ def export_command(argv: list[str], console: Console) -> int:
     beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside
     export.check(args.format, out, args.overwrite)
-    policy = load_policy(folder)
-    check_plain(policy, run, "export")
+    policy = check_plain(load_policy(folder), run, "export")
     difference = export.write(policy, run, args.format, out)
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(

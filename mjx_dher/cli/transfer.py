@@ -49,8 +49,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     from mjx_dher.stats import difference_interval
     from mjx_dher.tools import transfer
 
-    policy = load_policy(folder)
-    check_plain(policy, run, "transfer")
+    policy = check_plain(load_policy(folder), run, "transfer")
     environment = transfer.default_environment()
     if args.set_up:
         console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""A policy of a learner or networks of one's own: its state as a file, played by the learner itself, with JAX."""
+"""Policies of custom learners and networks: the learner's state as a file, played by the learner, with JAX."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from mjx_dher.types import Array, PyTree, Sizes
 
 
 @dataclasses.dataclass(frozen=True)
-class StoredPolicy:
-    """A deterministic policy, called like `policy.Policy`. It cannot be exported to other formats."""
+class LearnerPolicy:
+    """A deterministic `TrainedPolicy` that needs its learner. It cannot be exported to other formats."""
 
     learner: Learner
     state: PyTree  # the learner's
@@ -29,24 +29,24 @@ class StoredPolicy:
     sizes: Sizes
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Returns actions [..., A] for observations of one state or a batch."""
+        """Computes the actions [..., A] for observations of one state or a batch."""
         return np.asarray(self.forward(jnp.asarray(obs["observation"]), jnp.asarray(obs["desired_goal"])))
 
     def forward(self, observation: Any, goal: Any, xp: Any = jnp) -> Array:
-        """Returns actions for observations [..., D] and goals [..., G]; `xp` is there to be called as a `Policy` is."""
+        """Computes actions for observations [..., D] and goals [..., G]; `xp` is ignored."""
         del xp
         obs: Any = {"observation": observation, "desired_goal": goal}
         return self.learner.act(self.state, obs, self.hparams)
 
     def save(self, path: Path, **extra: Any) -> None:
-        """Writes the policy to `path`; what was there stays whole until the new file is."""
+        """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, sizes=np.array(self.sizes), **arrays, **extra)
 
 
-def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> StoredPolicy:
-    """Returns the policy that `StoredPolicy.save` wrote of the run that `spec` describes.
+def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:
+    """Makes the policy of what `LearnerPolicy.save` wrote; `spec` describes its run.
 
     Raises:
       ValueError: the arrays are not those of this learner.
@@ -58,4 +58,4 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> StoredPolicy
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
         raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
-    return StoredPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, sizes)
+    return LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, sizes)

@@ -1,4 +1,4 @@
-"""Reads what a run left. Needs NumPy alone, unless the run had a learner or networks of one's own."""
+"""Trained policies from run folders. Needs only NumPy, unless the run had a custom learner or custom networks."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.policy import Policy, bundled, from_arrays
+from mjx_dher.policy import Policy, TrainedPolicy, bundled, from_arrays
 from mjx_dher.runs.folder.run_folder import POLICY_FILE, read_spec
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 
 
-def load_policy(run_dir: str | Path) -> Policy:
-    """Returns a policy of the package by its name, or that of a run folder. Imports NumPy only: no JAX, no MuJoCo.
+def load_policy(run_dir: str | Path) -> TrainedPolicy:
+    """Loads a bundled policy, or that of a run folder. Imports only NumPy: no JAX, no MuJoCo.
 
-    The policy of a learner or networks of one's own is a `learners.stored.StoredPolicy`, which is called alike and needs JAX,
-    and the run folder.
+    Custom learners and networks are an exception: their policy is a `learner_policy.LearnerPolicy`, which needs JAX and the
+    run folder.
 
     Args:
-      run_dir: a run folder, a policy.npz, wherever it lies and whatever its name is, or a name among `bundled.names()`, such
-        as "push". A run folder or file in the current folder by that name comes first.
+      run_dir: a run folder, a policy.npz under any name, or the name of a bundled policy, such as "push". A run folder or file
+        of that name in the current folder comes first.
 
     Raises:
-      FolderError: there is no run folder of this program, or its policy is missing, damaged, or of a learner or networks of
-        one's own that cannot be imported or do not fit it.
+      FolderError: no run folder, or a policy that is missing, damaged, or of a custom learner that cannot be imported or does
+        not fit.
     """
     run_dir = bundled.find(run_dir)
     spec, path = (None, run_dir) if run_dir.is_file() else (read_spec(run_dir), run_dir / POLICY_FILE)
@@ -40,17 +40,17 @@ def load_policy(run_dir: str | Path) -> Policy:
         except ValueError as error:
             raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
     if spec is None:
-        raise FolderError(f"{path} is of a learner or networks of the user's own: name its run folder, which says which")
+        raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
 
     try:
-        return from_state(arrays, spec)  # type: ignore[return-value]
+        return from_state(arrays, spec)
     except (ValueError, KeyError, TypeError) as error:
         raise FolderError(f"{path} cannot be played: {error}") from error
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Returns the arrays in a policy.npz; nothing is unpickled."""
+    """Reads the arrays in a policy.npz; nothing is unpickled."""
     try:
         file = np.load(path, allow_pickle=False)
         if not isinstance(file, np.lib.npyio.NpzFile):
@@ -65,13 +65,9 @@ def _read(path: Path) -> dict[str, Any]:
         raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
 
 
-def check_fits(policy: Policy, env: Any) -> None:
-    """Refuses a policy for an environment whose observations, goals or actions are of other sizes.
-
-    Raises:
-      ValueError: names both sizes.
-    """
-    from mjx_dher.trainer import env_sizes
+def check_fits(policy: TrainedPolicy, env: Any) -> None:
+    """Raises ValueError if the sizes of observations, goals or actions of a policy and an environment differ."""
+    from mjx_dher.rollout import env_sizes
 
     theirs, own = tuple(env_sizes(env)), tuple(policy.sizes)
     if theirs != own:
@@ -81,13 +77,8 @@ def check_fits(policy: Policy, env: Any) -> None:
         )
 
 
-def check_plain(policy: Policy, spec: RunSpec, use: str) -> None:
-    """Refuses a policy that needs its learner to be played, for a `use` that has NumPy alone.
-
-    Raises:
-      ValueError: names the learner and the networks.
-    """
-    if not isinstance(policy, Policy):
-        raise ValueError(
-            f"{use} takes a policy of NumPy arrays, which learner {spec.learner!r} with networks {spec.networks!r} has not"
-        )
+def check_plain(policy: TrainedPolicy, spec: RunSpec, use: str) -> Policy:
+    """Returns a policy that needs only NumPy, as `use` does. Raises ValueError for one that needs its learner."""
+    if isinstance(policy, Policy):
+        return policy
+    raise ValueError(f"{use} needs a policy of NumPy arrays; learner {spec.learner!r} with networks {spec.networks!r} has none")

@@ -1,11 +1,11 @@
-"""Trained policies, as files and as functions of NumPy arrays. They need nothing but NumPy."""
+"""Trained policies as files and as functions of NumPy arrays. They need only NumPy."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,6 +13,19 @@ from mjx_dher.system import files
 
 _VECTORS = ("observation_mean", "observation_std", "goal_mean", "goal_std")
 _SCALARS = ("norm_clip", "obs_clip")
+
+
+class TrainedPolicy(Protocol):
+    """A deterministic policy, as `load_policy` returns it: a `Policy`, or a `learner_policy.LearnerPolicy`."""
+
+    @property
+    def sizes(self) -> tuple[int, int, int]: ...  # of observations, goals and actions: D, G, A
+
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # observations of one state or a batch -> actions [..., A]
+
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any: ...  # the same, unchecked, in NumPy or JAX
+
+    def save(self, path: Path, **extra: Any) -> None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +74,7 @@ class Policy:
 
         def normalize(value, mean, std):
             value = xp.clip(value, -self.obs_clip, self.obs_clip)
-            rank = (1,) * (value.ndim - 1)  # mean and std get the axes of the batch, which JAX may be told to insist on
+            rank = (1,) * (value.ndim - 1)  # mean and std get the axes of the batch: JAX may forbid implicit ones
             return xp.clip((value - mean.reshape(*rank, -1)) / std.reshape(*rank, -1), -self.norm_clip, self.norm_clip)
 
         x = xp.concatenate(
@@ -91,10 +104,10 @@ class Policy:
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> Policy:
-    """Returns the policy with these `Policy.arrays`.
+    """Makes a policy of its `Policy.arrays`.
 
     Raises:
-      ValueError: an array is missing, or not what a policy has; the message names it.
+      ValueError: names an array that is missing or invalid.
     """
     num_layers = sum(name.endswith("_kernel") for name in arrays)
     needed = [f"layer{i}_{part}" for i in range(max(1, num_layers)) for part in ("kernel", "bias")] + [*_VECTORS, *_SCALARS]
@@ -121,7 +134,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
 
 
 def _check_array(name: str, array: Any) -> None:
-    """Raises ValueError for an array of the wrong type or number of axes, that is not finite, or that must be positive."""
+    """Raises ValueError for an array of another type or rank, that is not finite, or not positive where it must be."""
     ndim = 0 if name in _SCALARS else 2 if name.endswith("_kernel") else 1
     if array.dtype.kind != "f" or array.ndim != ndim or 0 in array.shape:
         raise ValueError(f"{name} must be floating-point numbers of {ndim} axes; it is {array.dtype}{list(array.shape)}")
@@ -132,7 +145,7 @@ def _check_array(name: str, array: Any) -> None:
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
-    """Returns the policy of an actor's linear layers, by flax's names for them, with the normalizers folded in."""
+    """Makes a policy of an actor's linear layers, by flax's names, and its normalizers."""
     layers = tuple(
         (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
     )

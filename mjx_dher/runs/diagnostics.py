@@ -1,4 +1,4 @@
-"""Signs that a run has gone bad, in an epoch's metrics."""
+"""Failures and warnings, from an epoch's metrics."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from mjx_dher.config import Config
 
 
 def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
-    """Returns why a run cannot go on after an epoch; None where it can.
+    """Reason why a run ends as failed after an epoch, or None.
 
     Args:
-      metrics: of the epoch, as `trainer.make_train` names them.
+      metrics: of the epoch, by the names of `trainer.make_train`.
       config: sizes.
-      finite: whether all numbers of the learner are.
+      finite: whether all numbers of the learner are finite.
     """
     if not finite:
         return "the networks or normalizers hold numbers that are not finite (smaller actor_lr and critic_lr may help)"
@@ -24,21 +24,21 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
             " observation, a goal, an action or a reward is not finite"
         )
     if metrics["bad_success"] > 0:
-        return f"success must be 0 or 1; it is something else in a share of {metrics['bad_success']:.3g} of the episodes"
+        return f"success must be 0 or 1; in {metrics['bad_success']:.3g} of the episodes it is not"
     if metrics["no_goal_share"] >= 1:
         return "the sampler offers no hindsight goal for any transition: its weights are all 0, NaN or infinite"
     return None
 
 
 def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
-    """Returns what a reader should know of an epoch with these metrics, a sentence for each kind of trouble."""
+    """Warnings about an epoch with these metrics: a sentence for each metric at fault."""
     episodes = config.num_envs * config.cycles_per_epoch
     sentences = {
         "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment says"
         " `failed`, or a number in them is not finite",
-        "bad_rewards": f"a share of {metrics['bad_rewards']:.3g} of the rewards lie outside [-1, 0], though DDPG clips its"
-        " targets to what rewards in [-1, 0] can add up to: [-1/(1-gamma), 0]",
-        "no_goal_share": f"for a share of {metrics['no_goal_share']:.3g} of the transitions to be relabelled the sampler offers"
-        " no goal; these keep their own",
+        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range, whose returns"
+        " bound the learner's targets",
+        "no_goal_share": f"for {metrics['no_goal_share']:.3g} of the transitions to be relabelled the sampler offers no goal;"
+        " these keep their own",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}

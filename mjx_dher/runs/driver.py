@@ -21,7 +21,7 @@ from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel.processes import ALONE, Team
-from mjx_dher.policy.learner_policy import StoredPolicy
+from mjx_dher.policy.learner_policy import LearnerPolicy
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
@@ -304,7 +304,7 @@ def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, ru
     if learner is None:
         return
     policy = program.learner.export(learner, spec.hparams)
-    stored = StoredPolicy(program.learner, learner, spec.hparams, program.sizes) if policy is None else policy
+    stored = LearnerPolicy(program.learner, learner, spec.hparams, program.sizes) if policy is None else policy
     stored.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
 
 
