@@ -1,6 +1,7 @@
 """A timestep of MuJoCo's in one CUDA kernel, for models without the features that it leaves out.
 
 A CUDA kernel takes as long to start as some ten thousand environments take to run in it, and MuJoCo Warp's step is 135 of
-them. Here one kernel advances all environments by all timesteps of an environment step. Lanes, the threads of a warp, share an
-environment (`lanes`), whose numbers stay in the GPU's cache; its solver stops when it has converged, whatever the others do.
+them. Here one kernel advances all environments by all timesteps of an environment step. Threads of
+one warp share an environment (`threads`), whose numbers stay in shared memory. Each environment's solver stops when it has
+converged.
 """

@@ -64,7 +64,7 @@ def _at(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
     """Sets the first six rows: the target's place less the body's, and the turn between them."""
     body, target, nv = world.weld_body, world.weld_target, dofs.number
     arm = memory.pos[body] - memory.pos[bodies.root[body]]
@@ -72,7 +72,7 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, la
     inverse = wp.vec4(q[0], -q[1], -q[2], -q[3])
     goal = memory.quat[target]
     moved_by = bodies.moved_by[body]
-    for i in range(lane, nv, lanes):
+    for i in range(thread, nv, threads):
         along, about = wp.vec3(0.0), wp.vec3(0.0)
         if (moved_by >> i) & 1 == 1:
             motion = memory.motion[i]
@@ -83,7 +83,7 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, la
         for k in range(3):
             memory.jacobian[k * nv + i] = along[k]
             memory.jacobian[(3 + k) * nv + i] = about[k]
-    for k in range(lane, 3, lanes):
+    for k in range(thread, 3, threads):
         place = memory.pos[target] - memory.pos[body]
         between = times(inverse, goal)
         turn_left = wp.vec3(between[1], between[2], between[3])
@@ -103,16 +103,16 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, la
 
 
 @wp.func
-def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: wp.array(dtype=int), lane: int, lanes: int):
+def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: wp.array(dtype=int), thread: int, threads: int):
     """Gives a row to each joint at its limit, and a number of rows to each contact within its margin.
 
     Contacts for which there is no room are left out, and counted in `lost`.
     """
-    for s in range(lane, contacts.slots, lanes):
+    for s in range(thread, contacts.slots, threads):
         pair = contacts.pair[s]
         memory.touching[s] = wp.where(memory.distance[s] < contacts.margin[pair], _edges(contacts.dim[pair]), 0)
-    sync(lanes)
-    if lane == 0:
+    sync(threads)
+    if thread == 0:
         rows = int(6)
         for k in range(dofs.limits):
             memory.limited[k] = -1
@@ -131,7 +131,7 @@ def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: w
                 rows += edges
         memory.counts[0] = touching
         memory.counts[1] = rows
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
@@ -152,11 +152,11 @@ def limit(
     dofs: Dofs,
     contacts: Contacts,
     memory: Memory,
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Sets the rows of joints at their limits."""
-    for k in range(lane, dofs.limits, lanes):
+    for k in range(thread, dofs.limits, threads):
         row = memory.limited[k]
         if row >= 0:
             dof = dofs.limit_dof[k]
@@ -169,7 +169,7 @@ def limit(
 
 
 @wp.func
-def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent."""
     nv = dofs.number
     for c in range(memory.counts[0]):
@@ -185,7 +185,7 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, lane: 
         turning = friction[2] * normal
         moves2 = bodies.moved_by[contacts.geom_body[contacts.geom2[pair]]]
         moves1 = bodies.moved_by[contacts.geom_body[contacts.geom1[pair]]]
-        for i in range(lane, nv, lanes):
+        for i in range(thread, nv, threads):
             sign = float((moves2 >> i) & 1) - float((moves1 >> i) & 1)
             motion = sign * memory.motion[i]
             velocity = _at(motion, memory.place[s] - memory.pos[bodies.root[dofs.body[i]]])
@@ -201,14 +201,14 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, lane: 
                         aside = wp.dot(velocity, second)
                     memory.jacobian[(row + 2 * k) * nv + i] = along + aside
                     memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def press(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def press(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Sets what the rows of contacts ask for."""
     nv = dofs.number
-    for at in range(lane, _MOST * memory.counts[0], lanes):
+    for at in range(thread, _MOST * memory.counts[0], threads):
         s = memory.touching[at // _MOST]
         pair = contacts.pair[s]
         row = memory.slot[at // _MOST] + at % _MOST
@@ -218,4 +218,4 @@ def press(dofs: Dofs, contacts: Contacts, memory: Memory, lane: int, lanes: int)
             for i in range(nv):
                 velocity += memory.jacobian[row * nv + i] * memory.qvel[i]
             _ask(memory, row, contacts.soft[pair], depth, depth, contacts.weight[pair], velocity)
-    sync(lanes)
+    sync(threads)

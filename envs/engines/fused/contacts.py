@@ -1,4 +1,4 @@
-"""Contacts of a substep: a lane for each pair of geoms."""
+"""Contacts of a substep: a thread for each pair of geoms."""
 
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, Contacts, Memory
@@ -18,9 +18,9 @@ _box_box, _plane_cylinder = _shapes.box_box, _shapes.plane_cylinder
 
 
 @wp.func
-def collide_with_planes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def collide_with_planes(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of planes, and marks all others as empty."""
-    for p in range(lane, contacts.pairs, lanes):
+    for p in range(thread, contacts.pairs, threads):
         first = contacts.first[p]
         for i in range(contacts.most[p]):
             memory.distance[first + i] = FAR
@@ -40,13 +40,13 @@ def collide_with_planes(contacts: Contacts, memory: Memory, lane: int, lanes: in
                     _corners(memory, first, margin, pos1, normal, pos2, mat2, size2)
                 else:
                     _rim(memory, first, pos1, normal, pos2, mat2, size2)
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def collide_boxes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def collide_boxes(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of two boxes."""
-    for p in range(lane, contacts.pairs, lanes):
+    for p in range(thread, contacts.pairs, threads):
         if contacts.kind[p] == _BOX_BOX:
             geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
             pos1, mat1, size1 = _geom(contacts, memory, geom1)
@@ -61,23 +61,23 @@ def collide_boxes(contacts: Contacts, memory: Memory, lane: int, lanes: int):
                     memory.distance[first + i] = distances[i]
                     memory.place[first + i] = places[i]
                     memory.normal[first + i] = normal
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def collide_cylinders(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def collide_cylinders(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of a cylinder and a box.
 
     The first contact is that of the two as they lie; four more are looked for with both tilted by a little about the first one,
     as MuJoCo C does.
     """
     for round in range(contacts.rounds):  # not twice in the code, which is long
-        for at in range(lane, wp.where(round == 0, 1, 4) * contacts.pairs, lanes):
+        for at in range(thread, wp.where(round == 0, 1, 4) * contacts.pairs, threads):
             p = wp.where(round == 0, at, at // 4)
             if contacts.kind[p] == _CYLINDER_BOX:
                 _meet(contacts, memory, p, round, at % 4)
-        sync(lanes)
-    _thin(contacts, memory, lane, lanes)
+        sync(threads)
+    _thin(contacts, memory, thread, threads)
 
 
 @wp.func
@@ -121,9 +121,9 @@ def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int
 
 
 @wp.func
-def _thin(contacts: Contacts, memory: Memory, lane: int, lanes: int):
+def _thin(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Drops contacts of a cylinder and a box that are near others of them."""
-    for p in range(lane, contacts.pairs, lanes):
+    for p in range(thread, contacts.pairs, threads):
         first = contacts.first[p]
         if contacts.kind[p] == _CYLINDER_BOX:
             least = _APART * wp.min(contacts.geom_reach[contacts.geom1[p]], contacts.geom_reach[contacts.geom2[p]])
@@ -132,7 +132,7 @@ def _thin(contacts: Contacts, memory: Memory, lane: int, lanes: int):
                     if memory.distance[first + j] < FAR:
                         if wp.length(memory.place[first + i] - memory.place[first + j]) <= least:
                             memory.distance[first + i] = FAR
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """Places, velocities, mass matrix and forces of a substep, from coordinates and velocities.
 
 R. Featherstone, Rigid Body Dynamics Algorithms (2008): composite rigid bodies and recursive Newton-Euler, as sums over what
-is below a body instead of walks along the tree, which would leave all lanes but one idle.
+is below a body instead of walks along the tree, which would leave all threads but one idle.
 """
 
 from mjx_dher.envs.engines.fused.model import FREE, HINGE, MOCAP, SLIDE, STILL, Bodies, Dofs, Memory, World
@@ -45,15 +45,15 @@ def _matrix(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def place(
+def kinematics(
     bodies: Bodies,
     memory: Memory,
     inputs: wp.array(dtype=float),
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Computes the pose of every body: against its parent side by side, then along the tree."""
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         pos = bodies.pos[b]
         quat = bodies.quat[b]
         first = bodies.qpos[b]
@@ -74,33 +74,33 @@ def place(
             quat = wp.normalize(wp.vec4(inputs[3], inputs[4], inputs[5], inputs[6]))
         memory.pos[b] = pos
         memory.quat[b] = quat
-    sync(lanes)
-    # One lane goes along the tree, twice, with as little to do as can be; the rest is done side by side.
-    if lane == 0:
+    sync(threads)
+    # One thread goes along the tree, twice, with as little to do as can be; the rest is done side by side.
+    if thread == 0:
         for b in range(1, bodies.number):
             parent = bodies.parent[b]
             if parent > 0:
                 memory.quat[b] = times(memory.quat[parent], memory.quat[b])
-    sync(lanes)
-    for b in range(lane, bodies.number, lanes):
+    sync(threads)
+    for b in range(thread, bodies.number, threads):
         parent = bodies.parent[b]
         if parent > 0:
             memory.pos[b] = turned(memory.quat[parent], memory.pos[b])
-    sync(lanes)
-    if lane == 0:
+    sync(threads)
+    if thread == 0:
         for b in range(1, bodies.number):
             parent = bodies.parent[b]
             if parent > 0:
                 memory.pos[b] = memory.pos[b] + memory.pos[parent]
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         memory.quat[b] = wp.normalize(memory.quat[b])
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def move(bodies: Bodies, memory: Memory, lane: int, lanes: int):
+def com_pos(bodies: Bodies, memory: Memory, thread: int, threads: int):
     """Computes inertias, and the motion that each degree of freedom stands for."""
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         origin = memory.pos[bodies.root[b]]
         at = memory.pos[b] - origin
         mat = _matrix(memory.quat[b])
@@ -126,13 +126,13 @@ def move(bodies: Bodies, memory: Memory, lane: int, lanes: int):
                 memory.motion[dof + i] = wp.spatial_vector(none, unit)
                 axis = mat * unit
                 memory.motion[dof + 3 + i] = wp.spatial_vector(axis, wp.cross(at, axis))
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def turn(bodies: Bodies, memory: Memory, lane: int, lanes: int):
+def com_vel(bodies: Bodies, memory: Memory, thread: int, threads: int):
     """Computes velocities, and how fast each degree of freedom's motion turns."""
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         velocity = wp.spatial_vector()
         moved_by = bodies.moved_by[b]
         for i in range(memory.qvel.shape[0]):
@@ -147,7 +147,7 @@ def turn(bodies: Bodies, memory: Memory, lane: int, lanes: int):
             for i in range(3):
                 memory.turning[dof + i] = wp.spatial_vector()
                 memory.turning[dof + 3 + i] = _crossed(velocity, memory.motion[dof + 3 + i])
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
@@ -167,9 +167,9 @@ def _momentum(inertia: wp.mat33, moment: wp.vec3, mass: float, motion: wp.spatia
 
 
 @wp.func
-def strain(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+def rne(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
     """Computes the force that each body needs to go on as it moves, and not to fall."""
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         bias = wp.spatial_vector()
         moved_by = bodies.moved_by[b]
         for i in range(dofs.number):
@@ -187,13 +187,13 @@ def strain(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, 
         ) + wp.spatial_vector(
             wp.cross(omega, wp.spatial_top(has)) + wp.cross(v, wp.spatial_bottom(has)), wp.cross(omega, wp.spatial_bottom(has))
         )
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def push(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), lane: int, lanes: int):
+def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
     """Computes all forces except those of constraints, and the momentum that each degree of freedom stands for."""
-    for i in range(lane, dofs.number, lanes):
+    for i in range(thread, dofs.number, threads):
         motion = memory.motion[i]
         body = dofs.body[i]
         momentum, force = wp.spatial_vector(), wp.spatial_vector()
@@ -201,19 +201,19 @@ def push(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=floa
             momentum += _momentum(memory.inertia[b], memory.moment[b], bodies.mass[b], motion)
             force += memory.force[b]
         memory.momentum[i] = momentum
-        smooth = dofs.stiffness[i] * (dofs.rest[i] - memory.qpos[dofs.qpos[i]]) - dofs.damping[i] * memory.qvel[i]
+        smooth = _passive(dofs, memory, i)
         smooth -= wp.dot(motion, force)
         for a in range(dofs.actuators):
             if dofs.actuator_dof[a] == i:
-                smooth += _actuated(dofs, a, inputs[7 + a], memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+                smooth += _actuation(dofs, a, inputs[7 + a], memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
         memory.smooth[i] = smooth
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def weigh(bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
+def crb(bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
     """Computes the mass matrix."""
-    for at in range(lane, dofs.number * dofs.number, lanes):
+    for at in range(thread, dofs.number * dofs.number, threads):
         i, j = at // dofs.number, at % dofs.number
         later, sooner = wp.max(i, j), wp.min(i, j)
         mass = float(0.0)
@@ -222,11 +222,17 @@ def weigh(bodies: Bodies, dofs: Dofs, memory: Memory, lane: int, lanes: int):
         if i == j:
             mass += dofs.armature[i]
         memory.mass[at] = mass
-    sync(lanes)
+    sync(threads)
 
 
 @wp.func
-def _actuated(dofs: Dofs, a: int, control: float, length: float, velocity: float) -> float:
+def _passive(dofs: Dofs, memory: Memory, i: int) -> float:
+    """Returns the force of a degree of freedom's spring and damper."""
+    return dofs.stiffness[i] * (dofs.rest[i] - memory.qpos[dofs.qpos[i]]) - dofs.damping[i] * memory.qvel[i]
+
+
+@wp.func
+def _actuation(dofs: Dofs, a: int, control: float, length: float, velocity: float) -> float:
     """Returns an actuator's force on its joint."""
     clip = dofs.actuator_clip[a]
     factors = dofs.actuator_force[a]
@@ -239,12 +245,12 @@ def integrate(
     world: World,
     bodies: Bodies,
     memory: Memory,
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Advances positions by the velocities at the substep's end."""
     h = world.timestep
-    for b in range(lane, bodies.number, lanes):
+    for b in range(thread, bodies.number, threads):
         first = bodies.qpos[b]
         dof = bodies.dof[b]
         kind = bodies.kind[b]
@@ -262,4 +268,4 @@ def integrate(
             quat = wp.normalize(times(quat, turn))
             for i in range(4):
                 memory.qpos[first + 3 + i] = quat[i]
-    sync(lanes)
+    sync(threads)

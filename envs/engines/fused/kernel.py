@@ -5,7 +5,7 @@ from typing import Any
 
 from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
-from mjx_dher.envs.engines.fused.dynamics import integrate, move, place, push, strain, turn, weigh
+from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, Bodies, Contacts, Dofs, Layout, Memory, World
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
@@ -19,14 +19,14 @@ def _begin(
     qpos: wp.array(dtype=float),  # type: ignore[valid-type]
     qvel: wp.array(dtype=float),  # type: ignore[valid-type]
     guess: wp.array(dtype=float),  # type: ignore[valid-type]
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Takes an environment's state into its memory."""
-    copy(qpos, memory.qpos, lane, lanes)
-    copy(qvel, memory.qvel, lane, lanes)
-    copy(guess, memory.qacc, lane, lanes)
-    sync(lanes)
+    copy(qpos, memory.qpos, thread, threads)
+    copy(qvel, memory.qvel, thread, threads)
+    copy(guess, memory.qacc, thread, threads)
+    sync(threads)
 
 
 @wp.func
@@ -37,22 +37,22 @@ def _forces(
     memory: Memory,
     given: wp.array(dtype=float),  # type: ignore[valid-type]
     warps: int,
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Computes places, velocities, the mass matrix and all forces but those of constraints."""
     gather(warps)
-    place(bodies, memory, given, lane, lanes)
+    kinematics(bodies, memory, given, thread, threads)
     gather(warps)
-    move(bodies, memory, lane, lanes)
+    com_pos(bodies, memory, thread, threads)
     gather(warps)
-    turn(bodies, memory, lane, lanes)
+    com_vel(bodies, memory, thread, threads)
     gather(warps)
-    strain(world, bodies, dofs, memory, lane, lanes)
+    rne(world, bodies, dofs, memory, thread, threads)
     gather(warps)
-    push(bodies, dofs, memory, given, lane, lanes)
+    smooth_forces(bodies, dofs, memory, given, thread, threads)
     gather(warps)
-    weigh(bodies, dofs, memory, lane, lanes)
+    crb(bodies, dofs, memory, thread, threads)
 
 
 @wp.func
@@ -64,44 +64,44 @@ def _constraints(
     memory: Memory,
     lost: wp.array(dtype=int),  # type: ignore[valid-type]
     warps: int,
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ):
     """Computes the rows of constraints."""
     gather(warps)
-    number(world, dofs, contacts, memory, lost, lane, lanes)
+    number(world, dofs, contacts, memory, lost, thread, threads)
     gather(warps)
-    weld(world, bodies, dofs, memory, lane, lanes)
+    weld(world, bodies, dofs, memory, thread, threads)
     gather(warps)
-    limit(dofs, contacts, memory, lane, lanes)
+    limit(dofs, contacts, memory, thread, threads)
     gather(warps)
-    touch(bodies, dofs, contacts, memory, lane, lanes)
+    touch(bodies, dofs, contacts, memory, thread, threads)
     gather(warps)
-    press(dofs, contacts, memory, lane, lanes)
+    press(dofs, contacts, memory, thread, threads)
 
 
 @wp.func
-def _go_on(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, nv: int, warps: int, lane: int, lanes: int):
+def _go_on(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, nv: int, warps: int, thread: int, threads: int):
     """Advances velocities and places."""
     gather(warps)
-    solve(world, memory, nv, lane, lanes)
+    solve(world, memory, nv, thread, threads)
     gather(warps)
-    accelerate(world, dofs, memory, nv, lane, lanes)
+    accelerate(world, dofs, memory, nv, thread, threads)
     gather(warps)
-    integrate(world, bodies, memory, lane, lanes)
+    integrate(world, bodies, memory, thread, threads)
 
 
 @functools.cache
-def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, ...]) -> Any:
+def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...]) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
 
     Args:
       floats: memory of an environment.
-      lanes_of_one: threads that share an environment.
+      threads_per_env: threads that share an environment.
       warps: of 32 threads in a block; 0 on a CPU.
       kinds: of pairs of geoms that there are; the code for others is left out.
     """
-    shared = warps * (32 // lanes_of_one) * floats
+    shared = warps * (32 // threads_per_env) * floats
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -126,27 +126,27 @@ def make(floats: int, lanes_of_one: int, warps: int, nv: int, kinds: tuple[int, 
         `spare` [num_envs, size of `layout`] is the memory on a CPU; `inputs` [num_envs, 7 + nu] has the mocap body's pose and
         the controls. `lost` [1] counts contacts that there is no room for.
         """
-        env, lane = wp.tid()  # type: ignore[misc]
-        lanes = wp.static(lanes_of_one)  # so that the compiler knows them
+        env, thread = wp.tid()  # type: ignore[misc]
+        threads = wp.static(threads_per_env)  # so that the compiler knows them
         if wp.static(shared > 0):
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
-        memory = carve(layout, spare[env % spare.shape[0]], lanes)
-        _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], lane, lanes)
+        memory = carve(layout, spare[env % spare.shape[0]], threads)
+        _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], thread, threads)
         given = inputs[env]
         for _substep in range(substeps):
-            _forces(world, bodies, dofs, memory, given, wp.static(warps), lane, lanes)
+            _forces(world, bodies, dofs, memory, given, wp.static(warps), thread, threads)
             gather(wp.static(warps))
-            collide_with_planes(contacts, memory, lane, lanes)
+            collide_with_planes(contacts, memory, thread, threads)
             if wp.static(BOX_BOX in kinds):
                 gather(wp.static(warps))
-                collide_boxes(contacts, memory, lane, lanes)
+                collide_boxes(contacts, memory, thread, threads)
             if wp.static(CYLINDER_BOX in kinds):
                 gather(wp.static(warps))
-                collide_cylinders(contacts, memory, lane, lanes)
-            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), lane, lanes)
-            _go_on(world, bodies, dofs, memory, wp.static(nv), wp.static(warps), lane, lanes)
-        copy(memory.qpos, qpos[env], lane, lanes)
-        copy(memory.qvel, qvel[env], lane, lanes)
-        copy(memory.qacc, guess[env], lane, lanes)
+                collide_cylinders(contacts, memory, thread, threads)
+            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), thread, threads)
+            _go_on(world, bodies, dofs, memory, wp.static(nv), wp.static(warps), thread, threads)
+        copy(memory.qpos, qpos[env], thread, threads)
+        copy(memory.qvel, qvel[env], thread, threads)
+        copy(memory.qacc, guess[env], thread, threads)
 
     return advance

@@ -1,22 +1,22 @@
 # mypy: disable-error-code="empty-body,valid-type"
 """Linear equations of one environment: its rows of constraints added up, Cholesky's factors, and the solution.
 
-On a GPU each lane has whole rows of the matrix in its registers, and lanes hand each other numbers: a factorization in shared
-memory would wait for it at every step. L lanes have R rows each, N = L R at least as many as there are.
+On a GPU each thread has whole rows of the matrix in its registers, and threads exchange numbers by shuffles: a factorization
+in shared memory would wait for it at every step. L threads have R rows each, N = L R at least as many as there are.
 """
 
 from mjx_dher.system.warp_setup import wp
 
 _ON_A_GPU = """
-    const unsigned group = lanes == 32 ? ~0u : ((1u << lanes) - 1u) << (threadIdx.x & 31 & ~(lanes - 1));
+    const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) << (threadIdx.x & 31 & ~(threads - 1));
     auto run = [&](auto& h, auto& counter) {
         constexpr int R = sizeof(counter), N = sizeof(h) / sizeof(float) / R, L = N / R;
         float b[R], mine[R], inverse[N];
         float gain = 0.0f;
         #pragma unroll
         for (int r = 0; r < R; ++r) {
-            const int i = lane + r * L;
-            const bool is_row = lane < L && i < n;
+            const int i = thread + r * L;
+            const bool is_row = thread < L && i < n;
             b[r] = is_row ? right.data[i] : 0.0f;
             #pragma unroll
             for (int j = 0; j < N; ++j) h[r * N + j] = is_row && j <= i ? matrix.data[i * n + j] : 0.0f;
@@ -28,8 +28,8 @@ _ON_A_GPU = """
                 const float w = weight.data[row], left = w * lacks;
                 #pragma unroll
                 for (int r = 0; r < R; ++r) {
-                    const int i = lane + r * L;
-                    mine[r] = lane < L && i < n ? j_row[i] : 0.0f;
+                    const int i = thread + r * L;
+                    mine[r] = thread < L && i < n ? j_row[i] : 0.0f;
                     b[r] -= mine[r] * left;
                     mine[r] *= w;
                 }
@@ -48,20 +48,20 @@ _ON_A_GPU = """
         #pragma unroll
         for (int k = 0; k < N; ++k) {
             if (k < n) {
-                const float inv = rsqrtf(fmaxf(__shfl_sync(group, h[k / L * N + k], k % L, lanes), 1.0e-20f));
-                const float y = inv * __shfl_sync(group, b[k / L], k % L, lanes);
+                const float inv = rsqrtf(fmaxf(__shfl_sync(group, h[k / L * N + k], k % L, threads), 1.0e-20f));
+                const float y = inv * __shfl_sync(group, b[k / L], k % L, threads);
                 inverse[k] = inv;
                 gain += y * y;
                 #pragma unroll
                 for (int r = 0; r < R; ++r) {
-                    const int i = lane + r * L;
+                    const int i = thread + r * L;
                     h[r * N + k] *= inv;
                     b[r] = i == k ? y : i > k ? b[r] - h[r * N + k] * y : b[r];
                 }
                 #pragma unroll
                 for (int j = k + 1; j < N; ++j) {
                     if (j < n) {
-                        const float other = __shfl_sync(group, h[j / L * N + k], j % L, lanes);
+                        const float other = __shfl_sync(group, h[j / L * N + k], j % L, threads);
                         #pragma unroll
                         for (int r = 0; r < R; ++r) h[r * N + j] -= h[r * N + k] * other;
                     }
@@ -70,22 +70,22 @@ _ON_A_GPU = """
         }
         #pragma unroll
         for (int r = 0; r < R; ++r) {
-            const int i = lane + r * L;
+            const int i = thread + r * L;
             #pragma unroll
             for (int j = 0; j < N; ++j) {
-                if (lane < L && i < n && j < i) factor.data[i * n + j] = h[r * N + j];
+                if (thread < L && i < n && j < i) factor.data[i * n + j] = h[r * N + j];
             }
         }
         __syncwarp(group);
         #pragma unroll
         for (int k = N - 1; k >= 0; --k) {
             if (k < n) {
-                const float x = inverse[k] * __shfl_sync(group, b[k / L], k % L, lanes);
+                const float x = inverse[k] * __shfl_sync(group, b[k / L], k % L, threads);
                 #pragma unroll
                 for (int r = 0; r < R; ++r) {
-                    const int i = lane + r * L;
-                    if (lane < L && i < k) b[r] -= factor.data[k * n + i] * x;
-                    if (lane < L && i == k) solution.data[i] = x;
+                    const int i = thread + r * L;
+                    if (thread < L && i < k) b[r] -= factor.data[k * n + i] * x;
+                    if (thread < L && i == k) solution.data[i] = x;
                 }
             }
         }
@@ -94,13 +94,13 @@ _ON_A_GPU = """
     };
     char r1[1], r2[2], r4[4], r8[8];
     if (n <= 16) {
-        if (lanes >= 16) { float h[16]; return run(h, r1); }
-        if (lanes == 8) { float h[32]; return run(h, r2); }
+        if (threads >= 16) { float h[16]; return run(h, r1); }
+        if (threads == 8) { float h[32]; return run(h, r2); }
         float h[64]; return run(h, r4);
     }
-    if (lanes == 32) { float h[32]; return run(h, r1); }
-    if (lanes == 16) { float h[64]; return run(h, r2); }
-    if (lanes == 8) { float h[128]; return run(h, r4); }
+    if (threads == 32) { float h[32]; return run(h, r1); }
+    if (threads == 16) { float h[64]; return run(h, r2); }
+    if (threads == 8) { float h[128]; return run(h, r4); }
     float h[256]; return run(h, r8);
 """
 _ON_A_CPU = """
@@ -157,8 +157,8 @@ def direction(
     n: int,
     rows: int,
     stiff: int,
-    lane: int,
-    lanes: int,
+    thread: int,
+    threads: int,
 ) -> float:
     """Solves (M + J' D J) x = right - J' D residual, without J' D J where `stiff` is 0.
 

@@ -33,21 +33,23 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 
 @wp.func
-def _slopes(memory: Memory, rows: int, at: float, slope: float, curve: float, lane: int, lanes: int) -> wp.vec2:
+def _slopes(memory: Memory, rows: int, at: float, slope: float, curve: float, thread: int, threads: int) -> wp.vec2:
     """Returns the first and second derivative of the cost, so far along the search direction."""
     d1 = float(0.0)
     d2 = float(0.0)
-    for row in range(lane, rows, lanes):
+    for row in range(thread, rows, threads):
         change = memory.change[row]
         left = memory.residual[row] + at * change
         pull = _pull(row, left, memory.weight[row]) * change
         d1 += pull * left
         d2 += pull * change
-    return wp.vec2(total(d1, lanes) + slope + at * curve, total(d2, lanes) + curve)
+    return wp.vec2(total(d1, threads) + slope + at * curve, total(d2, threads) + curve)
 
 
 @wp.func
-def _how_far(memory: Memory, rows: int, slope: float, curve: float, gain: float, attempts: int, lane: int, lanes: int) -> float:
+def _how_far(
+    memory: Memory, rows: int, slope: float, curve: float, gain: float, attempts: int, thread: int, threads: int
+) -> float:
     """Returns the step along the search direction that minimizes the cost.
 
     Args:
@@ -58,7 +60,7 @@ def _how_far(memory: Memory, rows: int, slope: float, curve: float, gain: float,
     high = float(-1.0)
     step = float(1.0)
     for _ in range(attempts):
-        d = _slopes(memory, rows, step, slope, curve, lane, lanes)
+        d = _slopes(memory, rows, step, slope, curve, thread, threads)
         if wp.abs(d[0]) <= _SLOPE * gain:
             break
         if d[0] < 0.0:
@@ -72,56 +74,56 @@ def _how_far(memory: Memory, rows: int, slope: float, curve: float, gain: float,
 
 
 @wp.func
-def _take(memory: Memory, far: float, rows: int, size: int, lane: int, lanes: int) -> float:
+def _take(memory: Memory, far: float, rows: int, size: int, thread: int, threads: int) -> float:
     """Goes so far along the search direction; returns how many rows begin or cease to act."""
     changed = float(0.0)
-    for i in range(lane, size, lanes):
+    for i in range(thread, size, threads):
         memory.qacc[i] = memory.qacc[i] + far * memory.search[i]
         memory.inert[i] = memory.inert[i] + far * memory.step[i]
-    for row in range(lane, rows, lanes):
+    for row in range(thread, rows, threads):
         before = memory.residual[row]
         after = before + far * memory.change[row]
         memory.residual[row] = after
         if row >= _EQUALITIES and (before < 0.0) != (after < 0.0):
             changed += 1.0
-    changed = total(changed, lanes)
-    sync(lanes)
+    changed = total(changed, threads)
+    sync(threads)
     return changed
 
 
 @wp.func
-def _begin(memory: Memory, rows: int, nv: int, lane: int, lanes: int) -> float:
+def _begin(memory: Memory, rows: int, nv: int, thread: int, threads: int) -> float:
     """Computes what the solver keeps up to date, at the first guess; returns the energy that single precision leaves unsure.
 
     It is that of rounding J a - aref: at the minimum, the sum of D times the square of its error is what a step can gain.
     """
-    for i in range(lane, nv, lanes):
+    for i in range(thread, nv, threads):
         memory.inert[i] = _dot(memory.mass, i, memory.qacc, nv)
     unsure = float(0.0)
-    for row in range(lane, rows, lanes):
+    for row in range(thread, rows, threads):
         asked = memory.residual[row]
         has = _dot(memory.jacobian, row, memory.qacc, nv)
         residual = has - asked
         memory.residual[row] = residual
         size = wp.abs(has) + wp.abs(asked)
         unsure += _pull(row, residual, memory.weight[row]) * size * size
-    unsure = total(unsure, lanes)
-    sync(lanes)
+    unsure = total(unsure, threads)
+    sync(threads)
     return _UNSURE * unsure
 
 
 @wp.func
-def solve(world: World, memory: Memory, nv: int, lane: int, lanes: int):
+def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
     """Computes `qacc`, from what it holds on."""
     rows = memory.counts[1]
-    unsure = _begin(memory, rows, nv, lane, lanes)
+    unsure = _begin(memory, rows, nv, thread, threads)
     for _ in range(world.iterations):
         energy = float(0.0)
-        for i in range(lane, nv, lanes):
+        for i in range(thread, nv, threads):
             energy += memory.qacc[i] * memory.inert[i]
             memory.step[i] = memory.smooth[i] - memory.inert[i]
-        least = wp.max(wp.max(world.tolerance / world.scale, unsure), _ROUNDING * total(energy, lanes))
-        sync(lanes)
+        least = wp.max(wp.max(world.tolerance / world.scale, unsure), _ROUNDING * total(energy, threads))
+        sync(threads)
         gain = direction(
             memory.mass,
             memory.step,
@@ -133,24 +135,24 @@ def solve(world: World, memory: Memory, nv: int, lane: int, lanes: int):
             nv,
             rows,
             1,
-            lane,
-            lanes,
+            thread,
+            threads,
         )  # the cost's decrease if all of it were one piece, twice
         if not (gain > least):  # also if it is NaN
             break
         slope = float(0.0)
         curve = float(0.0)
-        for i in range(lane, nv, lanes):
+        for i in range(thread, nv, threads):
             step_i = _dot(memory.mass, i, memory.search, nv)
             slope -= memory.search[i] * memory.step[i]
             curve += memory.search[i] * step_i
             memory.step[i] = step_i
-        for row in range(lane, rows, lanes):
+        for row in range(thread, rows, threads):
             memory.change[row] = _dot(memory.jacobian, row, memory.search, nv)
-        slope = total(slope, lanes)
-        curve = total(curve, lanes)
-        far = _how_far(memory, rows, slope, curve, gain, world.ls_iterations, lane, lanes)
-        changed = _take(memory, far, rows, nv, lane, lanes)
+        slope = total(slope, threads)
+        curve = total(curve, threads)
+        far = _how_far(memory, rows, slope, curve, gain, world.ls_iterations, thread, threads)
+        changed = _take(memory, far, rows, nv, thread, threads)
         if changed == 0.0 and wp.abs(far - 1.0) < _WHOLE:
             break
         if far * far * gain <= least:  # rounding lets the search go no further
@@ -158,12 +160,12 @@ def solve(world: World, memory: Memory, nv: int, lane: int, lanes: int):
 
 
 @wp.func
-def accelerate(world: World, dofs: Dofs, memory: Memory, nv: int, lane: int, lanes: int):
+def accelerate(world: World, dofs: Dofs, memory: Memory, nv: int, thread: int, threads: int):
     """Advances velocities by all forces, implicitly in damping."""
-    sync(lanes)
-    for i in range(lane, nv, lanes):
+    sync(threads)
+    for i in range(thread, nv, threads):
         memory.mass[i * nv + i] = memory.mass[i * nv + i] + world.timestep * dofs.damping[i]
-    sync(lanes)
+    sync(threads)
     direction(
         memory.mass,
         memory.smooth,
@@ -175,9 +177,9 @@ def accelerate(world: World, dofs: Dofs, memory: Memory, nv: int, lane: int, lan
         nv,
         memory.counts[1],
         0,
-        lane,
-        lanes,
+        thread,
+        threads,
     )
-    for i in range(lane, nv, lanes):
+    for i in range(thread, nv, threads):
         memory.qvel[i] = memory.qvel[i] + world.timestep * memory.search[i]
-    sync(lanes)
+    sync(threads)

@@ -1,13 +1,13 @@
 # mypy: disable-error-code="empty-body"
-"""Lanes: the threads, neighbours in one warp of the GPU, that share the work on one environment.
+"""The GPU threads, neighbours in one warp, that share the work on one environment.
 
-There are `lanes` of them, a power of 2 up to 32, and 1 on a CPU. Each part of a substep is a loop that begins at the thread's
-own lane and goes on by `lanes`.
+There are `threads` of them, a power of 2 up to 32, and 1 on a CPU. `thread` is the number of one of them. Each part of a
+substep is a loop that begins at `thread` and advances by `threads`.
 """
 
 from mjx_dher.system.warp_setup import wp
 
-_GROUP = "const unsigned group = lanes == 32 ? ~0u : ((1u << lanes) - 1u) << (threadIdx.x & 31 & ~(lanes - 1));"
+_GROUP = "const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) << (threadIdx.x & 31 & ~(threads - 1));"
 
 
 @wp.func_native(f"""
@@ -16,8 +16,8 @@ _GROUP = "const unsigned group = lanes == 32 ? ~0u : ((1u << lanes) - 1u) << (th
     __syncwarp(group);
 #endif
 """)
-def sync(lanes: int):  # type: ignore[no-untyped-def]
-    """Waits for the environment's other lanes, and sees what they have written."""
+def sync(threads: int):  # type: ignore[no-untyped-def]
+    """Waits for the environment's other threads, and sees what they have written."""
     ...
 
 
@@ -38,12 +38,12 @@ def gather(warps: int):  # type: ignore[no-untyped-def]
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     {_GROUP}
-    for (int other = lanes / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
+    for (int other = threads / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
 #endif
     return x;
 """)
-def total(x: float, lanes: int) -> float:
-    """Returns the sum of the lanes' numbers, the same to the bit in each of them."""
+def total(x: float, threads: int) -> float:
+    """Returns the sum of the threads' numbers, the same to the bit in each of them."""
     ...
 
 
@@ -52,7 +52,7 @@ def _carve(of: str) -> str:
     return f"""
 #if defined(__CUDA_ARCH__)
     extern __shared__ char dynamic_smem_base[];
-    float* const all = reinterpret_cast<float*>(dynamic_smem_base) + threadIdx.x / lanes * size;
+    float* const all = reinterpret_cast<float*>(dynamic_smem_base) + threadIdx.x / threads * size;
 #else
     float* const all = spare.data;
 #endif
@@ -61,36 +61,38 @@ def _carve(of: str) -> str:
 
 
 @wp.func_native(_carve("wp::int32"))
-def ints(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=int):
+def ints(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=int):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
 
 
 @wp.func_native(_carve("wp::float32"))
-def floats(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=float):
+def floats(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=float):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
 
 
 @wp.func_native(_carve("wp::vec_t<3, wp::float32>"))
-def vec3s(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=wp.vec3):
+def vec3s(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.vec3):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
 
 
 @wp.func_native(_carve("wp::vec_t<4, wp::float32>"))
-def quats(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=wp.vec4):
+def quats(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.vec4):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
 
 
 @wp.func_native(_carve("wp::mat_t<3, 3, wp::float32>"))
-def matrices(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=wp.mat33):
+def matrices(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.mat33):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
 
 
 @wp.func_native(_carve("wp::vec_t<6, wp::float32>"))
-def spatials(spare: wp.array(dtype=float), size: int, begin: int, length: int, lanes: int) -> wp.array(dtype=wp.spatial_vector):
+def spatials(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(
+    dtype=wp.spatial_vector
+):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
