@@ -15,7 +15,7 @@ from mjx_dher.lookup import check_name
 
 if TYPE_CHECKING:
     from mjx_dher.envs.base import GoalEnv, State
-    from mjx_dher.envs.engines.simulator import Simulator
+    from mjx_dher.envs.engines.native import Simulator
 
 __all__ = ["GoalEnv", "Simulator", "State", "list_envs", "make"]
 
@@ -93,5 +93,5 @@ def __getattr__(name: str) -> Any:
     if name in ("GoalEnv", "State"):
         return getattr(importlib.import_module("mjx_dher.envs.base"), name)
     if name == "Simulator":
-        return importlib.import_module("mjx_dher.envs.engines.simulator").Simulator
+        return importlib.import_module("mjx_dher.envs.engines.native").Simulator
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

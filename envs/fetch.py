@@ -18,7 +18,7 @@ import numpy as np
 from mjx_dher.config import check_count, check_number
 from mjx_dher.envs.arm_kinematics import Chain, integrate
 from mjx_dher.envs.base import GoalEnv, State
-from mjx_dher.envs.engines import Physics, make_engine
+from mjx_dher.envs.engines import Controls, Physics, make_engine
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
@@ -145,7 +145,7 @@ class FetchEnv(GoalEnv):
             x.at[at].set(y)
             for x, at, y in ((state.physics.qpos, self._object_qpos, upright), (state.physics.qvel, self._object_qvel, 0.0))
         )
-        physics = Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
+        physics = state.physics.replace(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
         obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
         return dataclasses.replace(
             state, physics=physics, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"])
@@ -164,7 +164,7 @@ class FetchEnv(GoalEnv):
         quat = quat + POINTING_DOWN
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
         ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.drives_fingers else jnp.zeros(0)
-        physics = self.engine.advance(state.physics, target, ctrl)
+        physics = self.engine.advance(state.physics, Controls(ctrl=ctrl, mocap=target[None]))
         if self.has_fingers and not self.drives_fingers:
             physics = dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
         sound = self._is_sound(physics)
@@ -191,7 +191,7 @@ class FetchEnv(GoalEnv):
         qvel = jnp.zeros(self.model.nv, jnp.float32).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel, jnp.float32))
         if self.has_fingers:
             qvel = qvel.at[self._finger_qvel].set(jnp.array(self.task.finger_qvel, jnp.float32))
-        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv, jnp.float32))
+        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv, jnp.float32), act=jnp.zeros(0, jnp.float32))
 
     def _resting_place(self) -> Array | None:
         """Returns the object's qpos [7] after the physics has blown up: beside the gripper, as near as a reset would put it."""

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_dher import envs
 from mjx_dher.envs import engines
-from mjx_dher.envs.engines.base import Physics
+from mjx_dher.envs.engines.base import Controls, Physics
 from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
@@ -194,12 +194,14 @@ MOTOR = '<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worl
         (WELDED.format('<option density="1.2"/>', "box", 3), "a medium"),
         (WELDED.format('<default><joint frictionloss="1"/></default>', "box", 3), "friction in joints"),
         (WELDED.format('<default><joint stiffness="1 2"/></default>', "box", 3), "springs or damping that are not linear"),
+        (WELDED.format('<default><joint actuatorfrcrange="-1 1"/></default>', "box", 3), "limits of joint torques"),
+        (WELDED.format('<option noslip_iterations="3"/>', "box", 3), "noslip iterations"),
         (WELDED.format('<sensor><jointpos joint="j"/></sensor>', "box", 3), "sensors"),
         (
             WELDED.format('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>', "box", 3),
             "actuators other",
         ),
-        ("<mujoco/>", "other constraints than one weld of a mocap body"),
+        ("<mujoco/>", "equality constraints other than exactly one weld"),
     ],
 )
 def test_what_the_kernel_leaves_out_is_named(model, what):
@@ -239,8 +241,9 @@ def test_contacts_that_there_is_no_room_for_are_told():
     made = envs.make("slide", engine="warp", allow_cpu=True, constraints=12)
     model = envs.make("slide", engine="native").model
     (qpos, qvel, inputs), engine = touching(model), made.engine
-    physics = Physics(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros_like(qvel))))
-    after = jax.jit(jax.vmap(engine.advance))(physics, jnp.asarray(inputs[:, :7]), jnp.asarray(inputs[:, 7:]))
+    physics = Physics(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros_like(qvel), np.zeros((NUM, 0)))))
+    controls = Controls(ctrl=jnp.asarray(inputs[:, 7:]), mocap=jnp.asarray(inputs[:, None, :7]))
+    after = jax.jit(jax.vmap(engine.advance))(physics, controls)
     assert np.isfinite(after.qpos).all()
     with pytest.raises(ValueError, match=r"left out contacts .*constraints=12; constraints=\d+ are always enough"):
         engine.check()

@@ -9,11 +9,11 @@ from typing import Any
 
 import mujoco
 
-from mjx_dher.envs.engines.base import Engine, Physics
+from mjx_dher.envs.engines.base import Controls, Engine, Physics
 from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.spec import ENGINES
 
-__all__ = ["Engine", "Physics", "make_engine", "resolve_engine"]
+__all__ = ["Controls", "Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
@@ -37,21 +37,25 @@ def _has_warp() -> bool:
 
 
 def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
-    """Makes an engine for `model` that advances `substeps` timesteps a call.
+    """Makes an engine that advances `model` by `substeps` timesteps a call.
+
+    `native` takes any model without sleeping bodies, `jax` any that MJX takes, and `warp` those whose features its kernel has.
 
     Args:
       name: "native", "jax", "warp" or "auto".
-      model: the compiled MJCF, with exactly one mocap body.
+      model: the compiled MJCF.
       substeps: MuJoCo timesteps an environment step.
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp
-        the same two, `contacts` and `constraints` (its memory), and `allow_cpu`.
+        the same two, `constraints` (its memory), and `allow_cpu`.
 
     Raises:
-      ValueError: there is no such engine or option, or the engine cannot run on this machine.
+      ValueError: there is no such engine or option, or the engine cannot run this model or on this machine.
     """
     for option in options:
         check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
-    return _constructor(name)(model, substeps, **options)
+    if model.nhistory or model.npluginstate:
+        raise ValueError("the model has delays or plugins, whose state `Physics` does not hold; use mjx_dher.envs.Simulator")
+    return _constructor(name)(model, substeps=substeps, **options)
 
 
 def engine_options(name: str) -> list[str]:
@@ -60,14 +64,14 @@ def engine_options(name: str) -> list[str]:
     Raises:
       ValueError: as for `make_engine`.
     """
-    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps"})
+    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps", "derived"})
 
 
 def _constructor(name: str) -> Callable[..., Engine]:
     name = resolve_engine(name)
     constructor: Callable[..., Engine]
     if name == "native":
-        from mjx_dher.envs.engines.native import NativeEngine as constructor
+        from mjx_dher.envs.engines.native import Simulator as constructor
     elif name == "warp":
         if not _has_warp():
             raise ValueError(missing_extra("engine warp", "warp-lang", "cuda"))

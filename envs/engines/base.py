@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import jax.numpy as jnp
+import mujoco
 from flax import struct
 
 from mjx_dher.types import Array
@@ -11,21 +13,46 @@ from mjx_dher.types import Array
 
 @struct.dataclass
 class Physics:
-    """The complete state of the simulation between two steps, in MuJoCo's layout."""
+    """State of a simulation between two steps, in MuJoCo's layout."""
 
     qpos: Array  # [nq]
     qvel: Array  # [nv]
-    warmstart: Array  # [nv] initial guess of the constraint solver (qacc_warmstart)
+    warmstart: Array  # [nv] first guess of the constraint solver (qacc_warmstart)
+    act: Array  # [na] activations of actuators
+
+
+@struct.dataclass
+class Controls:
+    """Inputs that are held for a whole environment step."""
+
+    ctrl: Array  # [nu]
+    mocap: Array  # [nmocap, 7] poses of mocap bodies: position, m, and orientation (w, x, y, z)
 
 
 class Engine(Protocol):
-    """Physics engine that advances `Physics` by one environment step under a fixed input."""
+    """Physics engine that advances one simulation by one environment step; `jax.vmap` makes the batch."""
 
     name: str
 
-    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
-        """Returns the physics one environment step later; the mocap body is held at `target` [7] (position, m; w, x, y, z)."""
+    def advance(self, physics: Physics, controls: Controls) -> Physics:
+        """Returns the physics one environment step later."""
         ...
 
     def check(self) -> None:
-        """Raises ValueError if steps so far were wrong in a way that their results do not show."""
+        """Raises ValueError if earlier steps were wrong in a way that their results do not show."""
+
+
+def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) -> None:
+    """Raises ValueError if an array has another shape than the model's."""
+    for values, shapes in (
+        (physics, {"qpos": (model.nq,), "qvel": (model.nv,), "warmstart": (model.nv,), "act": (model.na,)}),
+        (controls, {"ctrl": (model.nu,), "mocap": (model.nmocap, 7)}),
+    ):
+        for name, shape in shapes.items():
+            check_shape(name, getattr(values, name), shape)
+
+
+def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    """Raises ValueError if the array called `name` has another shape."""
+    if jnp.shape(value) != shape:
+        raise ValueError(f"{name} has shape {list(jnp.shape(value))}; the model's is {list(shape)} (use jax.vmap for a batch)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import numpy as np
 
 from mjx_dher.config import check_count
 from mjx_dher.envs.arm_kinematics import quat_multiply
-from mjx_dher.envs.engines.base import Physics
+from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
 
@@ -50,16 +51,12 @@ class _Weld:
     """The part of a weld's acceleration that is due to velocity, which MJX leaves out and MuJoCo C and Warp put in.
 
     With r the weld's residual, MuJoCo asks for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: an arm that
-    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. The weld must join a mocap body (which counts as at
-    rest) to a moving body, in such a way that their frames coincide.
+    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. Only welds are corrected that join a mocap body
+    (which counts as at rest) to a moving body, in such a way that their frames coincide.
     """
 
-    def __init__(self, model: mujoco.MjModel):
-        if model.neq != 1 or model.eq_type[0] != mujoco.mjtEq.mjEQ_WELD or model.body_mocapid[model.eq_obj1id[0]] < 0:
-            raise ValueError("the model's one equality constraint must be a weld of a mocap body to the gripper")
-        if not np.allclose(model.eq_data[0, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]):
-            raise ValueError("the weld must have relpose 0 0 0 1 0 0 0 and torquescale 1")
-        self._target, self._body = int(model.eq_obj1id[0]), int(model.eq_obj2id[0])
+    def __init__(self, model: mujoco.MjModel, index: int):
+        self._target, self._body = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
         self._root = int(model.body_rootid[self._body])
         body = self._body
         while not model.body_dofnum[body]:
@@ -84,13 +81,32 @@ class _Weld:
         return -jnp.concatenate([position, orientation])
 
 
+def _welds(model: mujoco.MjModel) -> list[int | _Weld]:
+    """Returns the first rows of a model's constraints in order: welds to correct, and the numbers of other rows."""
+    disabled = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    connect, weld = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
+    if model.opt.disableflags & disabled or model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
+        return []
+
+    def to_correct(index: int) -> bool:
+        bodies = model.eq_objtype[index] == int(mujoco.mjtObj.mjOBJ_BODY) and model.eq_active0[index]
+        plain = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
+        if not bodies or not plain or model.body_mocapid[model.eq_obj1id[index]] < 0:
+            return False
+        return bool(model.body_weldid[model.eq_obj2id[index]])  # else it is fixed to the world
+
+    rows: list[int | _Weld] = [3 * int(np.count_nonzero(model.eq_type == connect))]
+    rows += [_Weld(model, index) if to_correct(index) else 6 for index in np.flatnonzero(model.eq_type == weld).tolist()]
+    return rows if any(isinstance(row, _Weld) for row in rows) else []
+
+
 def _grow_for_margins(model: mujoco.MjModel) -> None:
-    """Enlarges geoms by the margin of their contacts, and sets the margin to 0, if MJX would ignore it.
+    """Enlarges geoms by the margin of their contact pairs, and sets the margin to 0, if MJX would ignore it.
 
     A contact with a margin acts from that distance on. MJX 3.17 finds box-box and sphere-box contacts only if the geoms
     overlap: their distance would jump from none to the whole margin, and a slightly tilted face would touch with fewer points.
     A geom that is larger by the margin gives the same distances and normals (except at a box's edges, which stay sharp). The
-    geom must have the same margin in all its pairs of that kind.
+    geom must have the same margin in all its contacts; a warning names the pairs of which neither geom does.
     """
     sphere, box = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)
     ends = np.stack([model.pair_geom1, model.pair_geom2], axis=1)
@@ -100,11 +116,13 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
     for geom in sorted(set(ends[affected].ravel().tolist()), key=lambda geom: int(model.geom_type[geom])):
         pairs = np.flatnonzero((ends == geom).any(axis=1))
         margin = float(model.pair_margin[pairs[0]])
-        if margin > 0 and affected[pairs].all() and (model.pair_margin[pairs] == margin).all():
+        alone = not (model.geom_contype[geom] or model.geom_conaffinity[geom])  # no contacts besides the pairs
+        if alone and margin > 0 and affected[pairs].all() and (model.pair_margin[pairs] == margin).all():
             model.geom_size[geom] += margin
             model.pair_margin[pairs] = 0
-    if (affected & (model.pair_margin > 0)).any():
-        raise ValueError("a contact of a box with a box or sphere has a margin that neither geom has in all its pairs")
+    if (ignored := affected & (model.pair_margin > 0)).any():
+        names = ", ".join(" and ".join(model.geom(geom).name for geom in pair) for pair in ends[ignored])
+        warnings.warn(f"engine jax ignores the margin of contacts of boxes: {names}", stacklevel=2)
 
 
 class MjxEngine:
@@ -124,26 +142,34 @@ class MjxEngine:
         _grow_for_margins(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
-        self._model = mjx.put_model(model, impl="jax")
-        # NumPy leaves become constants of the program that traces them, on any device.
-        self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
-        self._weld = _Weld(model)  # its six rows are the first of all constraints
-        self._substeps = substeps
+        self._mujoco_model, self._substeps, self._welds = model, substeps, _welds(model)
+        try:
+            self._model = mjx.put_model(model, impl="jax")
+            # NumPy leaves become constants of the program that traces them, on any device.
+            self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
+        except NotImplementedError as error:
+            raise ValueError(f"engine jax: MJX does not support this model: {error}; use engine native") from error
 
-    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
+    def advance(self, physics: Physics, controls: Controls) -> Physics:
+        check_shapes(self._mujoco_model, physics, controls)
+
+        # MJX indexes empty arrays, such as the places of sites that do not exist, which NumPy rejects and JAX allows.
+        start = jax.tree.map(lambda x: x if x.size else jnp.asarray(x), self._data)
+
         def substep(_, p: Physics) -> Physics:
-            data = self._data.replace(
+            data = start.replace(
                 qpos=p.qpos,
                 qvel=p.qvel,
                 qacc_warmstart=p.warmstart,
-                mocap_pos=target[None, :3],
-                mocap_quat=target[None, 3:],
-                ctrl=ctrl,
+                act=p.act,
+                mocap_pos=controls.mocap[:, :3],
+                mocap_quat=controls.mocap[:, 3:],
+                ctrl=controls.ctrl,
             )
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
-                data = self._step(data)
+                data = self._step(data) if self._welds else mjx.step(self._model, data)
             # MJX takes its own precision from jax_enable_x64; between substeps, as between steps, it is float32.
-            return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)))
+            return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act)))
 
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
             return jax.lax.fori_loop(0, self._substeps, substep, physics)
@@ -152,8 +178,11 @@ class MjxEngine:
         pass  # no contact is lost: there is memory for all of them
 
     def _step(self, data: mjx.Data) -> mjx.Data:
-        """Computes `mjx.step` with the weld corrected, and without sensors, which the models do not have."""
+        """Computes `mjx.step` with the welds corrected, and without sensors."""
         data = mjx.fwd_velocity(self._model, mjx.fwd_position(self._model, data))
-        data = private_api.shift_reference_acceleration(data, -self._weld.bias(data))
+        shifts = [-weld.bias(data) if isinstance(weld, _Weld) else jnp.zeros(weld) for weld in self._welds]
+        data = private_api.shift_reference_acceleration(data, jnp.concatenate(shifts))
         data = mjx.fwd_acceleration(self._model, mjx.fwd_actuation(self._model, data))
-        return mjx.euler(self._model, mjx.solve(self._model, data))
+        euler = int(mujoco.mjtIntegrator.mjINT_EULER)
+        integrate = mjx.euler if self._mujoco_model.opt.integrator == euler else mjx.implicit
+        return integrate(self._model, mjx.solve(self._model, data))

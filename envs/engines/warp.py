@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import mujoco
 
 from mjx_dher.config import check_count
-from mjx_dher.envs.engines.base import Physics
+from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.fused import simulation
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import load, prepare, wp
-from mjx_dher.types import Array
 
 
 class WarpEngine:
@@ -108,12 +107,13 @@ class WarpEngine:
             module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it
         )
 
-    def advance(self, physics: Physics, target: Array, ctrl: Array) -> Physics:
+    def advance(self, physics: Physics, controls: Controls) -> Physics:
+        check_shapes(self._model, physics, controls)
         self._begin_loading()
         rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, physics.warmstart)]
         private_api.reset_call_id(self._call)
-        qpos, qvel, warmstart = self._call(*rows, jnp.concatenate([target, ctrl])[None])
-        return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0])
+        qpos, qvel, warmstart = self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None])
+        return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0], act=physics.act)
 
     def check(self) -> None:
         """Checks that no contacts were lost since the last call; waits for the kernel to compile.

@@ -9,7 +9,7 @@ from mjx_dher.envs.engines.fused import kernel, setup
 from mjx_dher.system.warp_setup import load, wp
 
 # Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
-LANES, WARPS = 16, 8
+THREADS, WARPS = 16, 8
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
 
@@ -33,10 +33,11 @@ class Simulation:
         world = setup.world_of(model, contacts, rows)
         layout = setup.layout_of(model, world, contacts, dofs)
         device = wp.get_device()
-        self._lanes = 1 if device.is_cpu else LANES
+        self._threads = 1 if device.is_cpu else THREADS
         warps = 0 if device.is_cpu else most_warps(layout.size, device.max_shared_memory_per_block)
         self._block = max(1, 32 * warps)
-        self._kernel = kernel.make(layout.size, self._lanes, warps, model.nv, tuple(sorted({*map(int, contacts.kind.numpy())})))
+        kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
+        self._kernel = kernel.make(layout.size, self._threads, warps, model.nv, kinds)
         memory = wp.zeros((num_envs, layout.size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (world, bodies, dofs, contacts, layout, memory)
         self._lost = wp.zeros(1, dtype=int)
@@ -50,7 +51,7 @@ class Simulation:
         """Advances coordinates, velocities and the solver's first guess by one environment step."""
         wp.launch(
             self._kernel,
-            dim=(self._num_envs, self._lanes),
+            dim=(self._num_envs, self._threads),
             inputs=[*self._kept, self._substeps, self._lost, inputs, *state],
             outputs=list(result),
             block_dim=self._block,
@@ -70,7 +71,7 @@ def most_warps(size: int, shared: int) -> int:
     Raises:
       ValueError: there is not enough for one.
     """
-    a_warp = 4 * size * (32 // LANES)
+    a_warp = 4 * size * (32 // THREADS)
     if a_warp > shared:
         raise ValueError(
             f"the warp engine needs {a_warp:,} bytes of a GPU's shared memory and has {shared:,}; fewer constraints take less"
@@ -84,7 +85,8 @@ def most_rows(model: mujoco.MjModel) -> int:
 
 
 # Model features by name -> whether a model has them.
-_DISABLED = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the flag of the older algorithm for convex shapes, which this one has
+_OLDER_CCD = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the flag of the older algorithm for convex shapes, which this one has
+_KNOWN_FLAGS = _OLDER_CCD | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # the solver has no islands
 _KNOWN_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
 
 
@@ -94,7 +96,7 @@ def unsupported(model: mujoco.MjModel) -> list[str]:
     features = {
         "an integrator other than Euler": opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
         "elliptic friction cones": opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "options disabled or enabled": opt.disableflags & ~_DISABLED or opt.enableflags,
+        "options disabled or enabled": opt.disableflags & ~_KNOWN_FLAGS or opt.enableflags,
         "tendons": model.ntendon,
         "flexes": model.nflex,
         "sensors": model.nsensor,
@@ -107,8 +109,11 @@ def unsupported(model: mujoco.MjModel) -> list[str]:
         "springs or damping that are not linear": np.any(model.jnt_stiffnesspoly) or np.any(model.dof_dampingpoly),
         "friction in joints": np.any(model.dof_frictionloss),
         "limits of free joints": np.any(model.jnt_limited[~scalar]),
+        "limits of joint torques": np.any(model.jnt_actfrclimited),
+        "delays": model.nhistory,
+        "noslip iterations": opt.noslip_iterations,
         "more than 31 degrees of freedom": model.nv > 31,
-        "other constraints than one weld of a mocap body": not _has_plain_weld(model),
+        "equality constraints other than exactly one weld of a mocap body": not _has_plain_weld(model),
         "actuators other than on joints, affine and without a state": not _has_plain_actuators(model),
         **_contact_features(model),
     }
@@ -141,7 +146,7 @@ def _contact_features(model: mujoco.MjModel) -> dict[str, Any]:
         "contacts of geoms that no pair lists": np.any(model.geom_contype) and np.any(model.geom_conaffinity),
         "contacts other than of boxes and cylinders with boxes and planes": set(kinds) - set(setup.CONTACT_KINDS),
         "contacts of cylinders and boxes without nativeccd=disable": ("CYLINDER", "BOX") in kinds
-        and not model.opt.disableflags & _DISABLED,
+        and not model.opt.disableflags & _OLDER_CCD,
         "contacts with rolling friction": np.any(model.pair_dim > 4),
         "contacts with a gap or adhesion": np.any(model.pair_gap) or np.any(model.pair_adhesion),
     }

@@ -1,0 +1,134 @@
+"""Engines on models that have nothing of a Fetch robot: an arm with joint servos, activations, several mocap bodies, none."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_dher.envs.engines import Controls, Physics, make_engine
+
+SUBSTEPS = 10
+
+
+def arm(size="0.02 0.02 0.04"):
+    """Six joints with position servos, a tool, and a cube on the floor; contacts by contype and conaffinity."""
+    links = [("0 0 0.1", "0 0 1"), ("0 0 0.2", "0 1 0"), ("0.3 0 0", "0 1 0"), ("0.3 0 0", "1 0 0"), ("0.1 0 0", "0 1 0")]
+    body = '<body pos="{}"><joint name="j{}" axis="{}" range="-2 2" damping="2" armature="0.1"/><geom fromto="0 0 0 0.08 0 0"/>'
+    chain = "".join(body.format(pos, number, axis) for number, (pos, axis) in enumerate(links))
+    tool = f'<body pos="0.08 0 0"><joint name="j5" axis="1 0 0" damping="2"/><geom type="box" size="{size}" mass="0.1"/></body>'
+    servos = "".join(f'<position joint="j{number}" kp="50" ctrlrange="-2 2"/>' for number in range(6))
+    return f"""
+<mujoco>
+  <default><geom type="capsule" size="0.03" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <geom type="plane" size="3 3 0.1" contype="1" conaffinity="1"/>
+    <body pos="0.5 0 0.03"><freejoint/><geom type="box" size="0.03 0.03 0.03" contype="1" conaffinity="1" mass="0.2"/></body>
+    {chain}{tool}{"</body>" * 5}
+  </worldbody>
+  <actuator>{servos}</actuator>
+</mujoco>"""
+
+
+BODY = '<body pos="{0} 0 1" name="{1}"><freejoint/><geom type="box" size="0.1 0.05 0.08"/></body>'
+MODELS = {
+    "arm": arm(),
+    "activations, implicitfast": """
+<mujoco><option integrator="implicitfast"/>
+<worldbody><body><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/>
+<body pos="0.3 0 0"><joint name="b" axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body></body></worldbody>
+<actuator><general joint="a" dyntype="filter" dynprm="0.1" gainprm="5"/><motor joint="b" gear="2"/>
+<intvelocity joint="b" kp="3" actrange="-1 1"/></actuator></mujoco>""",
+    "two mocap bodies": f"""
+<mujoco><worldbody><body name="left" mocap="true"/><body name="right" mocap="true" pos="1 0 1"/>
+{BODY.format(0, "l")}{BODY.format(1, "r")}{BODY.format(2, "held")}</worldbody>
+<equality><weld body1="right" body2="r" relpose="0 0 0 1 0 0 0"/><connect body1="held" body2="world" anchor="0 0 0"/>
+<weld body1="left" body2="l" relpose="0 0 0 1 0 0 0"/></equality></mujoco>""",
+    "nothing but a ball": '<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>',
+}
+
+
+def start(model, batch=()):
+    """The model's first state and random controls [*batch, 8]."""
+    rng = np.random.default_rng(0)
+    mocap = np.concatenate([np.zeros((model.nmocap, 3)), np.tile([1.0, 0, 0, 0], (model.nmocap, 1))], axis=1)
+    mocap[:, 2], mocap[:, 0] = 1, range(model.nmocap)
+    ctrl = rng.uniform(-1, 1, (*batch, 8, model.nu))
+    poses = np.broadcast_to(mocap, (*batch, 8, *mocap.shape)) + rng.uniform(-0.1, 0.1, (*batch, 8, *mocap.shape))
+    arrays = (model.qpos0, *(np.zeros(size) for size in (model.nv, model.nv, model.na)))
+    physics = Physics(*(jnp.asarray(x, jnp.float32) for x in arrays))
+    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *x.shape)), physics)
+    return many, Controls(ctrl=jnp.asarray(ctrl, jnp.float32), mocap=jnp.asarray(poses, jnp.float32))
+
+
+def play(engine, physics, controls):
+    """Physics after each of 8 steps."""
+
+    def step(physics, controls):
+        physics = engine.advance(physics, controls)
+        return physics, physics
+
+    return jax.lax.scan(step, physics, controls)[1]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_native_is_a_loop_over_mj_step_for_any_model(name):
+    """To the bit, in a batch, and again from the same start."""
+    model = mujoco.MjModel.from_xml_string(MODELS[name])
+    engine = make_engine("native", model, SUBSTEPS, num_threads=2)
+    first, controls = start(model, (3,))
+    played = jax.jit(jax.vmap(lambda *given: play(engine, *given)))
+    seen = played(first, controls)
+    for again, once in zip(jax.tree.leaves(played(first, controls)), jax.tree.leaves(seen), strict=True):
+        np.testing.assert_array_equal(again, once)
+    for i in range(3):
+        data = mujoco.MjData(model)
+        data.qpos[:] = first.qpos[i]
+        for t in range(8):
+            data.ctrl[:], mocap = controls.ctrl[i, t], controls.mocap[i, t]
+            data.mocap_pos[:], data.mocap_quat[:] = mocap[:, :3], mocap[:, 3:]
+            for _ in range(SUBSTEPS):
+                mujoco.mj_step(model, data)
+            for field, name in (("qpos", "qpos"), ("qvel", "qvel"), ("act", "act"), ("warmstart", "qacc_warmstart")):
+                value = getattr(data, name)
+                np.testing.assert_array_equal(getattr(seen, field)[i, t], np.float32(value), err_msg=field)
+                value[:] = np.float32(value)  # as between the steps of an engine
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "two mocap bodies" else name for name in MODELS]
+)
+def test_jax_follows_native_on_any_model(name):
+    model = mujoco.MjModel.from_xml_string(MODELS[name])
+    first, controls = start(model)
+    mjx, native = (make_engine(engine, model, SUBSTEPS) for engine in ("jax", "native"))
+    here, there = (jax.jit(lambda *x, engine=engine: play(engine, *x))(first, controls) for engine in (mjx, native))
+    assert np.ptp(there.qpos, axis=0).max() > 0.01
+    np.testing.assert_allclose(here.qpos, there.qpos, atol=2e-4)
+    np.testing.assert_allclose(here.act, there.act, atol=1e-5)
+
+
+def test_what_an_engine_cannot_do_is_rejected_when_it_is_made():
+    delayed = '<sensor><jointpos joint="a" nsample="4" delay="0.006"/></sensor></mujoco>'
+    model = mujoco.MjModel.from_xml_string(MODELS["activations, implicitfast"].replace("</mujoco>", delayed))
+    for engine in ("native", "jax"):
+        with pytest.raises(ValueError, match=r"delays.*Simulator"):
+            make_engine(engine, model, SUBSTEPS)
+    cylinder = arm().replace('type="box" size="0.02 0.02 0.04"', 'type="cylinder" size="0.02 0.04" contype="1"')
+    with pytest.raises(ValueError, match=r"engine jax: MJX .*CYLINDER.*; use engine native"):
+        make_engine("jax", mujoco.MjModel.from_xml_string(cylinder), SUBSTEPS)
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("field", ["ctrl", "mocap", "act"])
+def test_arrays_of_another_shape_are_rejected(engine, field):
+    model = mujoco.MjModel.from_xml_string(MODELS["nothing but a ball"])
+    physics, controls = start(model)
+    controls = jax.tree.map(lambda x: x[0], controls)
+    physics, controls = (
+        dataclasses.replace(x, **{field: jnp.ones((1, 7))}) if hasattr(x, field) else x for x in (physics, controls)
+    )
+    with pytest.raises(ValueError, match=rf"{field} has shape \[1, 7\]; the model's is"):
+        make_engine(engine, model, SUBSTEPS).advance(physics, controls)
