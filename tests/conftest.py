@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
 import socket
 import sys
 import time
@@ -47,6 +48,19 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 # Compiling takes most of the tests' time, and a fifth less of it without what makes programs fast.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES), str(ROOT / "docs")]
+
+
+@contextlib.contextmanager
+def refuses(*parts, error=ValueError):
+    """Fails unless the block raises `error`, with a message that has each of the parts as a word of its own.
+
+    Give the name of the field and the value: `refuses("num_envs", 0)`. How the message is worded is free.
+    """
+    with pytest.raises(error) as raised:
+        yield raised
+    message = str(raised.value)
+    missing = [part for part in map(str, parts) if not re.search(rf"(?<!\w){re.escape(part)}(?!\w)", message)]
+    assert not missing, f"{missing} not in {message!r}"
 
 
 def load_recorded(task):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import own_learner
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 from test_export import random_policy, save_run
 
 import mjx_dher.gym
@@ -21,31 +21,24 @@ from mjx_dher import cli, envs
 from mjx_dher.envs.engines.warp import WarpEngine
 
 REACH = "mjx_dher/FetchReach-v0"
-ARGUMENTS = [
-    ({"episode_length": 1.5}, "episode_length must be an integer in [1, 1000000]; got 1.5"),
-    ({"episode_length": "x"}, "episode_length must be an integer in [1, 1000000]; got 'x'"),
-    ({"episode_length": True}, "episode_length must be an integer in [1, 1000000]; got True"),
-    ({"episode_length": 10**7}, "episode_length must lie in [1, 1000000]; got 10000000"),
-    ({"distance_threshold": "x"}, "distance_threshold must be a number in (0, inf); got 'x'"),
-    ({"distance_threshold": None}, "distance_threshold must be a number in (0, inf); got None"),
-    ({"distance_threshold": float("nan")}, "distance_threshold must lie in (0, inf); got nan"),
-    ({"distance_threshold": float("inf")}, "distance_threshold must lie in (0, inf); got inf"),
-    ({"num_threads": 0}, "num_threads must lie in [1, 4096]; got 0"),
-    ({"num_threads": -1}, "num_threads must lie in [1, 4096]; got -1"),
-    ({"num_threads": "x"}, "num_threads must be an integer in [1, 4096]; got 'x'"),
-    ({"num_threads": 10**9}, "num_threads must lie in [1, 4096]; got 1000000000"),
-    ({"engine": "jax", "iterations": 0}, "iterations must lie in [1, 1000000]; got 0"),
-    ({"engine": "jax", "ls_iterations": 2.5}, "ls_iterations must be an integer in [1, 1000000]; got 2.5"),
-    ({"engine": "warp", "allow_cpu": True, "constraints": 0}, "constraints must lie in [1, 1000000]; got 0"),
-    ({"engine": "warp", "allow_cpu": True, "iterations": -1}, "iterations must lie in [1, 1000000]; got -1"),
-]
+NAN, INF = float("nan"), float("inf")
+BAD_ARGUMENTS = {
+    "native": [
+        *[("episode_length", value) for value in (1.5, "x", True, 10**7)],
+        *[("distance_threshold", value) for value in ("x", None, NAN, INF)],
+        *[("num_threads", value) for value in (0, -1, "x", 10**9)],
+    ],
+    "jax": [("iterations", 0), ("ls_iterations", 2.5)],
+    "warp": [("constraints", 0), ("iterations", -1)],
+}
 
 
-@pytest.mark.parametrize(("arguments", "message"), ARGUMENTS)
-def test_numbers_of_an_environment_that_cannot_be_are_refused_where_it_is_made(arguments, message):
-    with pytest.raises(ValueError) as error:  # noqa: PT011 - the whole message is compared
-        envs.make("reach", **{"engine": "native", **arguments})
-    assert str(error.value) == message
+@pytest.mark.parametrize("engine", BAD_ARGUMENTS)
+def test_a_bad_number_of_an_environment_is_reported_with_its_value_when_it_is_made(engine):
+    options = {"engine": engine, **({"allow_cpu": True} if engine == "warp" else {})}
+    for name, value in BAD_ARGUMENTS[engine]:
+        with refuses(name, value):
+            envs.make("reach", **options, **{name: value})
 
 
 def test_numpy_s_numbers_are_numbers():
@@ -58,16 +51,11 @@ def breaks(size=3):
 
 
 @pytest.mark.parametrize(
-    ("constructor", "message"),
-    [
-        (breaks, "env 'own:made' cannot be made: RuntimeError: no 3"),
-        (lambda: len(3), "env 'own:made' cannot be made: object of type 'int' has no len"),
-        (int, "env 'own:made' must be a class or function of Python's; no signature"),
-    ],
+    ("constructor", "reason"), [(breaks, "RuntimeError: no 3"), (lambda: len(3), "has no len"), (int, "signature")]
 )
-def test_a_constructor_that_breaks_is_named(constructor, message, monkeypatch):
+def test_a_constructor_that_breaks_is_named(constructor, reason, monkeypatch):
     monkeypatch.setitem(sys.modules, "own", types.SimpleNamespace(made=constructor))
-    with pytest.raises(ValueError, match=message):
+    with refuses("env", "own:made", reason):
         envs.make("own:made")
 
 
@@ -84,29 +72,27 @@ def many():
     return gymnasium.make_vec(REACH, num_envs=2)
 
 
-@pytest.mark.parametrize("seed", [1.5, "x", -1, True, np.float64(3), float("nan")])
-def test_seeds_that_are_none_are_refused(seed, single, many):
-    for env in (single, many):
-        with pytest.raises(ValueError, match="a seed must be an integer of at least 0, or None; got"):
-            env.reset(seed=seed)
-    with pytest.raises(ValueError, match="a seed must be an integer of at least 0, or None; got"):
-        many.reset(seed=[1, seed])
+def test_bad_seeds_are_reported(single, many):
+    for seed in (1.5, "x", -1, True, np.float64(3), NAN):
+        for env, given in [(single, seed), (many, seed), (many, [1, seed])]:
+            with refuses("seed", seed):
+                env.reset(seed=given)
 
 
-@pytest.mark.parametrize("seeds", [[5, 6], (5, 6), np.array([5, 6]), range(5, 7), 5, np.int64(5)])
-def test_seeds_of_every_kind_start_alike(seeds, single, many):
+def test_seeds_of_every_kind_start_alike(single, many):
     alone, _ = single.reset(seed=np.int64(5))
-    together, _ = many.reset(seed=seeds)
-    np.testing.assert_allclose(together["desired_goal"][0], alone["desired_goal"], atol=1e-6)
-    assert not np.allclose(together["desired_goal"][0], together["desired_goal"][1])
+    for seeds in ([5, 6], (5, 6), np.array([5, 6]), range(5, 7), 5, np.int64(5)):
+        together, _ = many.reset(seed=seeds)
+        np.testing.assert_allclose(together["desired_goal"][0], alone["desired_goal"], atol=1e-6)
+        assert not np.allclose(together["desired_goal"][0], together["desired_goal"][1])
 
 
-def test_other_mistakes_with_gymnasium_are_a_sentence(single):
-    with pytest.raises(ValueError, match="goals must be numbers; got"):
+def test_other_mistakes_with_gymnasium_are_reported(single):
+    with refuses("goals"):
         single.compute_reward(object(), np.zeros(3), {})
-    with pytest.raises(ValueError, match="option reward_type must be a single value; got"):
+    with refuses("reward_type", "sparse"):
         mjx_dher.gym.GymEnv("reach", reward_type=["sparse"])
-    with pytest.raises(ValueError, match="reset takes no options; got 3"):
+    with refuses("options", 3):
         single.reset(options=3)
 
 
