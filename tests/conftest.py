@@ -50,6 +50,13 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llv
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES), str(ROOT / "docs")]
 
 
+def names(message, *parts):
+    """Asserts that each of the parts is in the message, as a word of its own."""
+    words = {part: re.sub(r"^(?=\w)|(?<=\w)$", r"\\b", re.escape(part)) for part in map(str, parts)}
+    missing = [part for part, word in words.items() if not re.search(word, message)]
+    assert not missing, f"{missing} not in {message!r}"
+
+
 @contextlib.contextmanager
 def refuses(*parts, error=ValueError):
     """Fails unless the block raises `error`, with a message that has each of the parts as a word of its own.
@@ -58,9 +65,7 @@ def refuses(*parts, error=ValueError):
     """
     with pytest.raises(error) as raised:
         yield raised
-    message = str(raised.value)
-    missing = [part for part in map(str, parts) if not re.search(rf"(?<!\w){re.escape(part)}(?!\w)", message)]
-    assert not missing, f"{missing} not in {message!r}"
+    names(str(raised.value), *parts)
 
 
 def load_recorded(task):

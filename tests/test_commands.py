@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import EXAMPLES
+from conftest import EXAMPLES, names
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec
@@ -59,7 +59,7 @@ def test_list_names_all_that_there_is(capsys):
     assert cli.main(["list", "tasks", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"tasks": {name: row.line for name, row in COMPONENTS["env"].items()}}
     assert cli.main(["list", "sampler"]) == 2
-    assert "error: kind must be one of tasks, engines" in capsys.readouterr().err
+    names(capsys.readouterr().err, "kind", "sampler", "tasks")
 
 
 def test_every_command_has_a_help_that_names_it(capsys):
@@ -99,7 +99,7 @@ def test_the_other_shells_get_theirs(capsys):
     assert cli.main(["completion", "zsh"]) == 0
     assert capsys.readouterr().out.startswith("#compdef mjx-dher\n")
     assert cli.main(["completion", "fish"]) == 2
-    assert "shell must be one of bash, zsh, tcsh; got 'fish'" in capsys.readouterr().err
+    names(capsys.readouterr().err, "shell", "fish", "bash")
 
 
 # Settings of a file
@@ -128,22 +128,13 @@ def test_a_run_that_is_trained_again_from_its_config_is_the_same_to_the_bit(trai
     np.testing.assert_array_equal(first(obs), second(obs))
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (None, "config: there is no file"),
-        ("", "cannot be read"),
-        ("[]", "is not of this program's schema"),
-        ('{"schema": 3}', "is not of this program's schema 2 (found 3)"),
-        ('{"schema": 2}', "does not describe a run"),
-    ],
-)
-def test_what_is_no_config_is_refused(content, message, tmp_path, capsys):
+@pytest.mark.parametrize("content", [None, "", "[]", '{"schema": 3}', '{"schema": 2}'])
+def test_what_is_no_config_is_refused(content, tmp_path, capsys):
     file = tmp_path / "config.json"
     if content is not None:
         file.write_text(content)
     assert cli.main(["--config", str(file), "--out", str(tmp_path / "run")]) == 2
-    assert message in capsys.readouterr().err
+    names(capsys.readouterr().err, file)
     assert not (tmp_path / "run").exists()
 
 
@@ -153,21 +144,21 @@ def test_an_edited_config_is_taken_as_it_is_and_wrong_numbers_in_it_are_named(tr
     file.write_text(json.dumps({**content, "hparams": {**content["hparams"], "gamma": 0.25}}))
     assert cli.main(["--config", str(file), "--dry-run"]) == 0
     assert "edited since" in capsys.readouterr().out
-    for change, message in (
-        ({"hparams": {**content["hparams"], "gamma": 2}}, "gamma must lie in [0, 1); got 2"),
-        ({"hparams": {**content["hparams"], "gama": 0.5}}, "gama"),
-        ({"config": {**content["config"], "num_envs": 10**20}}, "num_envs must lie in"),
-        ({"env_kwargs": "episode_length=6"}, "env_kwargs must be a list"),
-        ({"env_kwargs": [1]}, "env_kwargs must be NAME=VALUE each"),
+    for change, parts in (
+        ({"hparams": {**content["hparams"], "gamma": 2}}, ["gamma", 2]),
+        ({"hparams": {**content["hparams"], "gama": 0.5}}, ["gama"]),
+        ({"config": {**content["config"], "num_envs": 10**20}}, ["num_envs", 10**20]),
+        ({"env_kwargs": "episode_length=6"}, ["env_kwargs"]),
+        ({"env_kwargs": [1]}, ["env_kwargs"]),
     ):
         file.write_text(json.dumps({**content, **change}))
         assert cli.main(["--config", str(file)]) == 2
-        assert message in capsys.readouterr().err
+        names(capsys.readouterr().err, *parts)
 
 
 def test_config_and_preset_are_not_given_together(trained, capsys):
     assert cli.main(["--config", str(trained), "--preset", "paper"]) == 2
-    assert capsys.readouterr().err == "error: config and preset are both whole settings: give one of them\n"
+    names(capsys.readouterr().err, "config", "preset")
 
 
 # Dry runs
@@ -189,14 +180,14 @@ def test_a_dry_run_refuses_what_a_run_would(command, tmp_path, capsys):
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "file").write_text("")
-    for argv, message in (
-        (["--out", str(taken)], "out: "),
-        (["--out", str(taken / "file" / "x")], "out: "),
-        (["--out", "/proc/x"], "out: /proc cannot be written to"),  # also where root asks, who has all permissions
-        (["--out", str(tmp_path / "new"), "--replay-size", str(10**10), "--env", "reach"], "at most"),
+    for argv, parts in (
+        (["--out", str(taken)], ["out", taken]),
+        (["--out", str(taken / "file" / "x")], ["out", taken / "file"]),
+        (["--out", "/proc/x"], ["out", "/proc"]),  # also when root asks, who has all permissions
+        (["--out", str(tmp_path / "new"), "--replay-size", str(10**10), "--env", "reach"], ["replay_size"]),
     ):
         assert cli.main([*command, "--dry-run", *argv]) == 2
-        assert message in capsys.readouterr().err
+        names(capsys.readouterr().err, *parts)
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
 
 
@@ -234,28 +225,28 @@ def test_arguments_are_part_of_what_a_run_is_and_none_leave_it_as_it_was():
     assert told == {"env_kwargs": "env_kwargs was () and is ['reward_type=dense']"}
 
 
-@pytest.mark.parametrize(
-    ("texts", "message"),
-    [
-        (["dense"], "env_kwargs must be NAME=VALUE each, such as reward_type=dense; got 'dense'"),
-        (["reward_type="], "env_kwargs must be NAME=VALUE each, such as reward_type=dense; got 'reward_type='"),
-        ([""], "env_kwargs must be NAME=VALUE each"),
-        (["a b=3"], "env_kwargs must be NAME=VALUE each"),
-        (["distance_threshold=nan"], "env_kwargs: distance_threshold must be finite; got nan"),
-        (["distance_threshold=1e999"], "env_kwargs: distance_threshold must be finite; got 1e999"),
-        (["reward_type=dense", "reward_type=sparse"], "env_kwargs has reward_type twice"),
-        (["engine=jax"], "env_kwargs cannot have engine, which is a setting of its own: --engine"),
-        ([f"episode_length={10**20}"], f"episode_length must lie in [1, 1000000]; got {10**20}"),
-        (["reward_tpye=dense"], "argument of env reach must be one of"),
-        (["reward_type=densee"], "reward_type must be 'sparse' or 'dense'; got 'densee'"),
-        (["distance_threshold=-1"], "distance_threshold must lie in (0, inf); got -1"),
-    ],
-)
-def test_arguments_that_cannot_be_are_refused(texts, message, tmp_path, capsys):
+BAD_KWARGS = [  # texts of --env-kwargs, and what the error must name
+    (["dense"], ["env_kwargs", "dense"]),
+    (["reward_type="], ["env_kwargs", "'reward_type='"]),
+    ([""], ["env_kwargs"]),
+    (["a b=3"], ["env_kwargs"]),
+    (["distance_threshold=nan"], ["env_kwargs", "distance_threshold", "nan"]),
+    (["distance_threshold=1e999"], ["env_kwargs", "distance_threshold", "1e999"]),
+    (["reward_type=dense", "reward_type=sparse"], ["env_kwargs", "reward_type"]),
+    (["engine=jax"], ["env_kwargs", "engine", "--engine"]),
+    ([f"episode_length={10**20}"], ["episode_length", 10**20]),
+    (["reward_tpye=dense"], ["reward_tpye", "reward_type"]),
+    (["reward_type=densee"], ["reward_type", "densee", "dense"]),
+    (["distance_threshold=-1"], ["distance_threshold", -1]),
+]
+
+
+@pytest.mark.parametrize("command", [["train"], ["train", "--dry-run"], ["sweep", "--seeds", "1", "--dry-run"]])
+def test_arguments_that_cannot_be_are_refused(command, tmp_path, capsys):
     out = tmp_path / "run"
-    for command in (["train"], ["train", "--dry-run"], ["sweep", "--seeds", "1", "--dry-run"]):
+    for texts, parts in BAD_KWARGS:
         assert cli.main([*command, "--env", "reach", "--engine", "native", "--env-kwargs", *texts, "--out", str(out)]) == 2
-        assert message in capsys.readouterr().err
+        names(capsys.readouterr().err, *parts)
     assert not any(tmp_path.iterdir())
 
 

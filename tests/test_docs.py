@@ -110,42 +110,39 @@ class Parsed(BaseException):
     """The arguments were taken: nothing more is to happen."""
 
 
-@pytest.fixture
-def parse_only(monkeypatch):
+def test_each_command_line_is_one(monkeypatch, capsys):
     parse = tyro.cli
 
-    def and_stop(*args, **kwargs):
+    def parse_only(*args, **kwargs):
         parse(*args, **kwargs)
         raise Parsed
 
-    monkeypatch.setattr(tyro, "cli", and_stop)
-
-
-@pytest.mark.parametrize("line", [line for line in OURS if "COMMAND" not in line and line != "--version"])
-def test_a_command_line_is_one(line, parse_only, monkeypatch, capsys):
-    arguments = shlex.split(line)
-    name = arguments[0] if arguments and arguments[0] in cli.COMMANDS else "train"
-    if "--help" in arguments:
-        arguments.remove("--help")
-    if "--config" in arguments:  # there is no such run here
-        at = arguments.index("--config")
-        del arguments[at : at + 2]
-    if "module:attribute" not in line and name in ("train", "sweep"):  # values and all
-        monkeypatch.undo()
-        parse_train_args(arguments) if name == "train" else parse_sweep_args([*arguments[1:], *_out(arguments)])
-        return
-    with pytest.raises(Parsed):
-        cli.main([word for word in arguments if word != "..."])
+    for line in OURS:
+        if "COMMAND" in line or line == "--version":
+            continue
+        arguments = shlex.split(line)
+        name = arguments[0] if arguments and arguments[0] in cli.COMMANDS else "train"
+        if "--help" in arguments:
+            arguments.remove("--help")
+        if "--config" in arguments:  # there is no such run here
+            at = arguments.index("--config")
+            del arguments[at : at + 2]
+        if "module:attribute" not in line and name in ("train", "sweep"):  # values and all
+            parse_train_args(arguments) if name == "train" else parse_sweep_args([*arguments[1:], *_out(arguments)])
+        else:
+            monkeypatch.setattr(tyro, "cli", parse_only)
+            with pytest.raises(Parsed):
+                cli.main([word for word in arguments if word != "..."])
+            monkeypatch.setattr(tyro, "cli", parse)
 
 
 def _out(arguments):
     return [] if "--out" in arguments else ["--out", "DIR"]
 
 
-@pytest.mark.parametrize("document", sorted({name for name, _ in COMMANDS}))
-def test_other_commands_name_what_is_there(document):
+def test_other_commands_name_what_is_there():
     """Files, their options, extras: of scripts that a test of their own runs, or that say which machine they need."""
-    for words in [words for name, words in COMMANDS if name == document and ours(words) is None]:
+    for words in [words for _, words in COMMANDS if ours(words) is None]:
         line = " ".join(words)
         assert set(",".join(re.findall(r"\.\[([\w,]+)\]", line)).split(",")) - {""} <= EXTRAS, line
         if words[0] != "python" or not words[1].endswith(".py"):

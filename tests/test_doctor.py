@@ -9,7 +9,7 @@ from importlib import metadata
 
 import jax
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names
 
 import mjx_dher
 from mjx_dher import cli, presets
@@ -177,16 +177,13 @@ def test_it_can_be_read():
 
 
 def test_a_long_error_is_cut_short():
-    with pytest.raises(ValueError, match="x") as caught:
-        raise ValueError("x\n" * 1000)
-    assert doctor.one_line(caught.value) == ("x " * 200) + " ..."
+    assert doctor.one_line(ValueError("x\n" * 1000)) == ("x " * 200) + " ..."
 
 
-@pytest.mark.parametrize("seconds", ["0", "-1", "nan", "4000"])
-def test_a_time_that_cannot_be_is_refused(seconds, capsys):
-    assert cli.main(["doctor", "--seconds", seconds]) == 2
-    error = capsys.readouterr().err
-    assert all(part in error for part in ("error: seconds", "(0, 3600]", seconds))
+def test_a_time_that_cannot_be_is_refused(capsys):
+    for seconds in ("0", "-1", "nan", "4000"):
+        assert cli.main(["doctor", "--seconds", seconds]) == 2
+        names(capsys.readouterr().err, "seconds", "(0, 3600]", seconds)
 
 
 def test_extras_are_those_that_install_the_package():

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import onnx
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names, refuses
 from onnx.reference import ReferenceEvaluator
 from safetensors import safe_open
 from safetensors.numpy import load_file
@@ -228,9 +228,9 @@ def without_relu(policy, about):
 WRONG = [
     ("onnx", lambda write, policy, about: write(other_weight(policy), about), "layer0_kernel"),
     ("safetensors", lambda write, policy, about: write(other_weight(policy), about), "layer0_kernel"),
-    ("onnx", lambda write, policy, about: write(policy, about | {"seed": "4"}), "metadata .*'seed': '4'"),
-    ("safetensors", lambda write, policy, about: write(policy, {}), "metadata "),
-    ("onnx", lambda write, policy, about: without_relu(policy, about), r"actions differ .* \d"),
+    ("onnx", lambda write, policy, about: write(policy, about | {"seed": "4"}), "metadata"),
+    ("safetensors", lambda write, policy, about: write(policy, {}), "metadata"),
+    ("onnx", lambda write, policy, about: without_relu(policy, about), "actions"),
 ]
 
 
@@ -242,7 +242,7 @@ def test_a_file_that_is_not_the_policy_is_not_kept(run, tmp_path, monkeypatch, n
     policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
     spoiled = spoil(to_bytes, policy, export.metadata(policy, started))
     monkeypatch.setitem(export.FORMATS, name, (lambda policy, about: spoiled, read))
-    with pytest.raises(ValueError, match=f"nothing was written: .*{message}"):
+    with refuses(message):
         export.write(policy, started, name, out)
     assert out.read_text() == "before"
     assert [path.name for path in tmp_path.iterdir()] == [out.name]
@@ -258,25 +258,25 @@ def test_a_policy_that_is_not_finite_is_not_exported(tmp_path, name, capsys):
     assert {file.name for file in path.iterdir()} == {"config.json", "policy.npz"}
 
 
-@pytest.mark.parametrize(
-    ("argv", "parts"),
-    [
-        (["{run}", "--format", "onyx"], ["format", "onnx, safetensors", "'onyx'", "did you mean 'onnx'?"]),
-        (["{run}", "--format", "onnx", "--out", "x.safetensors"], ["out", ".onnx", "'x.safetensors'"]),
-        (["{run}", "--format", "onnx", "--out", "{run}/policy.npz", "--overwrite"], ["out", ".onnx", "policy.npz"]),
-        (["{run}", "--format", "onnx", "--out", "nowhere/x.onnx"], ["out", "folder nowhere"]),
-        (["{run}", "--format", "safetensors"], ["out", "policy.safetensors", "--overwrite"]),
-        (["docs", "--format", "onnx"], ["docs", "run folder", "config.json"]),
-        (["nowhere", "--format", "onnx"], ["nowhere", "run folder"]),
-    ],
-)
-def test_bad_arguments_are_refused(run, argv, parts, capsys, monkeypatch):
+BAD = [
+    (["{run}", "--format", "onyx"], ["format", "onyx", "onnx"]),
+    (["{run}", "--format", "onnx", "--out", "x.safetensors"], ["out", ".onnx", "x.safetensors"]),
+    (["{run}", "--format", "onnx", "--out", "{run}/policy.npz", "--overwrite"], ["out", ".onnx", "policy.npz"]),
+    (["{run}", "--format", "onnx", "--out", "nowhere/x.onnx"], ["out", "nowhere"]),
+    (["{run}", "--format", "safetensors"], ["out", "policy.safetensors", "--overwrite"]),
+    (["docs", "--format", "onnx"], ["docs", "run folder", "config.json"]),
+    (["nowhere", "--format", "onnx"], ["nowhere", "run folder"]),
+]
+
+
+def test_bad_arguments_are_refused(run, capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
     before = {path: path.read_bytes() for path in run.iterdir()}
-    assert cli.main(["export", *(arg.format(run=run) for arg in argv)]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert all(part in error for part in parts), error
+    for argv, parts in BAD:
+        assert cli.main(["export", *(arg.format(run=run) for arg in argv)]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        names(error, *parts)
     assert {path: path.read_bytes() for path in run.iterdir()} == before
 
 
@@ -291,7 +291,7 @@ def test_a_folder_that_cannot_be_written_to_is_told(run, tmp_path):
     """A folder is where the unfinished file would be."""
     (tmp_path / "policy.onnx.partial").mkdir()
     policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
-    with pytest.raises(ValueError, match=r"out: cannot write .*policy\.onnx \("):
+    with refuses("out", tmp_path / "policy.onnx"):
         export.write(policy, started, "onnx", tmp_path / "policy.onnx")
 
 

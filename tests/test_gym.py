@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
@@ -195,31 +195,29 @@ def test_what_is_returned_belongs_to_the_caller():
     np.testing.assert_array_equal(following["achieved_goal"], kept["achieved_goal"])
 
 
-REFUSED = [
-    (lambda: gymnasium.make(REACH, engine="natve"), "engine must be one of auto, native, jax, warp; got 'natve'"),
-    (lambda: gymnasium.make(REACH, colour=1), "argument of env .* must be one of engine, .*, num_threads; got 'colour'"),
-    (lambda: gymnasium.make(REACH, reward_type="sprase"), "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
-    (lambda: gymnasium.make(REACH, episode_length=20), "episode_length is called max_episode_steps in gymnasium.make"),
-    (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), "render_mode must be one of rgb_array; got 'ansi'"),
-    (lambda: mjx_dher.tools.render.check_drawable(Probe("auto")), "probe cannot be rendered: it needs a MuJoCo model"),
-    (lambda: mjx_dher.gym.GymEnv("pusch"), r"env must be one of .*did you mean 'push'"),
-    (lambda: gymnasium.make_vec(REACH, num_envs=0), "num_envs must lie in .*; got 0"),
-    (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), "max_episode_steps must lie in .*; got 0"),
-    (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), r"render_mode must be None.*'rgb_array'"),
-    (lambda: single().step(np.zeros(3)), r"action must have shape \(2,\); got \(3,\)"),
-    (lambda: single().step(np.array([0, np.nan])), r"action must be finite; got \[ 0. nan\]"),
-    (lambda: single().reset(options={"goal": 1}), "reset takes no options; got {'goal': 1}"),
-    (lambda: single().render(), 'must be made with render_mode="rgb_array"'),
-    (lambda: single().compute_reward(np.zeros(2), np.zeros(3), {}), r"goals must end in an axis of 2; got .*\(3,\)"),
-    (lambda: many().step(np.zeros(2)), r"action must have shape \(2, 2\); got \(2,\)"),
-    (lambda: many().step(np.full((2, 2), np.inf)), "action must be finite"),
-    *(
-        (lambda seed=seed: many().reset(seed=seed), "a seed must be an integer of at least 0")
-        for seed in (1.5, -1, "x", [0, 1.5])
-    ),
-    (lambda: gymnasium.make(REACH).reset(seed=1.5), "a seed must be an integer of at least 0|seed"),
-    (lambda: many().reset(seed=[1]), "seed must be one number or one for each of 2 environments; got 1"),
-    (lambda: many().reset(options={"reset_mask": 1}), "reset takes no options; got {'reset_mask': 1}"),
+NAN_ACTION, ENDLESS_ACTIONS = np.array([0, np.nan]), np.full((2, 2), np.inf)
+REFUSED = [  # an act, and what the error must name
+    (lambda: gymnasium.make(REACH, engine="natve"), ["engine", "natve", "native"]),
+    (lambda: gymnasium.make(REACH, colour=1), ["argument", "colour", "num_threads"]),
+    (lambda: gymnasium.make(REACH, reward_type="sprase"), ["reward_type", "sprase", "sparse"]),
+    (lambda: gymnasium.make(REACH, episode_length=20), ["episode_length", "max_episode_steps"]),
+    (lambda: mjx_dher.gym.GymEnv("probe", render_mode="ansi"), ["render_mode", "ansi", "rgb_array"]),
+    (lambda: mjx_dher.tools.render.check_drawable(Probe("auto")), ["probe", "model"]),
+    (lambda: mjx_dher.gym.GymEnv("pusch"), ["env", "pusch", "push"]),
+    (lambda: gymnasium.make_vec(REACH, num_envs=0), ["num_envs", 0]),
+    (lambda: gymnasium.make_vec(REACH, max_episode_steps=0), ["max_episode_steps", 0]),
+    (lambda: gymnasium.make_vec(REACH, render_mode="rgb_array"), ["render_mode", "rgb_array"]),
+    (lambda: single().step(np.zeros(3)), ["action", "(2,)", "(3,)"]),
+    (lambda: single().step(NAN_ACTION), ["action", "finite", NAN_ACTION]),
+    (lambda: single().reset(options={"goal": 1}), ["options", {"goal": 1}]),
+    (lambda: single().render(), ["render_mode", "rgb_array"]),
+    (lambda: single().compute_reward(np.zeros(2), np.zeros(3), {}), ["goals", 2, "(3,)"]),
+    (lambda: many().step(np.zeros(2)), ["action", "(2, 2)", "(2,)"]),
+    (lambda: many().step(ENDLESS_ACTIONS), ["action", "finite"]),
+    *((lambda seed=seed: many().reset(seed=seed), ["seed"]) for seed in (1.5, -1, "x", [0, 1.5])),
+    (lambda: gymnasium.make(REACH).reset(seed=1.5), ["seed"]),
+    (lambda: many().reset(seed=[1]), ["seed", 2, 1]),
+    (lambda: many().reset(options={"reset_mask": 1}), ["options", {"reset_mask": 1}]),
 ]
 
 
@@ -235,23 +233,23 @@ def many():
     return env
 
 
-@pytest.mark.parametrize(("act", "message"), REFUSED)
-def test_what_cannot_be_is_refused(act, message):
-    with pytest.raises(ValueError, match=message):
-        act()
+def test_bad_arguments_are_reported():
+    for act, parts in REFUSED:
+        with refuses(*parts):
+            act()
 
 
 @pytest.mark.parametrize("env", [("GymEnv", (2,)), ("GymVectorEnv", (1, 2))])
 def test_a_step_needs_a_reset(env):
     name, shape = env
-    with pytest.raises(gymnasium.error.ResetNeeded, match="reset must be called before step"):
+    with pytest.raises(gymnasium.error.ResetNeeded):
         getattr(mjx_dher.gym, name)("probe").step(np.zeros(shape))
 
 
 def test_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "mjx_dher.gym")
-    with pytest.raises(ImportError, match=r"gymnasium 1\.1.*\[gym\]"):
+    with refuses("gymnasium", "[gym]", error=ImportError):
         importlib.import_module("mjx_dher.gym")
 
 

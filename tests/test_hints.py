@@ -2,11 +2,12 @@
 
 import io
 import os
+import re
 import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names
 from rich.console import Console
 
 from mjx_dher import RunSpec, cli, lookup
@@ -21,18 +22,18 @@ def test_a_polyak_that_is_likely_a_tau_is_explained():
         assert ("it is 1 - tau of other libraries" in console.file.getvalue()) == told
 
 
-@pytest.mark.parametrize("flag", common.FOREIGN_FLAGS)
-def test_every_foreign_flag_names_one_that_is_there(flag, capsys):
-    assert cli.main([flag, "3"]) == 2
-    named = capsys.readouterr().err.split(" is called ")[1]
+def test_every_foreign_flag_names_one_that_is_there(capsys):
     assert cli.main(["train", "--help"]) == 0
     text = capsys.readouterr().out
-    assert all(word.strip(",:") in text for word in named.split(" here")[0].split() if word.startswith("--"))
+    for flag in common.FOREIGN_FLAGS:
+        assert cli.main([flag, "3"]) == 2
+        named = re.findall(r"--[\w-]+", capsys.readouterr().err.replace(flag, "", 1))
+        assert all(word in text for word in named), flag
 
 
 def test_a_number_in_a_sweep_is_named_as_it_is_there(capsys):
     assert cli.main(["sweep", "--out", "x", "--her-k", "2", "4"]) == 2
-    assert "error: --her-k is called --sweep.her-k here, and takes one or more values to try" in capsys.readouterr().err
+    names(capsys.readouterr().err, "--her-k", "--sweep.her-k")
 
 
 def test_a_curve_of_characters():
@@ -65,26 +66,26 @@ def test_messages_name_the_program_that_was_started(monkeypatch):
 
 
 HUGE = str(10**20)
-BAD = [
-    (["eval", "docs", "--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
-    (["transfer", "docs", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
-    (["render", "docs", "--out", "x.png", "--seed", HUGE], [f"seed must lie in [0, 4294967295]; got {HUGE}"]),
-    (["--env-kwargs", "dense"], ["env_kwargs must be NAME=VALUE each, such as reward_type=dense; got 'dense'"]),
-    (["--config", "docs"], ["config: there is no file docs/config.json"]),
-    (["--stop-at", "nan"], ["stop_at must lie in (0, 1]; got nan"]),
-    (["sweep", "--out", "x", "--keep-end"], ["keep_end is for one run alone"]),
-    (["plot", "docs"], ["docs is neither a run folder nor that of a sweep: it has neither config.json nor cells/"]),
-    (["report", "docs/not-there"], ["docs/not-there is neither a run folder nor that of a sweep: no such folder"]),
-    (["list", "smplers"], ["kind must be one of tasks", "did you mean 'samplers' or 'metrics'?"]),
+BAD = [  # arguments, and what the error must name
+    (["eval", "docs", "--seed", HUGE], ["seed", HUGE, 4294967295]),
+    (["transfer", "docs", "--seed", "-1"], ["seed", -1]),
+    (["render", "docs", "--out", "x.png", "--seed", HUGE], ["seed", HUGE]),
+    (["--env-kwargs", "dense"], ["env_kwargs", "dense"]),
+    (["--config", "docs"], ["config", "docs/config.json"]),
+    (["--stop-at", "nan"], ["stop_at", "nan"]),
+    (["sweep", "--out", "x", "--keep-end"], ["keep_end"]),
+    (["plot", "docs"], ["docs", "config.json"]),
+    (["report", "docs/not-there"], ["docs/not-there"]),
+    (["list", "smplers"], ["kind", "smplers", "samplers"]),
 ]
 
 
-@pytest.mark.parametrize(("argv", "messages"), BAD)
-def test_bad_arguments_are_refused_with_a_line(argv, messages, capsys, monkeypatch):
+def test_bad_arguments_are_refused_with_a_line(capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
     before = {path.name for path in ROOT.iterdir()}
-    assert cli.main(argv) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert error.startswith("error: ")
-    assert all(message in error for message in messages)
+    for argv, parts in BAD:
+        assert cli.main(argv) == 2
+        (error,) = capsys.readouterr().err.splitlines()
+        assert error.startswith("error: ")
+        names(error, *parts)
     assert {path.name for path in ROOT.iterdir()} == before

@@ -3,6 +3,7 @@
 import os
 
 import pytest
+from conftest import refuses
 from test_export import random_policy, save_run
 
 import mjx_dher
@@ -23,10 +24,10 @@ def test_an_archive_that_cannot_be_opened_is_damaged(offset, bit, run, capsys):
     content = bytearray(file.read_bytes())
     content[content.rindex(b"PK\x01\x02") + offset] ^= bit
     file.write_bytes(content)
-    with pytest.raises(FolderError, match=r"policy\.npz is damaged or not a policy"):
+    with refuses("policy.npz", error=FolderError):
         mjx_dher.load_policy(run)
     assert cli.main(["eval", str(run)]) == 2
-    assert "policy.npz is damaged" in capsys.readouterr().err
+    assert "policy.npz" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["config.json", "policy.npz"])
@@ -39,11 +40,11 @@ def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(name, run, capsys):
 
 def test_a_pipe_in_the_place_of_a_result_is_not_waited_for(run):
     os.mkfifo(run / "result.json")
-    with pytest.raises(FolderError, match=r"result\.json is damaged: it is not a file"):
+    with refuses("result.json", error=FolderError):
         results.read(run)
 
 
 def test_batches_that_no_device_can_index_are_refused():
     config = Config(batch_size=10**7, replay_size=10**8, updates_per_cycle=1000, target_period=1000)
-    with pytest.raises(ValueError, match="batch_size must not exceed 2147483 with target_period 1000"):
+    with refuses("batch_size", 2147483, "target_period", 1000):
         validate(config, HParams(), 50)

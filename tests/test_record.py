@@ -4,8 +4,7 @@ import datetime
 import json
 import sys
 
-import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 
 sys.path.insert(0, str(ROOT / "bench"))
 import record
@@ -47,25 +46,17 @@ def test_the_page_has_a_row_an_entry_the_newest_first(tmp_path):
     assert line.get_xdata()[0] == datetime.datetime.fromisoformat(ENTRY["date"])
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "",
-        "{",
-        "[]",
-        json.dumps({**ENTRY, "figures": {}}),
-        json.dumps({name: x for name, x in ENTRY.items() if name != "commit"}),
-    ]
-    + [
-        json.dumps({**ENTRY, "figures": {**ENTRY["figures"], "updates_per_second": x}})
-        for x in (float("nan"), 0, -1, "x", None)
-    ],
-)
-def test_a_line_that_is_no_entry_is_named(line, tmp_path):
+BAD_FIGURES = [{**ENTRY["figures"], "updates_per_second": x} for x in (float("nan"), 0, -1, "x", None)]
+BAD_ENTRIES = [{**ENTRY, "figures": figures} for figures in ({}, *BAD_FIGURES)]
+BAD_ENTRIES += [{name: x for name, x in ENTRY.items() if name != "commit"}, []]
+
+
+def test_a_line_that_is_no_entry_is_reported_by_number(tmp_path):
     path = tmp_path / "history.jsonl"
-    path.write_text(json.dumps(ENTRY) + "\n" + line + "\n")
-    with pytest.raises(SystemExit, match="line 2: not an entry"):
-        record.read(path)
+    for line in ("", "{", *map(json.dumps, BAD_ENTRIES)):
+        path.write_text(json.dumps(ENTRY) + "\n" + line + "\n")
+        with refuses(2, error=SystemExit):
+            record.read(path)
 
 
 def test_a_busy_machine_and_changes_are_refused(tmp_path, monkeypatch):
@@ -75,7 +66,7 @@ def test_a_busy_machine_and_changes_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "remarks_of", lambda *args: ["machine busy"])
     monkeypatch.setattr(record, "measure", lambda repeats: (dict.fromkeys(record.FIGURES, 2.0 / 3), {"device": "cpu"}))
     path = tmp_path / "history.jsonl"
-    with pytest.raises(SystemExit, match="not recorded: machine busy"):
+    with refuses("machine busy", error=SystemExit):
         record.record(path, 1, anyway=False)
     assert not path.exists()
     for _ in range(2):

@@ -7,7 +7,7 @@ import sys
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names, refuses
 
 from mjx_dher import RunSpec, cli, envs, policy
 from mjx_dher.runs.folder import run_folder
@@ -154,7 +154,7 @@ def test_a_full_disk_is_an_error(tmp_path, monkeypatch):
             partial.unlink()
 
     monkeypatch.setattr(render.files, "atomic_write", to_full_disk)
-    with pytest.raises(ValueError, match=r"out: .*out\.gif .*No space left"):
+    with refuses("out", out, "No space left"):
         render.write(out, moving(1))
     assert os.listdir(tmp_path) == []
 
@@ -168,7 +168,7 @@ def test_a_file_stays_whole_when_its_successor_fails(tmp_path):
     out.write_text("before")
     with pytest.raises(RuntimeError, match="cannot draw"):
         render.write(out, breaks())
-    with pytest.raises(ValueError, match=r"out: cannot write .*out\.mp4 \("):
+    with refuses("out", out):
         render.write(out, np.zeros((3, 65, 65, 3), np.uint8))  # H.264 takes even sizes only
     assert out.read_text() == "before"
     assert os.listdir(tmp_path) == ["out.mp4"]
@@ -176,29 +176,28 @@ def test_a_file_stays_whole_when_its_successor_fails(tmp_path):
 
 OUT = ["--out", "there-is-none.gif"]
 BAD = [  # arguments, and what the message names: the field, the value and what is allowed
-    (["--env", "push", "--out", "x.avi"], ["out", "'x.avi'", ".mp4, .gif, .png"]),
-    (["--env", "push", "--out", "x"], ["out", "'x'", ".mp4, .gif, .png"]),
-    (["--env", "push", "--out", "nowhere/x.gif"], ["out", "folder nowhere"]),
+    (["--env", "push", "--out", "x.avi"], ["out", "x.avi", ".gif"]),
+    (["--env", "push", "--out", "x"], ["out", "x", ".gif"]),
+    (["--env", "push", "--out", "nowhere/x.gif"], ["out", "nowhere"]),
     (["--env", "push", "--out", "docs/push_learning_curve.png"], ["out", "docs/push_learning_curve.png", "--overwrite"]),
-    (["--env", "push", *OUT, "--width", "641"], ["width", "even", "64 to 2048", "641"]),
-    (["--env", "push", *OUT, "--width", "0", "--height", "9999"], ["width", "height", "9999"]),
-    (["--env", "push", *OUT, "--episodes", "0"], ["episodes", "[1, 1000000]", "got 0"]),
-    (["--env", "pusch", *OUT], ["env", "'pusch'", "did you mean 'push'?"]),
-    (["--env", "push", *OUT, "--engine", "wrap"], ["engine", "'wrap'", "auto, native, jax, warp"]),
-    (OUT, ["run folder", "--env", "pick_and_place, push"]),
+    (["--env", "push", *OUT, "--width", "641"], ["width", 641]),
+    (["--env", "push", *OUT, "--width", "0", "--height", "9999"], ["width", "height", 9999]),
+    (["--env", "push", *OUT, "--episodes", "0"], ["episodes", 0]),
+    (["--env", "pusch", *OUT], ["env", "pusch", "push"]),
+    (["--env", "push", *OUT, "--engine", "wrap"], ["engine", "wrap", "native", "warp"]),
+    (OUT, ["run folder", "--env", "push"]),
     (["docs", "--env", "push", *OUT], ["run folder", "--env"]),
     (["docs", *OUT], ["docs", "run folder", "config.json"]),
 ]
 
 
-@pytest.mark.parametrize(("argv", "messages"), BAD)
-def test_bad_arguments_are_refused(argv, messages, capsys, monkeypatch):
+def test_bad_arguments_are_refused(capsys, monkeypatch):
     monkeypatch.chdir(ROOT)
-    assert cli.main(["render", *argv]) == 2
-    error = capsys.readouterr().err
-    assert all(line.startswith("error: ") for line in error.splitlines())
-    for message in messages:
-        assert message in error
+    for argv, parts in BAD:
+        assert cli.main(["render", *argv]) == 2
+        error = capsys.readouterr().err
+        assert all(line.startswith("error: ") for line in error.splitlines())
+        names(error, *parts)
 
 
 def test_bad_arguments_are_refused_before_jax_or_mujoco_load():
@@ -213,7 +212,7 @@ assert not {{"jax", "mujoco"}} & set(sys.modules)
 
 def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    with pytest.raises(ValueError, match=r"MUJOCO_GL=nonsense \(.*libegl1.*libosmesa6"):
+    with refuses("MUJOCO_GL", "nonsense", "libegl1", "libosmesa6"):
         render.choose_gl()
 
 
@@ -224,11 +223,11 @@ def test_a_way_to_draw_that_hangs_is_given_up():
 def test_mujoco_must_not_have_chosen_already(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setitem(sys.modules, "mujoco", object())
-    with pytest.raises(ValueError, match=r"imported already.*MUJOCO_GL"):
+    with refuses("MUJOCO_GL"):
         render.choose_gl()
 
 
 def test_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ValueError, match=r"imageio_ffmpeg.*\[video\]"):
+    with refuses("imageio_ffmpeg", "[video]"):
         render.ffmpeg()
