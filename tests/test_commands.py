@@ -7,7 +7,8 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import EXAMPLES, names
+from configs import SHORT, flags
+from conftest import EXAMPLES, ROOT, names
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec
@@ -18,11 +19,8 @@ from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import fingerprint, run_folder
 
-FLAGS = [
-    *("--env", "point_mass:PointMass", "--preset", "cpu", "--num-envs", "2", "--hidden-sizes", "8", "--cycles-per-epoch", "2"),
-    *("--updates-per-cycle", "4", "--batch-size", "16", "--total-steps", "120", "--replay-size", "100"),
-    *("--eval-episodes", "4", "--final-episodes", "4", "--no-curve"),
-]
+EPISODES = ["--final-episodes", "4"]
+FLAGS = [*flags(SHORT), *EPISODES, "--no-curve"]
 
 
 @pytest.fixture(autouse=True)
@@ -192,9 +190,9 @@ def test_a_dry_run_refuses_what_a_run_would(command, tmp_path, capsys):
 
 
 def test_a_dry_run_of_a_sweep_counts_runs_and_programs(tmp_path, capsys):
-    flags = [flag for flag in FLAGS if flag != "--no-curve"]
     more = ["--sampler", "future", "weighted", "--learner", "ddpg", "td3", "--seeds", "3", "--sweep.her-k", "2", "4"]
-    assert cli.main(["sweep", *flags, *more, "--dry-run", "--out", str(tmp_path / "sweep")]) == 0
+    out = ["--out", str(tmp_path / "sweep")]
+    assert cli.main(["sweep", *flags(SHORT), *EPISODES, *more, "--dry-run", *out]) == 0
     printed = capsys.readouterr().out
     assert "24 runs, 0 of them done already" in printed
     assert printed.count("24 updates of 16 transitions; 1,440 steps and 288 updates in all") == 2
@@ -277,9 +275,8 @@ def test_eval_reads_all_runs_before_it_plays_one(trained, tmp_path, capsys):
 
 
 def test_trials_of_a_sweep_have_their_arguments(tmp_path, capsys):
-    flags = [flag for flag in FLAGS if flag != "--no-curve"]
     more = ["--env-kwargs", "episode_length=6", "--sampler", "future", "--seeds", "1", "--out", str(tmp_path / "sweep")]
-    assert cli.main(["sweep", *flags, *more]) == 0
+    assert cli.main(["sweep", *flags(SHORT), *EPISODES, *more]) == 0
     header, line = (tmp_path / "sweep" / "finals.csv").read_text().splitlines()
     assert dict(zip(header.split(","), line.split(",")))["env_kwargs"] == "episode_length=6"
     (config,) = (tmp_path / "sweep" / "cells").glob("*/config.json")

@@ -4,14 +4,16 @@ import json
 import sys
 
 import pytest
+from configs import SHORT, flags
 from conftest import EXAMPLES
-from test_commands import FLAGS
 from test_driver import result_of, rows_of
 
 import mjx_dher
 from mjx_dher import Options, RunSpec, cli
 from mjx_dher.runs.folder import run_folder
 from point_mass import PointMass
+
+FLAGS = [*flags(SHORT), "--final-episodes", "4", "--no-curve"]
 
 
 @pytest.fixture(autouse=True)

@@ -46,16 +46,9 @@ def test_readings():
         np.testing.assert_allclose(got, expected, atol=1e-6, err_msg=f"{normalization}, {kernel}, {temperature}")
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("normalization", COMPONENTS["weight_normalization"])
 @pytest.mark.parametrize("kernel", COMPONENTS["weight_kernel"])
-@pytest.mark.parametrize("temperature", [0.25, 1.0])
-def test_equal_distances_make_every_reading_exactly_future(normalization, kernel, temperature):
-=======
-@pytest.mark.parametrize("normalization", WEIGHT_NORMALIZATIONS)
-@pytest.mark.parametrize("kernel", WEIGHT_KERNELS)
 def test_equal_distances_make_every_reading_exactly_future(normalization, kernel):
->>>>>>> d3e4e25 (Tests: errors are asserted by field and value in seventeen files; tables of one rule are one test)
     """Of 0, of a millionth, of twice and a hundred times the scale; and the last step, after which one goal is left."""
     sampler = samplers.make("weighted", kernel, normalization=normalization)
     weighted, future = jax.jit(sampler.log_weights), jax.jit(samplers.future)
