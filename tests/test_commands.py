@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from configs import SHORT, flags
-from conftest import EXAMPLES, ROOT, names
+from conftest import EXAMPLES, names
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec
