@@ -24,12 +24,12 @@ print(json.dumps({"result": {"final_success": [1, 0], "final_return": [-10.0, -5
 TRAIN = """
 import pathlib, signal, sys, time
 from mjx_dher import RunSpec
-from mjx_dher.runs import run_folder, sinks
+from mjx_dher.runs.folder import loggers, run_folder
 stopped = []
 signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
 folder = pathlib.Path(next(arg for arg in sys.argv if arg.startswith("--out="))[6:])
 run_folder.create(folder, RunSpec(env="push"), "native", {})
-sink = sinks.CsvSink(folder / "metrics.csv")
+sink = loggers.CsvSink(folder / "metrics.csv")
 for epoch in range(1, 40):
     time.sleep(0.3)
     means = {"success_rate": 0.5, "return_mean": -30.0}
