@@ -204,6 +204,22 @@ def check_parts(config: Config, episode_length: int, parts: int) -> None:
         raise ValueError("\n".join(problems))
 
 
+def check_all(*calls: tuple[Any, ...]) -> None:
+    """Makes calls, (function, *arguments) each.
+
+    Raises:
+      ValueError: the messages of all calls that raise one.
+    """
+    messages = []
+    for function, *arguments in calls:
+        try:
+            function(*arguments)
+        except ValueError as error:
+            messages.append(str(error))
+    if messages:
+        raise ValueError("\n".join(messages))
+
+
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
     """Refuses what is not a number of `kind` (int or float) in `interval`.
 
@@ -252,12 +268,12 @@ def delay_problem(config: Config, delay: int) -> str | None:
     return None
 
 
-def choice_problems(spec: Any) -> Iterator[str]:
-    """Yields what is wrong with the fields of a dataclass that take one of a closed set of names (`Literal`)."""
-    for name, hint in get_type_hints(type(spec)).items():
+def _choice_problems(settings: Any) -> Iterator[str]:
+    """Yields the problems of fields that take one of a closed set of names (`Literal`)."""
+    for name, hint in get_type_hints(type(settings)).items():
         if get_origin(hint) is Literal:
             try:
-                check_name(name, getattr(spec, name), get_args(hint))
+                check_name(name, getattr(settings, name), get_args(hint))
             except ValueError as error:
                 yield str(error)
 
@@ -274,7 +290,7 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
                 yield from filter(None, (_number_problem(name, size, number, int) for size in value))
         elif not hasattr(value, "dtype") and (problem := _number_problem(name, value, number, hints[name])):
             yield problem
-    yield from choice_problems(settings)
+    yield from _choice_problems(settings)
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:

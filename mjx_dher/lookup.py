@@ -36,8 +36,8 @@ def check_name(field: str, value: str, allowed: Iterable[str], own: bool = False
     raise ValueError(f"{field} must be one of {', '.join(allowed)}{rest}; got {value!r}{_hint(str(value), allowed)}")
 
 
-def program() -> str:
-    """Returns what this program's command is called where it was started: mjx-dher if it is installed, else train.py."""
+def command_name() -> str:
+    """Name of the command that the user started: mjx-dher if it is installed, else train.py."""
     return "mjx-dher" if Path(sys.argv[0]).stem == "mjx-dher" else "train.py"
 
 

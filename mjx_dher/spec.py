@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 from typing_extensions import Doc
@@ -126,7 +126,7 @@ def validate_values(spec: RunSpec) -> None:
     Raises:
       ValueError: names every invalid field, its value and what is allowed.
     """
-    _raise_all(_problems(spec, [(_check_text, name, getattr(spec, name)) for name in COMPONENTS], 1))
+    config_lib.check_all(*((_check_text, name, getattr(spec, name)) for name in COMPONENTS), *_checks(spec, 1))
 
 
 def validate(spec: RunSpec, episode_length: int | None = None) -> None:
@@ -145,7 +145,7 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
         episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
     else:
         del names[0]
-    _raise_all(_problems(spec, names, episode_length))
+    config_lib.check_all(*names, *_checks(spec, episode_length))
 
 
 def _episode_length(spec: RunSpec) -> Any:
@@ -155,21 +155,13 @@ def _episode_length(spec: RunSpec) -> Any:
         return 50
 
 
-def _problems(spec: RunSpec, names: Sequence[tuple[Any, ...]], episode_length: Any) -> Iterator[str]:
-    """Yields the errors of the calls in `names`, and of the checks that every run must pass."""
-    sizes = (config_lib.validate, spec.config, spec.hparams, episode_length)
-    seed = (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]")
-    for check, *arguments in (*names, (to_arguments, spec.env_kwargs), sizes, seed):
-        try:
-            check(*arguments)
-        except ValueError as error:
-            yield str(error)
-    yield from config_lib.choice_problems(spec)
-
-
-def _raise_all(problems: Iterator[str]) -> None:
-    if messages := list(problems):
-        raise ValueError("\n".join(messages))
+def _checks(spec: RunSpec, episode_length: Any) -> list[tuple[Any, ...]]:
+    return [
+        (to_arguments, spec.env_kwargs),
+        (config_lib.validate, spec.config, spec.hparams, episode_length),
+        (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]"),
+        (check_name, "engine", spec.engine, ENGINES),
+    ]
 
 
 def _check_text(field: str, value: Any) -> None:

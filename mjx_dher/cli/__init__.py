@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import gc
-import importlib
 import signal
 import sys
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from mjx_dher import __version__, lookup
 from mjx_dher.cli import output
-from mjx_dher.cli.commands import COMMANDS
+from mjx_dher.cli.commands import COMMANDS, run
 
 MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that decide it
 TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk, not on the screen
@@ -45,9 +44,7 @@ def _run(name: str, argv: list[str]) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
-        module, function = COMMANDS[name].split(":")
-        command = getattr(importlib.import_module(module), function)
-        return int(command(argv, Console(highlight=False, markup=False, emoji=False)))
+        return run(name, argv, Console(highlight=False, markup=False, emoji=False))
     except KeyboardInterrupt:  # outside of training, which ends in order
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT

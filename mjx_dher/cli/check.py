@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, get_type_hints
 
-import tyro
 from rich.console import Console
 
-from mjx_dher import lookup, presets, spec
+from mjx_dher import presets, spec
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import make_env
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.caches import prepare
@@ -32,7 +32,7 @@ pass, else with status 2 and the first error.
 
 def check_command(argv: list[str], console: Console) -> int:
     """Tests custom components."""
-    args = tyro.cli(CheckArgs, prog=f"{lookup.program()} check", args=argv)
+    args = parse(CheckArgs, argv)
     run = presets.preset("cpu", **vars(args))
     spec.validate(run)
     if not spec.custom_components(run):

@@ -1,6 +1,18 @@
-"""The commands by name, and where each is."""
+"""The commands by name, where each is, and how its arguments are parsed."""
 
-# Each command, and the function (argv, console) -> exit status. Beside it is the class of its arguments: EvalArgs of eval.
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from rich.console import Console
+
+from mjx_dher.lookup import command_name
+
+Args = TypeVar("Args")
+
+# Each command, and the function (argv, console) -> exit status. Its module also has the class of its arguments: EvalArgs.
 COMMANDS = {
     "train": "mjx_dher.cli.train:train_command",
     "resume": "mjx_dher.cli.train:resume_command",
@@ -18,3 +30,55 @@ COMMANDS = {
     "doctor": "mjx_dher.cli.doctor:doctor_command",
     "completion": "mjx_dher.cli.completion:completion_command",
 }
+# Flags here, and what other libraries call them.
+_FOREIGN = {
+    "--actor-lr and --critic-lr": "--learning-rate --lr",
+    "--actor-lr": "--policy-lr",
+    "--critic-lr": "--q-lr",
+    "--replay-size": "--buffer-size --replay-buffer-size --max-replay-size",
+    "--polyak, which is 1 - tau: tau 0.05 is --polyak 0.95": "--tau --soft-target-tau",
+    "--gamma": "--discount --discounting",
+    "--num-envs": "--n-envs",
+    "--total-steps, of all environments": "--total-timesteps --num-timesteps --n-timesteps --total-env-steps --timesteps",
+    "--her-k": "--n-sampled-goal",
+    "--sampler": "--goal-selection-strategy",
+    "--updates-per-cycle, for the num_envs episodes of a cycle together": "--gradient-steps",
+    "--target-period": "--target-update-interval",
+    "--noise-std": "--exploration-noise",
+    "--hidden-sizes": "--net-arch",
+    "--env": "--env-id",
+    "--learner": "--algo",
+    "--log wandb": "--track",
+    "--log tensorboard": "--tensorboard-log",
+    "--eval-episodes": "--n-eval-episodes",
+}
+FOREIGN_FLAGS = {theirs: ours for ours, flags in _FOREIGN.items() for theirs in flags.split()}
+
+
+def run(name: str, argv: Sequence[str], console: Console) -> int:
+    """Runs a command; returns its exit status."""
+    module, function = COMMANDS[name].split(":")
+    return int(getattr(importlib.import_module(module), function)(list(argv), console))
+
+
+def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
+    """Parses the arguments of a command.
+
+    Args:
+      kind: class of the arguments, such as EvalArgs.
+      argv: the words after the command's name.
+      **options: more arguments of `tyro.cli`.
+
+    Raises:
+      ValueError: a flag of another library; the message names ours.
+    """
+    import tyro
+
+    for argument in argv:
+        flag = argument.partition("=")[0].replace("_", "-")
+        if flag in FOREIGN_FLAGS:
+            name, comma, rest = FOREIGN_FLAGS[flag].partition(",")
+            raise ValueError(f"{flag} is called {name} here{comma}{rest}")
+    command = kind.__name__.removesuffix("Args").lower()
+    prog = command_name() + ("" if command == "train" else f" {command}")
+    return tyro.cli(kind, prog=prog, args=argv, **options)

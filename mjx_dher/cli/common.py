@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -23,52 +24,14 @@ from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
 
+if TYPE_CHECKING:
+    from mjx_dher.sweeps import comparison
+
 CURVE_WIDTH = 24  # characters of the live curve
 Devices = int | Literal["all"]  # of the option --devices
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
 
-# Flags that other libraries have, and earlier ones of this one, with the names here.
-FOREIGN_FLAGS = {
-    "--learning-rate": "--actor-lr and --critic-lr",
-    "--lr": "--actor-lr and --critic-lr",
-    "--policy-lr": "--actor-lr",
-    "--q-lr": "--critic-lr",
-    "--buffer-size": "--replay-size",
-    "--replay-buffer-size": "--replay-size",
-    "--max-replay-size": "--replay-size",
-    "--tau": "--polyak, which is 1 - tau: tau 0.05 is --polyak 0.95",
-    "--soft-target-tau": "--polyak, which is 1 - tau: tau 0.05 is --polyak 0.95",
-    "--discount": "--gamma",
-    "--discounting": "--gamma",
-    "--n-envs": "--num-envs",
-    "--total-timesteps": "--total-steps, of all environments together",
-    "--num-timesteps": "--total-steps, of all environments together",
-    "--n-timesteps": "--total-steps, of all environments together",
-    "--total-env-steps": "--total-steps, of all environments together",
-    "--timesteps": "--total-steps, of all environments together",
-    "--n-sampled-goal": "--her-k",
-    "--goal-selection-strategy": "--sampler",
-    "--gradient-steps": "--updates-per-cycle, for the num_envs episodes of a cycle together",
-    "--target-update-interval": "--target-period",
-    "--exploration-noise": "--noise-std",
-    "--net-arch": "--hidden-sizes",
-    "--env-id": "--env",
-    "--algo": "--learner",
-    "--track": "--log wandb",
-    "--tensorboard-log": "--log tensorboard",
-    "--n-eval-episodes": "--eval-episodes",
-    "--eventful-share": "--priority-fraction",
-}
 LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
-
-
-def refuse_foreign_flags(argv: Sequence[str]) -> None:
-    """Raises ValueError for a flag of another library, and names ours."""
-    for argument in argv:
-        flag = argument.partition("=")[0].replace("_", "-")
-        if flag in FOREIGN_FLAGS:
-            name, comma, rest = FOREIGN_FLAGS[flag].partition(",")
-            raise ValueError(f"{flag} is called {name} here{comma}{rest}")
 
 
 def warn_of_tau(polyak: float, console: Console) -> None:
@@ -180,6 +143,22 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
     else:
         for row in rows:
             console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n", soft_wrap=True)
+
+
+def compare(
+    folder: Path, by_env: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
+) -> Sequence[comparison.Row]:
+    """Prints the comparison of all settings of a sweep, and writes it into the folder."""
+    from mjx_dher.sweeps import comparison
+
+    rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
+    comparison.write(folder, rows)
+    print_table(*comparison.table(rows), console)
+    for env, groups in by_env.items():
+        if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
+            labels = "; ".join(group.label for group in groups)
+            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}", soft_wrap=True)
+    return rows
 
 
 class Screen:

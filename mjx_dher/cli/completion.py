@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import lookup
-from mjx_dher.cli.commands import COMMANDS
+from mjx_dher.cli.commands import COMMANDS, parse
 
 Shell = Literal["bash", "zsh", "tcsh"]
 
@@ -33,7 +33,7 @@ class CompletionArgs:
 
 def completion_command(argv: list[str], console: Console) -> int:
     """Prints a shell's completion."""
-    args = tyro.cli(CompletionArgs, prog=f"{lookup.program()} completion", args=argv)
+    args = parse(CompletionArgs, argv)
     lookup.check_name("shell", args.shell, get_args(Shell))
     print(script(args.shell), end="")
     return 0

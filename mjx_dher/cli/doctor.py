@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 
-import tyro
 from rich.console import Console
 
-from mjx_dher import lookup
+from mjx_dher.cli.commands import parse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +27,7 @@ def doctor_command(argv: list[str], console: Console) -> int:
     """Says what works on this machine."""
     from mjx_dher.tools import doctor
 
-    args = tyro.cli(DoctorArgs, prog=f"{lookup.program()} doctor", args=argv)
+    args = parse(DoctorArgs, argv)
     doctor.check(args.seconds)
     if not args.json:
         console.print("trying the engines and the ways to draw ...")

@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import (
     changed_arguments,
     check_engine,
@@ -47,7 +47,7 @@ class EvalArgs:
 
 def eval_command(argv: list[str], console: Console) -> int:
     """Evaluates the policies of run folders."""
-    args = tyro.cli(EvalArgs, prog=f"{lookup.program()} eval", args=argv)
+    args = parse(EvalArgs, argv)
     if not args.runs:
         raise ValueError("eval takes one or more run folders, or policies of the package; got none")
     check_episodes(args.episodes, args.seed)

@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import lookup
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import find_run
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import run_folder
@@ -37,7 +38,7 @@ def export_command(argv: list[str], console: Console) -> int:
     from mjx_dher.policy.load import check_plain, load_policy
     from mjx_dher.tools import export
 
-    args = tyro.cli(ExportArgs, prog=f"{lookup.program()} export", args=argv)
+    args = parse(ExportArgs, argv)
     lookup.check_name("format", args.format, export.FORMATS)
     folder = find_run(args.run, console)
     run = run_folder.read_spec(folder)

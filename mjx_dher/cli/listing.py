@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import lookup
+from mjx_dher.cli.commands import parse
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
 
@@ -69,7 +70,7 @@ def names(kind: str) -> tuple[str, dict[str, str]]:
 
 def list_command(argv: list[str], console: Console) -> int:
     """Lists all names."""
-    args = tyro.cli(ListArgs, prog=f"{lookup.program()} list", args=argv)
+    args = parse(ListArgs, argv)
     for kind in args.kinds:
         lookup.check_name("kind", kind, KINDS)
     chosen = {kind: names(kind) for kind in args.kinds or KINDS}

@@ -8,14 +8,11 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup
-from mjx_dher.cli.common import print_table
-from mjx_dher.cli.sweep import compare
+from mjx_dher.cli.commands import parse
+from mjx_dher.cli.common import compare, print_table
 from mjx_dher.config import check_number
-from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
-from mjx_dher.system.files import FolderError
 from mjx_dher.tools import curves, figures
 
 TOGETHER = "curves"  # the picture of several runs, without its ending
@@ -43,10 +40,10 @@ class PlotArgs:
 
 def plot_command(argv: list[str], console: Console) -> int:
     """Draws runs, or a sweep."""
-    args = tyro.cli(PlotArgs, prog=f"{lookup.program()} plot", args=argv)
+    args = parse(PlotArgs, argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(args.formats)
-    if is_sweep(args.folders):
+    if grid.is_sweep(args.folders):
         return _plot_sweep(args, console)
     runs = [curves.read(folder) for folder in args.folders]
     together = len(runs) > 1
@@ -60,26 +57,6 @@ def plot_command(argv: list[str], console: Console) -> int:
         figures.write(curves.draw_together(runs) if together else curves.draw(runs[0]), path)
         console.print(f"wrote {path}", soft_wrap=True)
     return 0
-
-
-def is_sweep(folders: tuple[Path, ...]) -> bool:
-    """Returns whether this is one sweep, and not one or more run folders.
-
-    Raises:
-      FolderError: it is neither.
-    """
-    if not folders:
-        raise FolderError("name one or more run folders, or the folder of a sweep; got none")
-    for folder in folders:
-        if not folder.is_dir():
-            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: no such folder")
-        sweep, run = (folder / grid.CELLS).is_dir(), (folder / run_folder.CONFIG_FILE).exists()
-        if not sweep and not run:
-            told = f"it has neither {run_folder.CONFIG_FILE} nor {grid.CELLS}/"
-            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: {told}")
-        if sweep and len(folders) > 1:
-            raise FolderError(f"{folder} is a sweep: it is taken alone, not with other folders")
-    return (folders[0] / grid.CELLS).is_dir()
 
 
 def _plot_sweep(args: PlotArgs, console: Console) -> int:

@@ -9,7 +9,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, lookup
+from mjx_dher import envs
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, find_run, make_env, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import run_folder
@@ -51,7 +52,7 @@ def render_command(argv: list[str], console: Console) -> int:
     from mjx_dher.policy.load import load_policy
     from mjx_dher.tools import render
 
-    args = tyro.cli(RenderArgs, prog=f"{lookup.program()} render", args=argv)
+    args = parse(RenderArgs, argv)
     render.check(args.out, args.width, args.height, args.overwrite)
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
@@ -66,18 +67,6 @@ def render_command(argv: list[str], console: Console) -> int:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
     _draw(changed_arguments(played, args.env_kwargs), policy, args, console)
     return 0
-
-
-def draw_run(folder: Path, out: Path, episodes: int, console: Console) -> None:
-    """Draws episodes of a run's policy into a file, which it replaces.
-
-    Raises:
-      FolderError: no run folder, or it has no policy.
-      ValueError: the environment cannot be drawn, or not on this machine.
-    """
-    from mjx_dher.policy.load import load_policy
-
-    _draw(read_run(folder, console), load_policy(folder), RenderArgs(out=out, run=folder, episodes=episodes), console)
 
 
 def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> None:

@@ -9,11 +9,10 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup
-from mjx_dher.cli import render as cli_render
-from mjx_dher.cli.plot import is_sweep
+from mjx_dher.cli import commands
 from mjx_dher.config import check_number
 from mjx_dher.runs.folder import run_folder
+from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.tools import figures
 
@@ -43,10 +42,10 @@ class ReportArgs:
 
 def report_command(argv: list[str], console: Console) -> int:
     """Writes a page about a run or a sweep."""
-    args = tyro.cli(ReportArgs, prog=f"{lookup.program()} report", args=argv)
+    args = commands.parse(ReportArgs, argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(("svg",), "report")
-    sweep = is_sweep((args.folder,))
+    sweep = grid.is_sweep((args.folder,))
     if args.out is not None:
         files.check_file(args.out, (".html",), args.overwrite)
     from mjx_dher.sweeps import report
@@ -56,7 +55,7 @@ def report_command(argv: list[str], console: Console) -> int:
 
     if args.video:
         for run, out in _to_film(args.folder, sweep):
-            cli_render.draw_run(run, out, EPISODES, console)
+            commands.run("render", [str(run), "--out", str(out), "--episodes", str(EPISODES), "--overwrite"], console)
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
     out = args.out or args.folder / report.REPORT
     with files.atomic_write(out) as partial:

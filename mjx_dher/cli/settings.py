@@ -19,7 +19,7 @@ from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
 
-def read(path: Path) -> tuple[RunSpec, Options, list[str]]:
+def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
     """Returns the settings and options in the config.json of a run, and what a reader is told of them.
 
     Args:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup, presets, spec
+from mjx_dher import presets, spec
 from mjx_dher.cli import settings
-from mjx_dher.cli.common import Devices, Screen, make_env, print_table, refuse_foreign_flags, settle_compiler, try_parts
+from mjx_dher.cli.commands import parse
+from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_parts
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.cli.processes import Hosts, joined, refuse_with_ray
 from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
@@ -30,7 +29,7 @@ from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
 
 if TYPE_CHECKING:
-    from mjx_dher.sweeps import comparison
+    pass
 
 GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "priority", "generator", "learner", "networks")
 
@@ -123,13 +122,12 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
     Raises:
       ValueError: one or more of them cannot be used.
     """
-    refuse_foreign_flags(argv)
     for flag in argv:
         if (name := flag.partition("=")[0].lstrip("-").replace("-", "_")) in HParams._fields and flag.startswith("--"):
             dashed = name.replace("_", "-")
             raise ValueError(f"--{dashed} is called --sweep.{dashed} here, and takes one or more values to try")
     default = SweepArgs(tyro.MISSING, changes=_Changes(), sweep=_Axes())
-    args = tyro.cli(SweepArgs, prog=f"{lookup.program()} sweep", args=argv, default=default)
+    args = parse(SweepArgs, argv, default=default)
     _check(args)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
     if args.fleet.ray is not None:
@@ -317,19 +315,3 @@ def _write_tables(args: SweepArgs, console: Console) -> None:
         tables.write(args.out, trials)
         compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)
     console.print(f"wrote {tables.RESULTS}, {tables.FINALS} and {comparison.COMPARISON} in {args.out}", soft_wrap=True)
-
-
-def compare(
-    folder: Path, by_env: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
-) -> Sequence[comparison.Row]:
-    """Prints the comparison of all settings, and writes it into the folder."""
-    from mjx_dher.sweeps import comparison
-
-    rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
-    comparison.write(folder, rows)
-    print_table(*comparison.table(rows), console)
-    for env, groups in by_env.items():
-        if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
-            labels = "; ".join(group.label for group in groups)
-            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}", soft_wrap=True)
-    return rows

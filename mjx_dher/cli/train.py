@@ -16,20 +16,20 @@ from rich.console import Console
 
 from mjx_dher import lookup, presets, spec
 from mjx_dher.cli import settings
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import (
     Devices,
     Screen,
     check_engine,
     make_env,
     print_summary,
-    refuse_foreign_flags,
     settle_compiler,
     try_parts,
     warn_of_tau,
 )
 from mjx_dher.cli.processes import Hosts, check_out, claim, joined
 from mjx_dher.cli.view import PORT, Beside, Page
-from mjx_dher.config import check_devices
+from mjx_dher.config import check_all, check_devices
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
@@ -111,11 +111,7 @@ class ResumeArgs:
 
 def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
-    args = parse_train_args(argv)
-    if args.config_file is not None:
-        before, _, told = settings.read(args.config_file)
-        for line in (*told, settings.changes(before, args.spec)):
-            console.print(line, soft_wrap=True)
+    args = parse_train_args(argv, lambda text: console.print(text, soft_wrap=True))
     if args.dry_run:
         return _dry_run(args, console)
     port = address.check(Page().host, args.view_port) if args.view else None
@@ -137,7 +133,6 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     settle_compiler(args.spec.engine)
     check_platform()
     env = make_env(args.spec)
-    spec.validate(args.spec, env.episode_length)
     memory = settings.memory_lines(env, [args.spec])
     for title, told in settings.groups(args.spec):
         console.print(f"{title}: {told}", soft_wrap=True)
@@ -149,8 +144,7 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
 
 def resume_command(argv: list[str], console: Console) -> int:
     """Goes on with a run that was stopped."""
-    refuse_foreign_flags(argv)
-    args = tyro.cli(ResumeArgs, prog="train.py resume", args=argv)
+    args = parse(ResumeArgs, argv)
     check_engine(args.engine)
     if args.devices is not None:
         check_devices(args.devices)
@@ -209,7 +203,7 @@ def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[
     if not run_folder.checkpoints(args.run):
         raise FolderError(
             f"{args.run} has ended; there is nothing to go on with: --keep-end would have kept a checkpoint of its end."
-            f" `{lookup.program()} --config {args.run} --total-steps N` trains a longer one from the start"
+            f" `{lookup.command_name()} --config {args.run} --total-steps N` trains a longer one from the start"
         )
     if not results.can_go_on(args.run, run.config.total_steps):
         raise FolderError(
@@ -223,14 +217,15 @@ def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[
         )
 
 
-def parse_train_args(argv: list[str]) -> TrainArgs:
-    """Returns the arguments of `train`, checked before JAX, and with it CUDA, or MuJoCo is loaded.
+def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> TrainArgs:
+    """Parses the arguments of `train`, and checks them before JAX, and with it CUDA, or MuJoCo is loaded.
+
+    `report` is called with the origin of the settings, if they come from a file.
 
     Raises:
-      ValueError: one or more of them cannot be used.
+      ValueError: one or more invalid arguments.
     """
-    refuse_foreign_flags(argv)
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # they decide the defaults of all others
     early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
     early.add_argument("--learner")
@@ -240,35 +235,30 @@ def parse_train_args(argv: list[str]) -> TrainArgs:
     if chosen.config is not None:
         if chosen.preset != "auto":
             raise ValueError("config and preset are both whole settings: give one of them")
-        base, options, _ = settings.read(chosen.config)
-        return _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
+        base, options, notes = settings.load(chosen.config)
+        args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
+        for line in (*notes, settings.changes(base, args.spec)):
+            report(line)
+        return args
+
+    def parse_preset(preset: Any) -> TrainArgs:
+        default = TrainArgs(presets.preset(preset, chosen.env, chosen.learner))
+        origin = f"those of preset {preset} for {chosen.env}"
+        return dataclasses.replace(_parse(argv, default, origin), preset=preset)
+
     if chosen.preset != "auto":
-        return _parse_preset(argv, chosen.preset, chosen)
-    asks = {"-h", "--help"} & set(argv)  # only then is what the machine has asked for before all arguments are checked
-    args = _parse_preset(argv, presets.machine_preset() if asks else "cpu", chosen)
+        return parse_preset(chosen.preset)
+    # Asking for the machine's preset starts CUDA, so invalid arguments are rejected before, unless help is asked for.
+    on_cpu = None if {"-h", "--help"} & set(argv) else parse_preset("cpu")
     preset = presets.machine_preset()
-    return args if preset == "cpu" else _parse_preset(argv, preset, chosen)
-
-
-def _parse_preset(argv: list[str], preset: Any, chosen: argparse.Namespace) -> TrainArgs:
-    default = TrainArgs(presets.preset(preset, chosen.env, chosen.learner))
-    return dataclasses.replace(_parse(argv, default, f"those of preset {preset} for {chosen.env}"), preset=preset)
+    return on_cpu if on_cpu is not None and preset == "cpu" else parse_preset(preset)
 
 
 def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     head = f"{inspect.getdoc(TrainArgs)}\n\nDefaults below are {origin}."
-    args = tyro.cli(
-        TrainArgs, prog=lookup.program(), description=head, args=argv, default=default, config=(tyro.conf.OmitArgPrefixes,)
-    )
-    problems = []
-    settled = (args.options.check, lambda: check_devices(args.devices), lambda: check_out(args.hosts, args.out))
-    for check in (lambda: spec.validate(args.spec), *settled):
-        try:
-            check()
-        except ValueError as error:
-            problems.append(str(error))
-    if problems:
-        raise ValueError("\n".join(problems))
+    args = parse(TrainArgs, argv, description=head, default=default, config=(tyro.conf.OmitArgPrefixes,))
+    alone = (spec.validate, args.spec), (args.options.check,), (check_devices, args.devices)
+    check_all(*alone, (check_out, args.hosts, args.out))
     return args
 
 
@@ -317,7 +307,7 @@ def _train(
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
-            f" `{lookup.program()} resume {folder}` goes on",
+            f" `{lookup.command_name()} resume {folder}` goes on",
             soft_wrap=True,
         )
         return 128 + (stop.asked or 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import check_engine, check_episodes, find_run, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.system.caches import keep_compiled_programs
@@ -37,7 +37,7 @@ class TransferArgs:
 
 def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
-    args = tyro.cli(TransferArgs, prog=f"{lookup.program()} transfer", args=argv)
+    args = parse(TransferArgs, argv)
     check_engine(args.engine)
     check_episodes(args.episodes, args.seed)
     folder = find_run(args.run, console)

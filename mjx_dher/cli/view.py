@@ -16,7 +16,8 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, lookup
+from mjx_dher import envs
+from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import check_engine, check_episodes, find_run, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
@@ -70,14 +71,14 @@ class DemoArgs:
 
 def demo_command(argv: list[str], console: Console) -> int:
     """Shows a policy of the package."""
-    args = tyro.cli(DemoArgs, prog=f"{lookup.program()} demo", args=argv)
+    args = parse(DemoArgs, argv)
     first = "push" if "push" in bundled.names() else bundled.names()[0]
     return _view(ViewArgs(runs=(Path(first),), page=args.page), console)
 
 
 def view_command(argv: list[str], console: Console) -> int:
     """Shows policies at play."""
-    return _view(tyro.cli(ViewArgs, prog=f"{lookup.program()} view", args=argv), console)
+    return _view(parse(ViewArgs, argv), console)
 
 
 def _view(args: ViewArgs, console: Console) -> int:

@@ -80,3 +80,23 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
                 text = f"{source.split()[0]} ({field} {value}) has changed since"
                 told[text] = told.get(text, 0) + 1
     return [f"{text} {count} of the runs in {sweep}" for text, count in told.items()]
+
+
+def is_sweep(folders: Sequence[Path]) -> bool:
+    """Whether this is one sweep, and not one or more run folders.
+
+    Raises:
+      FolderError: it is neither.
+    """
+    if not folders:
+        raise FolderError("name one or more run folders, or the folder of a sweep; got none")
+    for folder in folders:
+        if not folder.is_dir():
+            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: no such folder")
+        sweep, run = (folder / CELLS).is_dir(), (folder / run_folder.CONFIG_FILE).exists()
+        if not sweep and not run:
+            told = f"it has neither {run_folder.CONFIG_FILE} nor {CELLS}/"
+            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: {told}")
+        if sweep and len(folders) > 1:
+            raise FolderError(f"{folder} is a sweep: it is taken alone, not with other folders")
+    return (folders[0] / CELLS).is_dir()

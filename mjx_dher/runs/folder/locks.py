@@ -102,4 +102,4 @@ def named(folder: Path) -> Iterator[None]:
 def last_checkpoint(folder: Path) -> str:
     """Returns what an error tells of the checkpoint that a run has left."""
     paths = run_folder.checkpoints(folder)
-    return f"`{lookup.program()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"
+    return f"`{lookup.command_name()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"
