@@ -169,7 +169,7 @@ def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
     wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
     trials: dict[str, list[dict[str, Any]]] = {}
     for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
-        _, spec = run_folder.read(trial["folder"])
+        _, spec = run_folder.read_run(trial["folder"])
         if (arm := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
             trials.setdefault(arm, []).append(trial)
     own = [run for arm in wanted.values() if arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]

@@ -200,7 +200,7 @@ def pretend(chunk, tell):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             run = fingerprint.identity(spec, "native", fingerprint.sources(spec))
-            run_folder.create(folder, spec, "native", {})
+            run_folder.write_config(folder, spec, "native", {})
             log = loggers.CsvSink(folder / "metrics.csv", 0, fingerprint.digest(run))
             for epoch in range(1, 11):
                 log.write({"epoch": epoch, "env_steps": epoch * 100, "updates": epoch, "wall_seconds": 0.1, **summary})

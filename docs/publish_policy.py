@@ -59,8 +59,8 @@ def _text(value: Any) -> str:
 
 def card(folder: Path) -> str:
     """Returns the card of the policy in `folder`, made of what is there: config.json, result.json and card.json."""
-    content, run = run_folder.read(folder)
-    result, facts = results.read(folder), bundled.facts(folder)
+    content, run = run_folder.read_run(folder)
+    result, facts = results.read_result(folder), bundled.facts(folder)
     versions = content["versions"]
     sizes = ", ".join(map(str, run.config.hidden_sizes))
     rows = {
@@ -113,9 +113,9 @@ def _original(outcome: dict[str, Any] | None) -> str:
 
 def check(folder: Path, run: RunSpec) -> None:
     """Raises ValueError for a run that cannot be part of the package."""
-    if (problem := results.problem(folder)) is not None:
+    if (problem := results.result_problem(folder)) is not None:
         raise ValueError(problem)
-    if results.read(folder)["status"] != run_folder.FINISHED:
+    if results.read_result(folder)["status"] != run_folder.FINISHED:
         raise ValueError(f"{folder} has failed; a policy of the package is of a run that has ended well")
     if run.env not in TITLES or spec.custom_components(run):
         raise ValueError(f"{folder} is of parts of its user's own, which a user of the package does not have")

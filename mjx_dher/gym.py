@@ -161,7 +161,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
             env: Any = self._compiled.env  # Any: a GoalEnv need not have a model
             goal, qpos = np.asarray(self._state.obs["desired_goal"]), self._qpos
             configurations = (qpos.popleft() for _ in itertools.count())
-            self._pictures = render.draw(env.model, configurations, goal, PICTURE, PICTURE)
+            self._pictures = render.draw_frames(env.model, configurations, goal, PICTURE, PICTURE)
         self._qpos.append(np.asarray(self._state.physics.qpos))
         return next(self._pictures)
 

@@ -75,7 +75,7 @@ def test_a_stopped_run_resumes(archive, name):
 
 def test_an_ended_run_goes_on_with_more_steps(archive):
     folder = archive / "ddpg_ended"
-    assert results.problem(folder) is None
+    assert results.result_problem(folder) is None
     assert cli.main(["resume", str(folder), "--total-steps", "200", "--no-curve"]) == 0
     compare(folder, archive / "expected" / folder.name)
 

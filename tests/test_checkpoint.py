@@ -292,7 +292,7 @@ def refusal(capsys, *args):
 
 def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "no such folder" in refusal(capsys, "resume", tmp_path / "none")
-    run_folder.create(tmp_path / "run", RunSpec(config=CONFIG), "native", {})
+    run_folder.write_config(tmp_path / "run", RunSpec(config=CONFIG), "native", {})
     assert "no checkpoint to go on from" in refusal(capsys, "resume", tmp_path / "run")
     assert "engine must be" in refusal(capsys, "resume", tmp_path / "run", "--engine", "bullet")
     assert "keep must lie in" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")

@@ -251,7 +251,7 @@ def test_arguments_that_cannot_be_are_refused(command, tmp_path, capsys):
 def test_a_run_has_its_arguments_wherever_it_is_played_again(trained, tmp_path, capsys):
     assert json.loads((trained / "config.json").read_text())["env_kwargs"] == ["episode_length=6"]
     # 2 environments x 2 cycles x 6 steps
-    assert run_folder.read(trained)[1].env_arguments == {"episode_length": 6}
+    assert run_folder.read_run(trained)[1].env_arguments == {"episode_length": 6}
     assert (trained / "metrics.csv").read_text().splitlines()[1].startswith("1,24,")
     assert cli.main(["eval", str(trained), str(trained), "--episodes", "5", "--json"]) == 0
     captured = capsys.readouterr()

@@ -25,8 +25,8 @@ PNG = b"\x89PNG"
 
 def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", columns=("q_mean", "critic_loss")):
     """A run folder as `train` leaves it after so many epochs; status None: it has not ended."""
-    run_folder.create(folder, spec, "native", {"lanes": 1})
-    digest = run_folder.read_content(folder)["digest"]
+    run_folder.write_config(folder, spec, "native", {"lanes": 1})
+    digest = run_folder.read_config(folder)["digest"]
     sink = loggers.CsvSink(folder / "metrics.csv", digest=digest)
     for epoch in range(1, epochs + 1):
         rate = min(1.0, epoch / 10)
@@ -58,34 +58,34 @@ def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", column
     ],
 )
 def test_a_run_is_read_however_it_ended(made, status, tmp_path):
-    curve = curves.read(write_run(tmp_path / "run", **made))
+    curve = curves.read_curve(write_run(tmp_path / "run", **made))
     assert (curve.status, len(curve.rows), curve.reason) == (status, 12, made.get("reason", ""))
     np.testing.assert_allclose(curve.column("success_rate")[:3], [0.1, 0.2, 0.3])
     assert np.isnan(curve.column("nothing")).all()
     assert "12,000 steps in 24 s" in curves.title(curve)
     assert status in curves.title(curve)
-    assert figures.to_svg(curves.draw(curve), 0).startswith("<svg")
+    assert figures.to_svg(curves.draw_curve(curve), 0).startswith("<svg")
 
 
 def test_runs_without_an_epoch_have_no_curve(tmp_path):
     with refuses("begun", error=FolderError):
-        curves.read(write_run(tmp_path / "begun", epochs=0, status=None))
+        curves.read_curve(write_run(tmp_path / "begun", epochs=0, status=None))
     failed = write_run(tmp_path / "failed", epochs=0, status="failed", reason="no episode can be learned from")
     with refuses("failed", "no episode can be learned from", error=FolderError):
-        curves.read(failed)
+        curves.read_curve(failed)
     assert "No epoch of the run has ended." in report.of_run(failed)
 
 
 def test_a_run_of_one_epoch_and_a_learner_of_ones_own_is_drawn(tmp_path):
-    curve = curves.read(write_run(tmp_path / "run", epochs=1, columns=()))
-    figure = curves.draw(curve)
+    curve = curves.read_curve(write_run(tmp_path / "run", epochs=1, columns=()))
+    figure = curves.draw_curve(curve)
     assert [axis.get_title() for axis in figure.axes] == ["success rate", "mean return"]
 
 
 def test_everything_written_is_inside(tmp_path):
     long = dataclasses.replace(SPEC, sampler="a_package_of_mine.samplers_of_mine:prefer_goals_that_are_near")
-    runs = [curves.read(write_run(tmp_path / str(i), dataclasses.replace(long, seed=i))) for i in range(9)]
-    for figure in (curves.draw(runs[0]), curves.draw_together(runs), curves.draw_together(runs[:1])):
+    runs = [curves.read_curve(write_run(tmp_path / str(i), dataclasses.replace(long, seed=i))) for i in range(9)]
+    for figure in (curves.draw_curve(runs[0]), curves.draw_together(runs), curves.draw_together(runs[:1])):
         width, height = figure.canvas.get_width_height()
         for text, box in texts(figure):
             assert box.x0 >= -1, text.get_text()
@@ -99,18 +99,18 @@ def test_a_bound_that_rounding_has_moved_beyond_the_rate_is_drawn(tmp_path):
     content = json.loads((folder / "result.json").read_text())
     content |= {"success_rate": 0.0, "success_low": 4e-19, "success_high": 0.0076}
     files.write_json(folder / "result.json", content)
-    assert "end, 500 episodes: 0.000" in curves.draw(curves.read(folder)).axes[0].get_legend_handles_labels()[1]
+    assert "end, 500 episodes: 0.000" in curves.draw_curve(curves.read_curve(folder)).axes[0].get_legend_handles_labels()[1]
 
 
 def test_the_interval_of_success_is_wilson_s(tmp_path):
-    figure = curves.draw(curves.read(write_run(tmp_path / "run")))
+    figure = curves.draw_curve(curves.read_curve(write_run(tmp_path / "run")))
     band = figure.axes[0].collections[0].get_paths()[0].get_extents()
     # Of 20 episodes: none too few at 2 of 20, whose interval is 0.028 to 0.301 (Wilson 1927), up to 20 of 20, 0.839 to 1.
     np.testing.assert_allclose((band.y0, band.y1), (0.0279, 1.0), atol=1e-3)
 
 
 def test_runs_are_called_by_what_differs(tmp_path):
-    make = lambda name, **changes: curves.read(write_run(tmp_path / name, dataclasses.replace(SPEC, **changes)))  # noqa: E731
+    make = lambda name, **changes: curves.read_curve(write_run(tmp_path / name, dataclasses.replace(SPEC, **changes)))  # noqa: E731
     runs = [make("a"), make("b", seed=3), make("c", env_kwargs=("reward_type=dense",))]
     assert curves.labels(runs) == [
         "env_kwargs none, seed 0",
@@ -120,9 +120,9 @@ def test_runs_are_called_by_what_differs(tmp_path):
     same = [make("d"), make("e"), make("f", seed=1)]
     assert curves.labels(same) == [f"seed 0: {tmp_path / 'd'}", f"seed 0: {tmp_path / 'e'}", "seed 1"]
     assert curves.labels(same[:2]) == [str(tmp_path / "d"), str(tmp_path / "e")]
-    unfinished = curves.read(write_run(tmp_path / "g", dataclasses.replace(SPEC, seed=7), status=None))
+    unfinished = curves.read_curve(write_run(tmp_path / "g", dataclasses.replace(SPEC, seed=7), status=None))
     assert curves.labels([same[0], unfinished]) == ["seed 0", "seed 7 (not ended)"]
-    head, cells = curves.table([same[0], unfinished])
+    head, cells = curves.curves_table([same[0], unfinished])
     assert dict(zip(head, cells[0]))["final success (95 % interval)"] == "0.970 (0.951 to 0.982)"
     assert dict(zip(head, cells[1]))["last evaluation"] == "1.00"
 
@@ -236,7 +236,7 @@ def test_a_page_about_a_run_holds_all_that_it_shows(tmp_path, capsys):
 def test_a_page_about_a_run_that_failed_says_why_without_markup_of_its_own(tmp_path):
     spec = dataclasses.replace(SPEC, env="<b>:x")
     run = write_run(tmp_path / "run", status="failed", reason="<script>alert('x')</script> & more")
-    curve = curves.read(run)
+    curve = curves.read_curve(run)
     text = report.of_run(run)
     Page(text)
     assert "&lt;script&gt;" in text
@@ -286,10 +286,10 @@ def test_a_picture_that_cannot_be_drawn_costs_a_run_nothing(tmp_path, monkeypatc
     run = write_run(tmp_path / "run")
     told = []
     console = type("Console", (), {"print": lambda self, text, **kwargs: told.append(text)})()
-    monkeypatch.setattr(curves, "draw", lambda curve: 1 / 0)
+    monkeypatch.setattr(curves, "draw_curve", lambda curve: 1 / 0)
     cli_train._draw(run, True, console)
     assert told == ["the learning curve could not be drawn (ZeroDivisionError: division by zero)"]
     monkeypatch.setattr(figures, "is_there", lambda: False)
     cli_train._draw(run, True, console)
     assert len(told) == 1
-    assert not math.isnan(curves.read(run).column("success_rate")[0])
+    assert not math.isnan(curves.read_curve(run).column("success_rate")[0])

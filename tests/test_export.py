@@ -23,7 +23,7 @@ FORMATS = ("onnx", "safetensors")
 
 def save_run(path, policy):
     """A run folder that holds `policy`."""
-    run_folder.create(path, RunSpec(env="slide", sampler="weighted", seed=3), "native", {})
+    run_folder.write_config(path, RunSpec(env="slide", sampler="weighted", seed=3), "native", {})
     policy.save(path / run_folder.POLICY_FILE)
     return path
 

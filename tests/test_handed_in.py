@@ -295,7 +295,7 @@ def test_the_names_that_learners_may_not_use_are_those_of_the_log():
     train = make_train(ENV, SMALL)
     _, metrics = trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
     progress = Progress(*(1 for _ in Progress._fields))
-    logged = loggers.row(progress, dict.fromkeys(metrics, 0.0))
+    logged = loggers.metrics_row(progress, dict.fromkeys(metrics, 0.0))
     losses = {"critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"}
     assert set(logged) - losses == RESERVED
 

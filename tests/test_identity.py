@@ -76,7 +76,7 @@ def resume(folder, capsys, *flags):
 def test_all_files_of_a_run_carry_one_digest(made):
     digests = set()
     for folder in (made / "run", made / "whole"):
-        content, spec = run_folder.read(folder)
+        content, spec = run_folder.read_run(folder)
         assert spec == SPEC
         digests |= {content["digest"], fingerprint.digest(run_folder.identity_of(content, spec))}
         digests |= {row["digest"] for row in loggers.read_rows(folder / "metrics.csv")}

@@ -258,7 +258,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 @pytest.fixture
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
-    run_folder.create(tmp_path / "run", SPEC, "none", {})
+    run_folder.write_config(tmp_path / "run", SPEC, "none", {})
     learner_policy.LearnerPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
@@ -286,7 +286,7 @@ def test_its_numbers_come_back_to_the_bit(folder, trained):
 
 @pytest.mark.parametrize("changes", [{"networks": "mlp"}, {"config": dataclasses.replace(SMALL, hidden_sizes=(16,))}])
 def test_a_stored_policy_of_other_networks_is_refused(folder, changes, mine):
-    run_folder.create(folder, dataclasses.replace(SPEC, **changes), "none", {})
+    run_folder.write_config(folder, dataclasses.replace(SPEC, **changes), "none", {})
     with pytest.raises(ValueError, match=r"policy\.npz") as error:
         mjx_dher.load_policy(folder)
     assert repr(changes.get("networks", "mine:networks")) in str(error.value)

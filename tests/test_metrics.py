@@ -78,7 +78,7 @@ def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
 
 def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
-    run_folder.create(tmp_path / "run", RunSpec(seed=3, sampler="closest"), "native", {})
+    run_folder.write_config(tmp_path / "run", RunSpec(seed=3, sampler="closest"), "native", {})
     sink = loggers.open_sinks(tmp_path / "run", ["wandb"])[1]
     run = sink._run
     sink.write(row(1))
@@ -97,11 +97,11 @@ def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_pa
 
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
     with pytest.raises(ValueError, match=r"log must be one of jsonl, tensorboard, wandb; got 'tensorbord' \(did you mean"):
-        loggers.check(["jsonl", "tensorbord"])
+        loggers.check_logs(["jsonl", "tensorbord"])
     monkeypatch.setitem(loggers.EXTRAS, "wandb", "no_such_package")
     with pytest.raises(ValueError, match=r'log wandb needs no_such_package, .*pip install -e "\.\[wandb\]"'):
-        loggers.check(["wandb"])
-    loggers.check(["jsonl"])
+        loggers.check_logs(["wandb"])
+    loggers.check_logs(["jsonl"])
 
 
 def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):

@@ -41,7 +41,7 @@ def test_a_pipe_in_the_place_of_a_file_is_not_waited_for(name, run, capsys):
 def test_a_pipe_in_the_place_of_a_result_is_not_waited_for(run):
     os.mkfifo(run / "result.json")
     with refuses("result.json", error=FolderError):
-        results.read(run)
+        results.read_result(run)
 
 
 def test_batches_that_no_device_can_index_are_refused():

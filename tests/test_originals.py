@@ -15,7 +15,7 @@ from mjx_dher.tools import transfer
 def run(tmp_path_factory):
     """A run folder of `reach` with a policy written by hand: moved by the gripper's place and the goal's, at random."""
     out = tmp_path_factory.mktemp("runs") / "reach"
-    run_folder.create(out, RunSpec(env="reach", engine="native"), "native", {})
+    run_folder.write_config(out, RunSpec(env="reach", engine="native"), "native", {})
     kernel = np.random.default_rng(0).normal(size=(13, 4)).astype(np.float32)
     policy.Policy(
         layers=((kernel, np.zeros(4, np.float32)),),
@@ -41,7 +41,7 @@ def test_a_python_without_the_originals_is_refused(run, capsys):
 
 def test_a_task_without_an_original_is_refused():
     with pytest.raises(ValueError, match="point_mass has no original to transfer to; the tasks that have: push, "):
-        transfer.check("point_mass", Path(sys.executable))
+        transfer.check_original("point_mass", Path(sys.executable))
 
 
 @pytest.mark.parametrize(

@@ -221,7 +221,7 @@ def test_what_has_no_model_is_not_rendered():
     from mjx_dher.tools import render
 
     with refuses("point_mass", "model"):
-        render.play(PointMass(), lambda obs, key: jnp.zeros((2, 2)), seed=0, num_episodes=2)
+        render.record_episodes(PointMass(), lambda obs, key: jnp.zeros((2, 2)), seed=0, num_episodes=2)
 
 
 def test_a_fresh_run_folder_s_name_is_one_of_a_file(monkeypatch, tmp_path):

@@ -28,7 +28,7 @@ from mjx_dher.runs.folder import loggers, run_folder
 stopped = []
 signal.signal(signal.SIGTERM, lambda *_: stopped.append(True))
 folder = pathlib.Path(next(arg for arg in sys.argv if arg.startswith("--out="))[6:])
-run_folder.create(folder, RunSpec(env="push"), "native", {})
+run_folder.write_config(folder, RunSpec(env="push"), "native", {})
 sink = loggers.CsvSink(folder / "metrics.csv")
 for epoch in range(1, 40):
     time.sleep(0.3)

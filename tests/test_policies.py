@@ -35,7 +35,7 @@ def test_the_tasks_have_policies():
 @pytest.mark.parametrize("name", bundled.names())
 def test_a_policy_is_a_whole_run_with_a_card(name):
     folder = bundled.FOLDER / name
-    assert results.problem(folder) is None
+    assert results.result_problem(folder) is None
     assert run_folder.read_spec(folder).env == name
     assert (folder / "README.md").read_text() == PUBLISH["card"](folder)
     here = facts_of(name)["here"]
@@ -55,7 +55,7 @@ def test_the_documents_have_every_policy():
     """The table has the figures of the cards, and the site the cards."""
     page, index = ((ROOT / "docs" / name).read_text() for name in ("policies.md", "index.md"))
     for name in bundled.names():
-        facts, result = facts_of(name), results.read(bundled.FOLDER / name)
+        facts, result = facts_of(name), results.read_result(bundled.FOLDER / name)
         rates = " | ".join(
             f"{x['success_rate']:.3f} ({x['success_low']:.3f} to {x['success_high']:.3f})" if x else "not measured"
             for x in (facts["here"], facts["original"])
@@ -194,6 +194,6 @@ def edit(path, **changes):
 def test_its_actions_are_those_of_the_run_that_it_is_of():
     """The array of settings in the policy is that of its config.json: files of two runs were not mixed up."""
     for name in bundled.names():
-        assert run_folder.edited(bundled.FOLDER / name, *run_folder.read(bundled.FOLDER / name)) == {}
+        assert run_folder.edited(bundled.FOLDER / name, *run_folder.read_run(bundled.FOLDER / name)) == {}
         with np.load(bundled.FOLDER / name / "policy.npz", allow_pickle=False) as arrays:
             assert json.loads(arrays["settings"].tobytes())["env"] == name

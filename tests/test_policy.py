@@ -38,7 +38,7 @@ def learner():
 
 @pytest.fixture
 def run_dir(tmp_path, learner):
-    run_folder.create(tmp_path / "run", SPEC, "native", {"note": "for the reader"})
+    run_folder.write_config(tmp_path / "run", SPEC, "native", {"note": "for the reader"})
     DDPG.export(learner, HP).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
@@ -64,7 +64,7 @@ def test_the_loaded_policy_acts_as_the_learner_does(run_dir, learner):
 
 def test_a_description_comes_back_as_it_was(run_dir):
     assert run_folder.read_spec(run_dir) == SPEC
-    content = run_folder.read_content(run_dir)
+    content = run_folder.read_config(run_dir)
     assert (content["engine"], content["physics"], content["note"]) == ("native", "native", "for the reader")
 
 

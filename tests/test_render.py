@@ -32,7 +32,7 @@ except ValueError as error:
 import jax
 
 def picture(env, qpos, goal):
-    return next(render.draw(env.model, [qpos], goal, 320, 240))
+    return next(render.draw_frames(env.model, [qpos], goal, 320, 240))
 
 frames = {}
 for name in envs.list_envs():
@@ -62,7 +62,7 @@ assert codes == [0, 0]
 def drawn(tmp_path_factory):
     """(folder, pictures by name, what the commands printed) of SCRIPT."""
     folder = tmp_path_factory.mktemp("render")
-    run_folder.create(folder / "run", RunSpec(env="push", engine="native"), "native", {})
+    run_folder.write_config(folder / "run", RunSpec(env="push", engine="native"), "native", {})
     still = policy.Policy(
         layers=((np.zeros((28, 4)), np.zeros(4)),),
         observation_mean=np.zeros(25),
@@ -134,7 +134,7 @@ def moving(count):
 
 @pytest.mark.parametrize(("suffix", "count"), [(".mp4", 12), (".gif", 12), (".GIF", 12), (".png", 1)])
 def test_what_is_written_can_be_read(tmp_path, suffix, count):
-    render.write(tmp_path / f"out{suffix}", moving(count))
+    render.write_frames(tmp_path / f"out{suffix}", moving(count))
     assert frames_in(tmp_path / f"out{suffix}", 96, 64) == count
     assert os.listdir(tmp_path) == [f"out{suffix}"]
 
@@ -155,7 +155,7 @@ def test_a_full_disk_is_an_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(render.files, "atomic_write", to_full_disk)
     with refuses("out", out, "No space left"):
-        render.write(out, moving(1))
+        render.write_frames(out, moving(1))
     assert os.listdir(tmp_path) == []
 
 
@@ -167,9 +167,9 @@ def test_a_file_stays_whole_when_its_successor_fails(tmp_path):
     out = tmp_path / "out.mp4"
     out.write_text("before")
     with pytest.raises(RuntimeError, match="cannot draw"):
-        render.write(out, breaks())
+        render.write_frames(out, breaks())
     with refuses("out", out):
-        render.write(out, np.zeros((3, 65, 65, 3), np.uint8))  # H.264 takes even sizes only
+        render.write_frames(out, np.zeros((3, 65, 65, 3), np.uint8))  # H.264 takes even sizes only
     assert out.read_text() == "before"
     assert os.listdir(tmp_path) == ["out.mp4"]
 

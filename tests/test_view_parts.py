@@ -161,7 +161,7 @@ def test_why_there_is_no_critic_is_told():
 
 def test_an_environment_has_the_arguments_of_its_run_or_those_given(stopped, tmp_path):
     folder, run = tmp_path / "run", dataclasses.replace(stopped[1], env_kwargs=("episode_length=20", "reward_type=dense"))
-    run_folder.create(folder, run, "native", {})
+    run_folder.write_config(folder, run, "native", {})
     (folder / "policy.npz").write_bytes(b"")
     assert sources.of_run("mine", folder).env_kwargs == run.env_kwargs
     assert sources.of_run("mine", folder, None, ("episode_length=30",)).env_kwargs == ("episode_length=30", "reward_type=dense")

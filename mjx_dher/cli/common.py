@@ -112,7 +112,7 @@ def read_run(path: Path, console: Console) -> RunSpec:
     Raises:
       FolderError: no run folder, or one that cannot be believed.
     """
-    content, spec = run_folder.read(path)
+    content, spec = run_folder.read_run(path)
     for text in run_folder.changed_code(content, spec):
         console.print(f"since {path} was trained: {text}", soft_wrap=True)
     return spec

@@ -45,16 +45,16 @@ def plot_command(argv: list[str], console: Console) -> int:
     figures.check(args.formats)
     if grid.is_sweep(args.folders):
         return _plot_sweep(args, console)
-    runs = [curves.read(folder) for folder in args.folders]
+    runs = [curves.read_curve(folder) for folder in args.folders]
     together = len(runs) > 1
     out = args.out or (Path() if together else args.folders[0])
     files.make_folder(out)
     if together:
-        print_table(*curves.table(runs), console)
+        print_table(*curves.curves_table(runs), console)
     name = TOGETHER if together else curves.CURVE
     for ending in args.formats:  # drawn anew: a figure that was written before has another layout
         path = out / f"{name}.{ending}"
-        figures.write(curves.draw_together(runs) if together else curves.draw(runs[0]), path)
+        figures.write(curves.draw_together(runs) if together else curves.draw_curve(runs[0]), path)
         console.print(f"wrote {path}", soft_wrap=True)
     return 0
 

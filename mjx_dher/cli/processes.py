@@ -132,12 +132,12 @@ def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, goes_on:
     if not goes_on or out is None or not (out / run_folder.CONFIG_FILE).exists():
         return stack.enter_context(run_folder.claim_new(out, spec))
     stack.enter_context(files.lock(out))
-    content, begun = run_folder.read(out)
+    content, begun = run_folder.read_run(out)
     before = run_folder.identity_of(content, begun)
     now = fingerprint.identity(spec, content["physics"], fingerprint.sources(spec))
     changed = {name: text for name, text in fingerprint.differences(before, now).items() if name not in fingerprint.MAY_CHANGE}
     if changed:
         raise FolderError(f"out: {out} holds a run with other settings: {'; '.join(changed.values())}")
-    if results.exists(out) and results.read(out)["status"] != run_folder.FAILED:
+    if results.has_result(out) and results.read_result(out)["status"] != run_folder.FAILED:
         raise FolderError(f"out: {out} holds this run, and it has ended")
     return out

@@ -53,7 +53,7 @@ def render_command(argv: list[str], console: Console) -> int:
     from mjx_dher.tools import render
 
     args = parse(RenderArgs, argv)
-    render.check(args.out, args.width, args.height, args.overwrite)
+    render.check_output(args.out, args.width, args.height, args.overwrite)
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
@@ -93,7 +93,7 @@ def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> N
         f" physics {run_folder.engine_name(env)}, drawn with {gl} ...",
         soft_wrap=True,
     )
-    qpos, goals, success = render.play(env, act, args.seed, args.episodes)
+    qpos, goals, success = render.record_episodes(env, act, args.seed, args.episodes)
     pictures = (env.model, qpos, goals, args.width, args.height)
-    render.write(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
+    render.write_frames(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
     console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)

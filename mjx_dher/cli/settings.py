@@ -30,7 +30,7 @@ def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
     """
     file = path / run_folder.CONFIG_FILE if path.is_dir() else path
     try:
-        content = run_folder.read_file(file)
+        content = run_folder.read_config_file(file)
     except FileNotFoundError:
         raise FolderError(f"config: there is no file {file}") from None
     run = run_folder.to_spec(file, content)

@@ -149,7 +149,7 @@ def resume_command(argv: list[str], console: Console) -> int:
     if args.devices is not None:
         check_devices(args.devices)
     args.hosts.place(os.environ)
-    content = run_folder.read_content(args.run)
+    content = run_folder.read_config(args.run)
     settle_compiler(args.engine or content["physics"])
     described = {name: str(value) for name, value in vars(args).items() if name != "hosts"} | {"digest": content["digest"]}
     with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
@@ -183,7 +183,7 @@ def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> t
     given = {name: getattr(args, name) for name in fields if getattr(args, name) is not None}
     options = Options(**{**{name: content[name] for name in fields if name in content}, **given})
     options.check()
-    if results.exists(args.run) and (result := results.read(args.run))["status"] != run_folder.FAILED:
+    if results.has_result(args.run) and (result := results.read_result(args.run))["status"] != run_folder.FAILED:
         _check_ended(args, run, options, result)
         options = dataclasses.replace(options, stop_at=args.stop_at)  # what has ended it does not end it again
     run_folder.checkpoints_to_resume(args.run)
@@ -326,7 +326,7 @@ def _draw(folder: Path, curve: bool, console: Console) -> None:
         return
     picture = folder / f"{curves.CURVE}.png"
     try:
-        figures.write(curves.draw(curves.read(folder)), picture)
+        figures.write(curves.draw_curve(curves.read_curve(folder)), picture)
         console.print(f"learning curve: {picture}", soft_wrap=True)
     except Exception as error:  # the run itself has ended as it should
         console.print(f"the learning curve could not be drawn ({type(error).__name__}: {error})", soft_wrap=True)

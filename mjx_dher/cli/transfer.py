@@ -55,7 +55,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
         console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
         transfer.set_up(environment)
     python = args.python or transfer.interpreter(environment)
-    name = transfer.check(run.env, python)
+    name = transfer.check_original(run.env, python)
     keep_compiled_programs()
     if run.env_kwargs:
         console.print(f"trained with {' '.join(run.env_kwargs)}; played without them, there and here", soft_wrap=True)

@@ -59,7 +59,7 @@ def deliver(folder: Path, parcel: bytes) -> bool:
             _write_run(folder, content)
     except OSError as error:
         raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); the same command goes on") from error
-    if (problem := results.problem(folder)) is not None:
+    if (problem := results.result_problem(folder)) is not None:
         raise FolderError(f"what came back of a run is not whole: {problem}")
     return True
 

@@ -240,9 +240,9 @@ def _open(
     `ended` is the number of epochs that its metrics have.
     """
     digest = fingerprint.digest(run)
-    if ended == 0 or run_folder.read_content(folder)["digest"] != digest:
+    if ended == 0 or run_folder.read_config(folder)["digest"] != digest:
         placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
-        run_folder.create(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
+        run_folder.write_config(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)
     opened = [*loggers.open_sinks(folder, session.options.log, ended, steps, digest), *own]
@@ -285,7 +285,7 @@ class Watch:
 def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:
     """Returns an epoch's metrics of each run."""
     metrics = {name: np.atleast_1d(values) for name, values in progress.metrics.items()}
-    return [loggers.row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
+    return [loggers.metrics_row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
 
 
 def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], failed: Container[int]) -> None:
@@ -343,7 +343,7 @@ def _finish(
             if not reason:
                 _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
                 files.flush(folder / run_folder.POLICY_FILE)
-            loggers.flush(folder)
+            loggers.flush_logs(folder)
             files.write_json(folder / run_folder.RESULT_FILE, content)
         results.append(Result(folder, str(content["status"]), epoch, progress.num_epochs, content))
     return results

@@ -16,35 +16,35 @@ class Options:
     final_episodes: int = 500
     """Episodes of the last evaluation."""
     checkpoint_every: int = 10
-    """Epochs between checkpoints, from which a run goes on; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
+    """Epochs between checkpoints, from which a run resumes; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
     keep: int = 2
-    """Checkpoints to keep, the newest (of runs side by side: one); they are deleted when the run has ended."""
+    """Newest checkpoints to keep (one, if runs are side by side). They are deleted when the run has ended."""
     keep_end: bool = False
     """Checkpoint of the end, kept, from which `resume --total-steps` makes a single run longer; as large as the replay ring."""
     log: tuple[str, ...] = ()
     """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
     stop_at: float | None = None
-    """Success rate that ends a run, as the mean of its last three evaluations; a run goes on to total_steps unless given."""
+    """Success rate that ends a run early, as the mean of its last three evaluations."""
 
     def check(self) -> None:
-        """Raises ValueError where an option cannot be used."""
+        """Raises ValueError for an invalid option."""
         check_count("final_episodes", self.final_episodes)
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
         if not isinstance(self.keep_end, bool):
             raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
-        loggers.check(self.log)
+        loggers.check_logs(self.log)
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
 
     def check_many(self) -> None:
-        """Raises ValueError for an option that several runs cannot have."""
+        """Raises ValueError for an option that only a single run can have."""
         if self.stop_at is not None:
             raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
         if self.keep_end:
             raise ValueError("keep_end is for one run alone: a sweep with another total_steps has runs of its own")
 
     def is_reached(self, success_rates: Sequence[float]) -> bool:
-        """Returns whether a run with these success rates, an epoch each, has reached `stop_at`."""
+        """Whether a run has reached `stop_at`, given the success rates of its epochs."""
         last = success_rates[-3:]
         return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, while something trains."""
+"""Ctrl-C and SIGTERM during training."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rich.console import Console
 
 
 class Stop:
-    """While it is entered, the first signal asks for a stop, and the next one ends the program at once.
+    """Context in which the first signal requests a stop, and the second ends the process at once.
 
-    A compiled epoch cannot be interrupted, so whoever trains looks at `asked` after each. All that was saved is on the disk.
+    A compiled epoch cannot be interrupted, so training checks `asked` after each epoch.
 
     Args:
       console: to print to.
-      folder: where things are saved.
+      folder: of the run, for the messages.
     """
 
     def __init__(self, console: Console, folder: Path):

@@ -72,7 +72,7 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
     told: dict[str, int] = {}
     for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
         try:
-            content = run_folder.read_content(path.parent)
+            content = run_folder.read_config(path.parent)
         except FolderError:
             continue  # whoever reads its result will say so
         for (field, value), source in now.items():

@@ -31,12 +31,12 @@ def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> s
     Raises:
       FolderError: no run folder, or one that cannot be believed.
     """
-    curve = curves.read(folder, allow_empty=True)
+    curve = curves.read_curve(folder, allow_empty=True)
     spec = curve.spec
     body = [html.paragraph(curves.title(curve), "failed" if curve.status == FAILED else ""), html.facts(_facts(curve))]
     body += _videos(folder, report)
     if curve.rows:
-        body += [html.heading("Curves"), html.figure(figures.to_svg(curves.draw(curve), 0))]
+        body += [html.heading("Curves"), html.figure(figures.to_svg(curves.draw_curve(curve), 0))]
         columns = [name for name in curve.rows[0] if name != "digest"]
         rows = [[_number(row.get(name)) for name in columns] for row in curve.rows]
         body.append(html.details(f"every epoch ({len(rows)})", html.table(columns, rows)))

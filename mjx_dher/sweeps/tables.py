@@ -26,7 +26,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
     status and reason; curve, lists by column; and final, the last evaluation, empty for a run that failed.
 
     Raises:
-      FolderError: no sweep, none ended, or a trial that cannot be believed (`results.problem`).
+      FolderError: no sweep, none ended, or a trial that cannot be believed (`results.result_problem`).
     """
     paths = sorted(path.parent for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}"))
     if not paths:
@@ -36,9 +36,9 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 
 def _read_trial(path: Path) -> dict[str, Any]:
-    if (problem := results.problem(path)) is not None:
+    if (problem := results.result_problem(path)) is not None:
         raise FolderError(f"{problem}; the sweep's command trains it again, or remove the folder")
-    result, (content, spec) = results.read(path), run_folder.read(path)
+    result, (content, spec) = results.read_result(path), run_folder.read_run(path)
     failed = result["status"] == FAILED
     try:
         rows = loggers.read_rows(path / run_folder.METRICS_FILE)

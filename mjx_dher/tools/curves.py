@@ -43,17 +43,17 @@ class Curve(NamedTuple):
         return np.array([row.get(name, math.nan) for row in self.rows], float)
 
 
-def read(folder: Path, allow_empty: bool = False) -> Curve:
+def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
     """Returns the curve of the run in `folder`, finished or not.
 
     Raises:
       FolderError: no run folder, one that cannot be believed, or, unless `allow_empty`, no epoch has ended.
     """
-    content, spec = run_folder.read(folder)
-    ended = results.exists(folder)
-    if ended and (problem := results.problem(folder)) is not None:
+    content, spec = run_folder.read_run(folder)
+    ended = results.has_result(folder)
+    if ended and (problem := results.result_problem(folder)) is not None:
         raise FolderError(problem)
-    result = results.read(folder) if ended else {}
+    result = results.read_result(folder) if ended else {}
     rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
     status = result.get("status", NOT_ENDED)
     if not rows and not allow_empty:
@@ -71,7 +71,7 @@ def title(curve: Curve) -> str:
     return f"{', '.join(parts)}; {curve.content['physics']}; {steps}; {state}"
 
 
-def draw(curve: Curve) -> Any:
+def draw_curve(curve: Curve) -> Any:
     """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values and losses."""
     panels = [
         (label, {name: text for name, text in columns.items() if np.isfinite(curve.column(name)).any()}, log)
@@ -170,7 +170,7 @@ def draw_together(curves: Sequence[Curve]) -> Any:
     return figure
 
 
-def table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
+def curves_table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
     """Returns a table of several runs, its head and its cells: what each is, how far it came, and its success."""
     head = ["run", "what differs", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
     cells = []

@@ -38,7 +38,7 @@ FORMATS = {
 }
 
 
-def check(out: Path, width: int, height: int, overwrite: bool) -> None:
+def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
     """Raises if the arguments are not allowed, before anything slow happens.
 
     Raises:
@@ -108,7 +108,7 @@ def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
 
 
 def check_drawable(env: Any) -> None:
-    """Raises ValueError unless `env` has the attributes that `play` and `draw` need."""
+    """Raises ValueError unless `env` has the attributes that `record_episodes` and `draw_frames` need."""
     import jax
 
     start = jax.eval_shape(env.reset, jax.random.key(0))
@@ -121,7 +121,9 @@ def check_drawable(env: Any) -> None:
         )
 
 
-def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def record_episodes(
+    env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plays whole episodes in a batch and returns the data to draw them.
 
     Args:
@@ -159,7 +161,7 @@ def play(env: Any, act: Callable[[Any, Any], Any], seed: int, num_episodes: int)
 def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
     """Yields the N * (T + 1 + HOLD) frames [height, width, 3] uint8 of all episodes. Arguments as in `stills`."""
     for episode, goal in zip(qpos, goals):
-        for frame in draw(model, episode, goal, width, height):
+        for frame in draw_frames(model, episode, goal, width, height):
             yield frame
         for _ in range(HOLD):
             yield frame
@@ -176,10 +178,10 @@ def stills(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: 
     """
     # Closer together at first, when a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)
-    return np.concatenate(list(draw(model, qpos[0, chosen], goals[0], width, height)), axis=1)
+    return np.concatenate(list(draw_frames(model, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
-def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Generator[np.ndarray]:
+def draw_frames(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Generator[np.ndarray]:
     """Yields a picture [height, width, 3] uint8 of each configuration, with the goal as a red ball.
 
     Args:
@@ -214,7 +216,7 @@ def draw(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, h
             yield renderer.render()
 
 
-def write(out: Path, frames: Iterable[np.ndarray]) -> None:
+def write_frames(out: Path, frames: Iterable[np.ndarray]) -> None:
     """Writes `frames`, [height, width, 3] uint8 each, in the format given by the suffix of `out`.
 
     On error, an existing file stays as it was. (imageio_ffmpeg.write_frames reports no error when ffmpeg fails at the end.)

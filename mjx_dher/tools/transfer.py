@@ -62,7 +62,7 @@ def interpreter(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def check(env_name: str, python: Path) -> str:
+def check_original(env_name: str, python: Path) -> str:
     """Returns the gymnasium id of the original of a task.
 
     Raises:
@@ -106,7 +106,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
     return {name: np.concatenate([np.asarray(outcome[name]) for outcome in outcomes]) for name in outcomes[0]}
 
 
-def play(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
+def play_original(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
     """Plays a run's policy in its original task in this process: episode i uses the seed `first_seed` + i."""
     warnings.filterwarnings("ignore")
     import gymnasium
@@ -137,9 +137,9 @@ def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool
 
 
 def main(argv: Sequence[str]) -> None:
-    """Prints the outcomes of `play` as JSON in the last line."""
+    """Prints the outcomes of `play_original` as JSON in the last line."""
     run, episodes, first_seed = argv
-    print(json.dumps(play(Path(run), int(episodes), int(first_seed))))
+    print(json.dumps(play_original(Path(run), int(episodes), int(first_seed))))
 
 
 if __name__ == "__main__":

@@ -96,8 +96,8 @@ class Cast:
             return f"{RANDOM} in `{self._env_name}`"
         text = f"`{self._env_name}`"
         try:
-            if results.exists(folder):
-                result = results.read(folder)
+            if results.has_result(folder):
+                result = results.read_result(folder)
                 measured = bundled.facts(folder)["here"] if bundled.is_shipped(folder) else result
                 return (
                     f"{text}, trained: success {measured['success_rate']:.3f} in {measured['episodes']:,} episodes after"

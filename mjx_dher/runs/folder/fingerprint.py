@@ -1,4 +1,4 @@
-"""What a run is, in files: its settings, the files of its own code, and the digest that all of its files carry."""
+"""Identity of a run: its settings, the digests of custom source files, and the digest that all of its files carry."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ALWAYS = frozenset(
 
 
 def settings(spec: RunSpec) -> dict[str, Any]:
-    """Returns all settings of a run by name, the seed left out."""
+    """All settings of a run by name, without the seed."""
     parts = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     return {
         **{name: value for name, value in parts.items() if name not in ("config", "hparams", "seed")},
@@ -38,10 +38,9 @@ def settings(spec: RunSpec) -> dict[str, Any]:
 
 
 def sources(spec: RunSpec) -> dict[str, str]:
-    """Returns, by field, name and digest of the file of each part's module that is the user's own: "push2d.py 3fa9c1d2e4".
+    """Name and digest of each custom component's file, by field: "push2d.py 3fa9c1d2e4".
 
-    It is the file of the module that is named, not of those that it imports. It is read once in a process, which goes on with
-    what it has imported.
+    Files that it imports are not included. Each file is read once in a process, as its module is.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
     return {name: source for name, source in read.items() if source is not None}
@@ -54,7 +53,7 @@ def _source(import_path: str) -> str | None:
 
 
 def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
-    """Returns what a run computes with, as JSON has it: settings, seed, the engine that runs, the files of its own code."""
+    """Everything that a run computes with, for JSON: settings, seed, the physics that runs, and custom source files."""
     defaults = settings(RunSpec())
     kept = {name: x for name, x in settings(spec).items() if name in _ALWAYS or x != defaults[name]}
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
@@ -64,7 +63,7 @@ def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dic
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Returns ten digits that stand for what `identity` gave."""
+    """Ten hexadecimal digits of an `identity`."""
     return sha256_of(content)[:10]
 
 
@@ -80,12 +79,12 @@ def trial_name(spec: RunSpec) -> str:
 
 
 def in_a_path(name: str) -> str:
-    """Returns the name of an environment or a sampler as a part of a file's: "Tasks:Mine" is tasks-mine."""
+    """The name of an environment or a sampler for a file name: "Tasks:Mine" becomes tasks-mine."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower())
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
-    """Returns what differs between two identities, by name, as a reader is told: "gamma was 0.98 and is 0.1"."""
+    """Differences between two identities, a sentence for each name: "gamma was 0.98 and is 0.1"."""
     defaults = {**settings(RunSpec()), "sources": {}}
 
     def value(content: Mapping[str, Any], name: str) -> Any:
@@ -104,5 +103,5 @@ def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
 
 
 def sha256_of(content: Any) -> str:
-    """Returns the SHA-256 of what JSON can hold."""
+    """SHA-256 of a JSON value."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -135,7 +135,7 @@ class LaneCheckpoints:
             files.make_folder(folder)
             files.write_json(folder / NAMES_FILE, {"cells": self.names})
         for run in self.folders:
-            loggers.flush(run)  # a checkpoint is of no use without the lines before it
+            loggers.flush_logs(run)  # a checkpoint is of no use without the lines before it
         told: dict[str, Any] = {"runs": self.runs, "refused": tuple(self.refused), "failed": self.failed}
         path = checkpoint.save(folder, state, progress.epoch, progress.wall_seconds, self.keep, **told)
         self.refused.clear()

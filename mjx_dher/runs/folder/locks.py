@@ -1,4 +1,4 @@
-"""Which program trains which run: the lock of each run's folder, and what is asked under it."""
+"""Locks of run folders, so that only one process trains a run."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Run = tuple[RunSpec, Path]  # and its folder
 
 @dataclasses.dataclass(frozen=True)
 class Claims:
-    """Claims of one program on runs."""
+    """Claims of one process on runs."""
 
-    sweep: bool  # leave out runs that have ended or that another program has, rather than raise
+    sweep: bool  # skip runs that have ended or that another process trains, instead of raising
     report: Callable[[str], None]
 
     def is_free(self, spec: RunSpec, folder: Path) -> bool:
-        """Returns whether a run is to be trained, as far as can be told before its turn comes: now, not when all is compiled.
+        """Whether a run is to be trained, as far as can be known before it is compiled.
 
         Raises:
           FolderError: it is not, and this is no sweep.
@@ -40,18 +40,18 @@ class Claims:
             return False
 
     def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
-        """Locks the first runs that are to be trained and that no other program has, up to `lanes`, and makes their folders.
+        """Makes and locks the folders of the first `lanes` runs that are to be trained and that no other process trains.
 
         Args:
-          stack: it holds the locks.
+          stack: holds the locks.
           waiting: runs, in order.
           lanes: at least 1.
 
         Returns:
-          The runs, and those that wait; of these, runs of another program come last. Runs that have ended are in neither.
+          The claimed runs, and the waiting ones, of which those of other processes come last. Ended runs are in neither.
 
         Raises:
-          FolderError: one has ended or is another program's, and this is no sweep; or its folder cannot be written to.
+          FolderError: a run has ended or another process trains it, and this is no sweep; or a folder is not writable.
         """
         claimed: list[Run] = []
         busy: list[Run] = []
@@ -72,14 +72,14 @@ class Claims:
         return claimed, busy
 
     def _is_due(self, spec: RunSpec, folder: Path) -> bool:
-        """Returns whether a run, which is locked, is to be trained.
+        """Whether a locked run is to be trained.
 
         Raises:
           FolderError: it is not, and this is no sweep.
         """
-        if not results.exists(folder):
+        if not results.has_result(folder):
             return True
-        problem = results.problem(folder)
+        problem = results.result_problem(folder)
         if self.sweep and problem is not None:
             self.report(f"{problem}; it is trained again")
         if self.sweep:
@@ -91,7 +91,7 @@ class Claims:
 
 @contextlib.contextmanager
 def named(folder: Path) -> Iterator[None]:
-    """Makes an error of the file system name the folder, and what is left to go on from."""
+    """Turns an OSError into a FolderError that names the folder and its last checkpoint."""
     try:
         yield
     except OSError as error:
@@ -100,6 +100,6 @@ def named(folder: Path) -> Iterator[None]:
 
 
 def last_checkpoint(folder: Path) -> str:
-    """Returns what an error tells of the checkpoint that a run has left."""
+    """Clause of an error message about the run's newest checkpoint."""
     paths = run_folder.checkpoints(folder)
     return f"`{lookup.command_name()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"

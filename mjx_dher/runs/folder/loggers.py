@@ -1,4 +1,4 @@
-"""Where a run's numbers go: the screen, a CSV file, and, where asked for, JSON lines, TensorBoard or Weights & Biases."""
+"""Loggers of a run's metrics: a CSV file, and on request JSON lines, TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, memory
 from mjx_dher.system.files import FolderError
 
-# The columns of metrics.csv that are always there, first and in this order; whatever an epoch's metrics hold more follows.
+# The first columns of metrics.csv; the other metrics of an epoch follow.
 COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
 FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
 LOGS = ("jsonl", "tensorboard", "wandb")
@@ -34,15 +34,15 @@ class Sink(Protocol):
 
 
 class CsvSink:
-    """metrics.csv: one line an epoch, handed to the system before the next begins. Its last column is the run's digest.
+    """metrics.csv: one line for each epoch, written before the next begins. The last column is the run's digest.
 
     Args:
       path: of the file.
-      epochs: of a run that is resumed, those that had ended; their lines stay, and later ones go.
+      epochs: epochs that had ended, if the run is resumed; their lines stay, and later lines are removed.
       digest: of the run's settings; see `fingerprint.digest`.
 
     Raises:
-      FolderError: the file has not the lines of all these epochs.
+      FolderError: the file lacks lines of these epochs.
     """
 
     def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
@@ -74,11 +74,11 @@ class CsvSink:
 
 
 class JsonlSink:
-    """metrics.jsonl: an object a line, an epoch each; numbers that are not finite are null.
+    """metrics.jsonl: one object for each epoch; numbers that are not finite are null.
 
     Args:
       path: of the file.
-      epochs: of a run that is resumed, those that had ended; lines that are missing are made of metrics.csv beside it.
+      epochs: epochs that had ended, if the run is resumed; missing lines are taken from metrics.csv beside it.
     """
 
     def __init__(self, path: Path, epochs: int = 0):
@@ -97,18 +97,18 @@ class JsonlSink:
 
 
 def whole_epochs(folder: Path) -> int:
-    """Returns up to which epoch metrics.csv in `folder` has whole lines; 0 where there is none."""
+    """Number of epochs, from the first, for which metrics.csv in `folder` has whole lines."""
     return max(0, len(_whole_lines(folder / METRICS_FILE)) - 1)
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Returns the whole lines of a metrics.csv as numbers; the digest stays text."""
+    """Reads the whole lines of a metrics.csv as numbers; the digest stays text."""
     head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
     return [{name: x if name == DIGEST else _to_number(x) for name, x in zip(head, line)} for line in lines]
 
 
 def _whole_lines(path: Path) -> list[str]:
-    """Returns the head of metrics.csv, and its lines up to the first that is cut, or of another epoch than is due."""
+    """Head of metrics.csv, and its lines up to the first that is truncated or out of order."""
     if not path.exists():
         return []
     head, *lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) or [""]
@@ -136,8 +136,8 @@ def _to_json(row: dict[str, Any]) -> str:
     return json.dumps({name: v if math.isfinite(v) else None for name, v in row.items() if name != DIGEST}) + "\n"
 
 
-def flush(folder: Path) -> None:
-    """Flushes what CSV and JSON lines have of the run in `folder` onto the disk."""
+def flush_logs(folder: Path) -> None:
+    """Flushes the CSV file and the JSON lines of the run in `folder` to the disk."""
     for name in (METRICS_FILE, JSON_FILE):
         if (folder / name).exists():
             files.flush(folder / name)
@@ -163,10 +163,10 @@ class TensorBoardSink:
 
 
 class WandbSink:
-    """A run of Weights & Biases, whose own variables rule it (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
+    """A run of Weights & Biases, set by its own variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
 
     Args:
-      folder: of the run; what is logged offline is kept in it, and a resumed run goes on with the same one.
+      folder: of the run; offline logs are kept in it, and a resumed run continues the same W&B run.
       content: of config.json.
     """
 
@@ -193,15 +193,11 @@ class WandbSink:
         self._run.finish()
 
 
-EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # of LOGS, and the package that each needs
+EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # extras, and their packages
 
 
-def check(logs: Sequence[str]) -> None:
-    """Raises unless all names are in LOGS and their packages are installed.
-
-    Raises:
-      ValueError: names the log, and the extra to install.
-    """
+def check_logs(logs: Sequence[str]) -> None:
+    """Raises ValueError unless all names are in LOGS and their packages are installed."""
     if not isinstance(logs, (list, tuple)):
         raise ValueError(f"log must be names among {', '.join(LOGS)}; got {logs!r}")
     for log in logs:
@@ -211,17 +207,17 @@ def check(logs: Sequence[str]) -> None:
 
 
 def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0, digest: str = "") -> list[Sink]:
-    """Opens metrics.csv, and `logs`, of the run in `folder`, of which so many epochs and environment steps had ended."""
+    """Opens metrics.csv and `logs` of the run in `folder`, after `epochs` epochs and `env_steps` environment steps."""
     makers: dict[str, Callable[[], Sink]] = {
         "jsonl": lambda: JsonlSink(folder / JSON_FILE, epochs),
         "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
-        "wandb": lambda: WandbSink(folder, run_folder.read_content(folder)),
+        "wandb": lambda: WandbSink(folder, run_folder.read_config(folder)),
     }
     return [CsvSink(folder / METRICS_FILE, epochs, digest), *(makers[log]() for log in dict.fromkeys(logs))]
 
 
-def row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
-    """Returns what the sinks take of an epoch: a `loop.Progress` and the metrics of one run, in the order of metrics.csv."""
+def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
+    """One row for the sinks, in the order of metrics.csv, from a `loop.Progress` and the metrics of one run."""
     steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
     first = {name: metrics[name] for name in FIRST_COLUMNS if name in metrics}
     return {

@@ -1,4 +1,4 @@
-"""Results of runs that have ended, and whether they can be believed."""
+"""Results of runs that have ended, and checks that their files are whole."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.system.files import FolderError
 
 
-def exists(folder: Path) -> bool:
-    """Returns whether the run has a result, believable or not."""
+def has_result(folder: Path) -> bool:
+    """Whether the run has a result, damaged or not."""
     return (folder / run_folder.RESULT_FILE).exists()
 
 
-def read(folder: Path) -> dict[str, Any]:
-    """Returns the result of a run that has ended.
+def read_result(folder: Path) -> dict[str, Any]:
+    """Reads the result of a run that has ended.
 
     Raises:
       FolderError: it is missing or damaged.
     """
     path = folder / run_folder.RESULT_FILE
     if path.exists() and not path.is_file():
-        raise FolderError(f"{path} is damaged: it is not a file")  # a FIFO, whose reader would wait for ever
+        raise FolderError(f"{path} is damaged: it is not a file")  # a reader of a FIFO would block
     try:
         content = json.loads(path.read_text())
         return {"reason": "", **content, "status": str(content["status"]), "epochs": int(content["epochs"])}
@@ -33,21 +33,21 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def can_go_on(folder: Path, total_steps: int) -> bool:
-    """Returns whether a run that has ended can go on from a checkpoint: it failed, or `total_steps` is more than it made.
+    """Whether a run that has ended can resume: it failed, or made fewer than `total_steps`, and it has a checkpoint.
 
     Raises:
       FolderError: its result is damaged.
     """
-    result = read(folder)
+    result = read_result(folder)
     due = result["status"] == FAILED or result.get("env_steps", total_steps) < total_steps
     return due and bool(run_folder.checkpoints(folder))
 
 
-def problem(folder: Path) -> str | None:
-    """Returns why a run with a result is not whole: its curve is cut, or its files are not of one run. None where it is."""
+def result_problem(folder: Path) -> str | None:
+    """Reason why a run with a result is not whole: metrics are missing, or files have other settings. None if it is whole."""
     try:
-        result = read(folder)
-        content, _ = run_folder.read(folder)
+        result = read_result(folder)
+        content, _ = run_folder.read_run(folder)
     except FolderError as error:
         return str(error)
     epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
@@ -66,5 +66,5 @@ def problem(folder: Path) -> str | None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Returns whether the run has ended, and its result can be believed."""
-    return exists(folder) and problem(folder) is None
+    """Whether the run has ended and its files are whole."""
+    return has_result(folder) and result_problem(folder) is None

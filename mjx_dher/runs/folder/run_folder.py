@@ -37,11 +37,11 @@ FAILED = "failed"
 
 @contextlib.contextmanager
 def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
-    """Makes and locks the folder for a new run: `out`, else a fresh one under runs/. It goes again if nothing is written to it.
+    """Makes and locks the folder for a new run: `out`, or a fresh one under runs/. Removes it if it stays empty.
 
     Raises:
-      FolderError: `out` is something else than an empty folder, or another program has it.
-      OSError: it cannot be made or written to.
+      FolderError: `out` is not an empty folder, or another process has locked it.
+      OSError: the folder cannot be made or written to.
     """
     if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
         raise FolderError(f"out: {out} is there already and is no folder")
@@ -53,7 +53,7 @@ def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
             except FolderError:
                 if out is not None:
                     raise
-                continue  # another program has just taken it
+                continue  # another process has just taken it
             yield folder
             return
 
@@ -66,18 +66,18 @@ def _fresh(spec: RunSpec) -> Path:
 
 
 def engine_name(env: Any) -> str:
-    """Returns the name of the physics that an environment runs on; none for one without an engine."""
+    """Name of the physics that an environment runs on; "none" without an engine."""
     return getattr(getattr(env, "engine", None), "name", "none")
 
 
-def create(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> None:
+def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> None:
     """Makes the folder and writes config.json.
 
     Args:
       path: of the folder.
       spec: the run's description.
-      engine: the physics that runs, where `spec.engine` may say auto.
-      extra: written, too, for the reader and for `resume`.
+      engine: the physics that runs (`spec.engine` may be auto).
+      extra: further entries, for the reader and for `resume`.
     """
     hparams = {name: float(value) for name, value in spec.hparams._asdict().items()}
     description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
@@ -96,22 +96,18 @@ def _versions() -> dict[str, str]:
 
 
 def checkpoints(path: Path) -> list[Path]:
-    """Returns the checkpoints of the run in `path`, the newest first."""
+    """Checkpoints of the run in `path`, the newest first."""
     paths = (path / CHECKPOINTS).glob("epoch-*")
     return sorted((path for path in paths if path.name[6:].isdecimal()), key=epoch_of, reverse=True)
 
 
 def epoch_of(checkpoint: Path) -> int:
-    """Returns the epochs that had ended when a checkpoint was made, by its name."""
+    """Epochs that had ended when a checkpoint was made, from its name."""
     return int(checkpoint.name[6:])
 
 
 def checkpoints_to_resume(path: Path) -> list[Path]:
-    """Returns the checkpoints of the run in `path`, the newest first, of which there must be one.
-
-    Raises:
-      FolderError: there is none.
-    """
+    """Checkpoints of the run in `path`, the newest first. Raises FolderError if there is none."""
     if paths := checkpoints(path):
         return paths
     raise FolderError(
@@ -127,7 +123,7 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
       FolderError: it cannot be read, or is of another schema.
     """
     if file.exists() and not file.is_file():
-        raise FolderError(f"{file} is not a file")  # a FIFO, whose reader would wait for ever
+        raise FolderError(f"{file} is not a file")  # a reader of a FIFO would block
     try:
         content = json.loads(file.read_text())
     except FileNotFoundError:
@@ -140,21 +136,21 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
     return content
 
 
-def read_content(path: Path) -> dict[str, Any]:
+def read_config(path: Path) -> dict[str, Any]:
     """Reads config.json of the run in `path`.
 
     Raises:
-      FolderError: no run folder, or one of another schema; the message says which.
+      FolderError: no run folder, or one of another schema.
     """
     if not path.is_dir():
         raise FolderError(f"{path} is not a run folder: no such folder")
     try:
-        return read_file(path / CONFIG_FILE)
+        return read_config_file(path / CONFIG_FILE)
     except FileNotFoundError:
         raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
 
 
-def read_file(file: Path) -> dict[str, Any]:
+def read_config_file(file: Path) -> dict[str, Any]:
     """Reads a run's config.json, wherever it lies and whatever its name is.
 
     Raises:
@@ -182,21 +178,17 @@ def _check_kinds(content: dict[str, Any]) -> None:
 
 
 def read_spec(path: Path) -> RunSpec:
-    """Returns the description of the run in `path`.
+    """Reads the description of the run in `path`; raises FolderError as `read_run` does."""
+    return read_run(path)[1]
+
+
+def read_run(path: Path) -> tuple[dict[str, Any], RunSpec]:
+    """Reads config.json of the run in `path`: its content, and the run's description.
 
     Raises:
-      FolderError: no run folder, one of another schema, or a config.json that was edited; the message says which.
+      FolderError: no run folder, one of another schema, or a config.json that was edited.
     """
-    return read(path)[1]
-
-
-def read(path: Path) -> tuple[dict[str, Any], RunSpec]:
-    """Returns config.json of the run in `path`, and the description in it.
-
-    Raises:
-      FolderError: as for `read_spec`.
-    """
-    content = read_content(path)
+    content = read_config(path)
     spec = to_spec(path, content)
     if edits := edited(path, content, spec):
         raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
@@ -204,7 +196,7 @@ def read(path: Path) -> tuple[dict[str, Any], RunSpec]:
 
 
 def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
-    """Returns the `identity` of the run that config.json describes."""
+    """The `identity` of the run that config.json describes."""
     return fingerprint.identity(spec, content["physics"], content["sources"])
 
 
@@ -227,7 +219,7 @@ def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
 
 
 def written_identity(path: Path) -> dict[str, Any] | None:
-    """Returns the `identity` that the run's newest checkpoint has, or else its policy; None where neither can tell."""
+    """The `identity` in the run's newest checkpoint, or else in its policy; None without either."""
     for checkpoint in checkpoints(path):
         try:
             (content,) = read_versioned(checkpoint / MANIFEST, SCHEMA)["runs"]
@@ -239,21 +231,21 @@ def written_identity(path: Path) -> dict[str, Any] | None:
             return None
         with np.load(path / POLICY_FILE, allow_pickle=False) as arrays:
             return dict(json.loads(arrays["settings"].tobytes()))
-    except Exception:  # NumPy, zipfile and zlib raise nearly anything at a file that is damaged; who loads it says so
+    except Exception:  # NumPy, zipfile and zlib raise many errors for a damaged file; `load_policy` reports them
         return None
 
 
 def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
-    """Returns the description that `read_content` gave of the run in `path`, or `read_file` of the file there.
+    """Makes the description of a run from the content of its config.json, at `path` or in the folder `path`.
 
     Raises:
-      FolderError: something is missing in it, or of another kind.
+      FolderError: an entry is missing or invalid.
     """
     file = path / CONFIG_FILE if path.is_dir() else path
     try:
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
-        if "total_steps" not in config:  # its default would be taken for a wish, which `resume` grants
+        if "total_steps" not in config:  # `resume` would take its default for a new value
             raise KeyError("total_steps")
         spec = RunSpec(
             config=Config(**config),
