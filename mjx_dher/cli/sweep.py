@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -16,7 +15,7 @@ from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_parts
 from mjx_dher.cli.fleet_options import FleetArgs, request_of
-from mjx_dher.cli.processes import Hosts, joined, refuse_with_ray
+from mjx_dher.cli.processes import join
 from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
 from mjx_dher.fleet.plan import Request
 from mjx_dher.runs.folder import fingerprint
@@ -104,7 +103,8 @@ class SweepArgs:
     """Settings that other options override: cpu, gpu, frugal, paper, or auto, the one for this machine."""
     lanes: int | None = None
     """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
-    hosts: Annotated[Hosts, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Hosts)
+    distributed: bool = False
+    """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     devices: Devices = 1
     """Devices to train on, or all: runs side by side are shared out among them; where they are more, several share each run."""
     fleet: Annotated[FleetArgs, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetArgs)
@@ -147,11 +147,12 @@ def _check(args: SweepArgs) -> None:
     if args.lanes is not None:
         check_count("lanes", args.lanes)
     check_devices(args.devices)
-    args.hosts.place(os.environ)
     args.options.check()
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
-    if request_of(args.fleet) is not None and args.dry_run:
+    if request_of(args.fleet) is not None and (args.devices != 1 or args.distributed):
+        raise ValueError("devices and distributed are for one program over several devices; with ray each task has a device")
+    if args.fleet.ray is not None and args.dry_run:
         raise ValueError("dry_run does not go with --ray: try the command without --ray")
     if args.out.exists() and not args.out.is_dir():
         raise FolderError(f"out: {args.out} is there already and is no folder")
@@ -186,25 +187,26 @@ def sweep_command(argv: list[str], console: Console) -> int:
     if args.dry_run:
         return _dry_run(args, trials, console)
     if (request := request_of(args.fleet)) is not None:
-        refuse_with_ray(args.hosts, args.devices)
         return _sweep_fleet(args, request, console)
     settle_compiler(args.engine)
-    described = {name: value for name, value in dataclasses.asdict(args).items() if name not in ("hosts", "out")}
-    with joined(args.hosts, {**described, "trials": [*map(fingerprint.trial_name, trials)]}, console) as (team, own_console):
-        return _sweep(args, trials, own_console, team)
+    described = {name: value for name, value in dataclasses.asdict(args).items() if name != "out"}
+    screen = join(args.distributed, {**described, "trials": [*map(fingerprint.trial_name, trials)]}, console)
+    return _sweep(args, trials, screen)
 
 
-def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console, team: Any) -> int:
-    """Trains a grid of runs in this process, or in the processes of a `Team`, of which the first one writes."""
+def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
+    """Trains a grid of runs; of several processes the first one decides and writes."""
+    from mjx_dher.parallel import processes
+
     places = {trial: place for place, trial in enumerate(trials)}
 
     def begin() -> list[int]:
         files.make_folder(args.out / grid.CELLS)
         return [places[trial] for trial in _announce(args, trials, console)]
 
-    todo = [trials[place] for place in team.share(begin)]
-    signum = _train(args, todo, console, team) if todo else None
-    return int(team.share(lambda: _end(args, trials, todo, signum, console)))
+    todo = [trials[place] for place in processes.broadcast(begin)]
+    signum = _train(args, todo, console) if todo else None
+    return int(processes.broadcast(lambda: _end(args, trials, todo, signum, console)))
 
 
 def _sweep_fleet(args: SweepArgs, request: Request, console: Console) -> int:
@@ -278,7 +280,7 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     return 0
 
 
-def _train(args: SweepArgs, todo: list[RunSpec], console: Console, team: Any) -> int | None:
+def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None:
     """Trains what is left; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
 
@@ -297,7 +299,6 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console, team: Any) ->
                 options=args.options,
                 lanes=args.lanes,
                 devices=args.devices,
-                team=team,
                 should_stop=lambda: stop.asked is not None,
                 report=lambda text: console.print(text, soft_wrap=True),
                 on_epoch=screen.show,

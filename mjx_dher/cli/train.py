@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import dataclasses
 import inspect
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,7 +26,7 @@ from mjx_dher.cli.common import (
     try_parts,
     warn_of_tau,
 )
-from mjx_dher.cli.processes import Hosts, check_out, claim, joined
+from mjx_dher.cli.processes import check_out, claim, join
 from mjx_dher.cli.view import PORT, Beside, Page
 from mjx_dher.config import check_all, check_devices
 from mjx_dher.lookup import check_name
@@ -70,7 +69,8 @@ class TrainArgs:
     """Show in the browser how the run learns: the policy after each epoch, at play. Needs the extra view."""
     view_port: int = PORT
     """Port of that page; 0: any that is free."""
-    hosts: Hosts = dataclasses.field(default_factory=Hosts)
+    distributed: bool = False
+    """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     devices: Devices = 1
     """Devices that share the run, GPUs where there are any, or all: equal parts of its environments, ring and batches."""
     options: Options = dataclasses.field(default_factory=Options)
@@ -88,9 +88,8 @@ class ResumeArgs:
     """Run folder."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
-    hosts: Annotated[Hosts, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Hosts)
-    devices: Devices | None = None
-    """Devices that share the run, or all; as many as it was started with unless given."""
+    distributed: bool = False
+    """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     total_steps: int | None = None
     """Environment steps of the whole run, those that were made included; as the run was started with unless given."""
     final_episodes: int | None = None
@@ -118,13 +117,16 @@ def train_command(argv: list[str], console: Console) -> int:
     settle_compiler(args.spec.engine)
     own = {"seed": args.spec.seed, "sources": fingerprint.sources(args.spec), "devices": args.devices}
     described = {**fingerprint.settings(args.spec), **dataclasses.asdict(args.options), **own}
-    with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
-        folder = Path(team.share(lambda: str(claim(stack, args.out, args.spec, goes_on=team.size > 1))))
+    screen = join(args.distributed, described, console)
+    from mjx_dher.parallel import processes
+
+    with contextlib.ExitStack() as stack:
+        folder = Path(processes.broadcast(lambda: str(claim(stack, args.out, args.spec, resumes=args.distributed))))
         prepare()
         env = make_env(args.spec)
         try_parts(env, [args.spec], screen)
-        beside = stack.enter_context(Beside(folder, port if team.leads else None, screen))
-        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, team, beside.after_epoch)
+        beside = stack.enter_context(Beside(folder, port if processes.leads() else None, screen))
+        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, beside.after_epoch)
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
@@ -146,20 +148,19 @@ def resume_command(argv: list[str], console: Console) -> int:
     """Goes on with a run that was stopped."""
     args = parse(ResumeArgs, argv)
     check_engine(args.engine)
-    if args.devices is not None:
-        check_devices(args.devices)
-    args.hosts.place(os.environ)
     content = run_folder.read_config(args.run)
     settle_compiler(args.engine or content["physics"])
-    described = {name: str(value) for name, value in vars(args).items() if name != "hosts"} | {"digest": content["digest"]}
-    with joined(args.hosts, described, console) as (team, screen), contextlib.ExitStack() as stack:
-        team.share(lambda: stack.enter_context(files.lock(args.run)))
+    described = {name: str(value) for name, value in vars(args).items()} | {"digest": content["digest"]}
+    screen = join(args.distributed, described, console)
+    from mjx_dher.parallel import processes
+
+    with contextlib.ExitStack() as stack:
+        processes.broadcast(lambda: stack.enter_context(files.lock(args.run)))
         run, options = _to_resume(args, content, screen)
         prepare()
         ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
-        devices = content.get("devices", 1) if args.devices is None else args.devices
         env = make_env(run, args.engine or ran)
-        return _train(env, run, args.run, options, args.curve, screen, devices, team)
+        return _train(env, run, args.run, options, args.curve, screen, content.get("devices", 1))
 
 
 def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
@@ -258,7 +259,7 @@ def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     head = f"{inspect.getdoc(TrainArgs)}\n\nDefaults below are {origin}."
     args = parse(TrainArgs, argv, description=head, default=default, config=(tyro.conf.OmitArgPrefixes,))
     alone = (spec.validate, args.spec), (args.options.check,), (check_devices, args.devices)
-    check_all(*alone, (check_out, args.hosts, args.out))
+    check_all(*alone, (check_out, args.distributed, args.out))
     return args
 
 
@@ -270,17 +271,17 @@ def _train(
     curve: bool,
     console: Console,
     devices: Devices,
-    team: Any,
     after_epoch: Callable[[], None] = lambda: None,
 ) -> int:
     """Trains into `folder`; goes on where it has a checkpoint."""
+    from mjx_dher.parallel import processes
     from mjx_dher.runs import driver
     from mjx_dher.runs.folder.locks import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
     before = [row["success_rate"] for row in loggers.read_rows(folder / run_folder.METRICS_FILE)]
     stop, screen = Stop(console, folder), Screen(console, [run], before)
-    curve = curve and team.leads
+    curve = curve and processes.leads()
 
     def on_epoch(specs: Any, progress: Any) -> None:
         screen.show(specs, progress)
@@ -297,7 +298,6 @@ def _train(
                 [folder],
                 options=options,
                 devices=devices,
-                team=team,
                 should_stop=lambda: stop.asked is not None,
                 report=lambda text: console.print(text, soft_wrap=True),
                 on_epoch=on_epoch,

@@ -19,8 +19,7 @@ import numpy as np
 from mjx_dher import config as config_lib
 from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
-from mjx_dher.parallel import mesh
-from mjx_dher.parallel.processes import ALONE, Team
+from mjx_dher.parallel import mesh, processes
 from mjx_dher.policy.learner_policy import LearnerPolicy
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
@@ -67,7 +66,6 @@ class _Session:
     shared: Path
     sweep: bool
     devices: int
-    team: Team
 
 
 def train_runs(
@@ -78,7 +76,6 @@ def train_runs(
     options: Options | None = None,
     lanes: int | None = None,
     devices: int | str = 1,
-    team: Team = ALONE,
     shared: Path | None = None,
     sweep: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
@@ -98,7 +95,6 @@ def train_runs(
       options: evaluation, checkpoints, logs; the defaults where None.
       lanes: runs side by side, at most; by default one on a CPU, whose cores one run fills, and elsewhere what memory holds.
       devices: to train on, or "all"; runs side by side are shared out among them, and fewer runs than devices are in parts.
-      team: processes that train together, each of which calls this alike; the first one writes.
       shared: folder for the checkpoints of runs side by side; "unfinished" beside the first run's folder where None.
       sweep: whether runs that have ended, or that another program is at work on, are left out, and runs whose checkpoints
         cannot be used begin anew, instead of raising.
@@ -120,15 +116,15 @@ def train_runs(
     placed_on = mesh.find(devices)
     shared = folders[0].parent / "unfinished" if shared is None else shared
     most, number = mesh.most_lanes(lanes, placed_on), max(1, len(placed_on))
-    asked = lambda: team.any(should_stop())  # noqa: E731
-    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, number, team)
+    asked = lambda: processes.any_process(should_stop())  # noqa: E731
+    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, number)
     claims = Claims(sweep, report)
-    free = team.share(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
+    free = processes.broadcast(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
     waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
     if not waiting:
         return []
     program = program_lib.compile_runs(env, [spec for spec, _ in waiting], most, options.final_episodes, report, placed_on)
-    team.agree("lanes", program.lanes)
+    processes.check_equal({"lanes": program.lanes})  # memory decides them where the user does not
     return _train_in_turn(session, program, claims, waiting)
 
 
@@ -163,30 +159,30 @@ def _claim(
     """Returns the runs that `claims` has claimed for the first process, and those that wait."""
     places = {run[1]: place for place, run in enumerate(waiting)}
     decide = lambda: [[places[folder] for _, folder in runs] for runs in claims.claim(stack, waiting, lanes)]  # noqa: E731
-    claimed, left = session.team.share(decide)
+    claimed, left = processes.broadcast(decide)
     return [waiting[place] for place in claimed], [waiting[place] for place in left]
 
 
 def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folders: Sequence[Path]) -> list[Result]:
     """Trains runs side by side, from their start or their checkpoint, to their end or until a stop is asked for."""
-    options, team = session.options, session.team
+    options = session.options
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
     runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec)) for spec in specs]
-    checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs, team)
+    checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams))
     _refuse_ended(session.env, specs[0], start)
-    for folder in folders if team.leads else ():  # before anything that a result tells of is touched
+    for folder in folders if processes.leads() else ():  # before anything that a result tells of is touched
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
     watch = Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
-        own = zip(ended, specs, folders, runs) if team.leads else ()
+        own = zip(ended, specs, folders, runs) if processes.leads() else ()
         logs = [_open(stack, session, program.lanes, *run) for run in own]
-        success = team.share(lambda: _success_rates(folders[0]))  # of one run, see stop_at
-        for progress in loop.run(session.env, specs[0].config, program.compiled, start, team.fetch):
+        success = processes.broadcast(lambda: _success_rates(folders[0]))  # of one run, see stop_at
+        for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
             _log(rows, logs, watch.failed)
@@ -194,7 +190,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
             if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs) or options.is_reached(success):
                 break
             if program.lanes == 1:
-                _save_policy(program, team.collect(progress.state.learner), specs[0], folders[0], runs[0])
+                _save_policy(program, processes.collect(progress.state.learner), specs[0], folders[0], runs[0])
             session.on_epoch(specs, progress)
             if session.should_stop():
                 session.report(f"saved {checkpoints.save(progress)}")
@@ -319,12 +315,11 @@ def _finish(
 ) -> list[Result]:
     """Writes what runs leave that have ended: policies and results. result.json comes last: with it a run is done."""
     outcome: Any = None
-    team = session.team
-    learners = team.collect(progress.state.learner)
+    learners = processes.collect(progress.state.learner)
     if len(failed) < len(specs):
         keys, _ = program_lib.stack(specs, program.choices, program.lanes)
         episodes = session.options.final_episodes
-        outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes, team.fetch)
+        outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes, processes.fetch)
     results = []
     for lane, (spec, folder) in enumerate(zip(specs, folders)):
         epoch, reason = failed.get(lane, (progress.epoch, ""))
@@ -339,7 +334,7 @@ def _finish(
         }
         if not reason:
             content |= evaluate.summarize(*(x[lane] for x in outcome[:4]))
-        if team.leads:
+        if processes.leads():
             if not reason:
                 _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
                 files.flush(folder / run_folder.POLICY_FILE)

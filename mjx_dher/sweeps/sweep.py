@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mjx_dher.parallel.processes import ALONE, Team
+from mjx_dher.parallel import processes
 from mjx_dher.runs.driver import Result, train_runs
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.program.loop import Progress
@@ -28,7 +28,6 @@ def run(
     options: Options,
     lanes: int | None = None,
     devices: int | str = 1,
-    team: Team = ALONE,
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
@@ -42,7 +41,6 @@ def run(
       options: evaluation, checkpoints, logs.
       lanes: runs side by side, at most.
       devices: to train on, or "all", as for `train_runs`.
-      team: processes that train together, each of which calls this alike; the first one writes.
       should_stop: asked after every epoch; True ends the sweep, with a checkpoint.
       report: called with a line about each program and checkpoint.
       on_epoch: called after every epoch of those side by side.
@@ -56,7 +54,7 @@ def run(
     """
     results: list[Result] = []
     for trials in grid.by_program(specs):
-        if results and team.any(should_stop()):
+        if results and processes.any_process(should_stop()):
             break
         results += train_runs(
             make_env(trials[0]),
@@ -65,7 +63,6 @@ def run(
             options=options,
             lanes=lanes,
             devices=devices,
-            team=team,
             shared=folder / UNFINISHED,
             sweep=True,
             should_stop=should_stop,

@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.parallel.reshard import regroup
 from mjx_dher.runs.folder.fingerprint import sha256_of
 from mjx_dher.runs.folder.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
 from mjx_dher.system import files, memory, private_api
@@ -28,6 +27,7 @@ SCHEMA = 2
 _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
+_CURSOR, _STEPS = ".replay.cursor", ".env_steps"
 
 
 class CheckpointError(FolderError):
@@ -174,8 +174,31 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
             read = _say([name, list(array.shape), str(array.dtype)])
             raise CheckpointError(f"{path} was read as {read}, and was written as {_say(saved[name])}")
     shapes = _to_shapes(template)
-    arrays = regroup(arrays, shapes, len(manifest["runs"]))
+    arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
+    _check_devices(path, arrays, shapes)
     return manifest, _fit(path, arrays, shapes)
+
+
+def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
+    """Returns the arrays of the `runs` that were saved, with the last one repeated up to the number of lanes in `shapes`.
+
+    A program may have more lanes than runs. One run alone has no lane axis.
+    """
+    if _STEPS not in arrays or _STEPS not in shapes:
+        return arrays  # of no TrainState
+    saved, needed = arrays[_STEPS].shape, tuple(shapes[_STEPS].shape)
+    if saved == needed or not 1 <= runs <= min(*(saved or (1,)), *(needed or (1,))):
+        return arrays
+    lanes: Any = np.minimum(np.arange(needed[0]), runs - 1) if needed else 0
+    return {name: (array if saved else array[None])[lanes] for name, array in arrays.items()}
+
+
+def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any]) -> None:
+    """Raises CheckpointError if each run was split over another number of devices: each device has a ring with a cursor."""
+    if all(name in known for name in (_CURSOR, _STEPS) for known in (arrays, shapes)):
+        before, now = (known[_CURSOR].size // max(1, known[_STEPS].size) for known in (arrays, shapes))
+        if before != now:
+            raise CheckpointError(f"{path}: devices must be {before} for each run, as when it was made; got {now}")
 
 
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:

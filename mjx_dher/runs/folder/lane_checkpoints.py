@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.parallel.processes import ALONE, Team
+from mjx_dher.parallel import processes
 from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.checkpoint import Restored
 from mjx_dher.runs.program.loop import Progress, Start
@@ -35,7 +35,6 @@ class LaneCheckpoints:
     restart: bool  # begin anew where no checkpoint can be used, rather than raise
     report: Callable[[str], None]
     runs: Sequence[dict[str, Any]]  # `fingerprint.identity` of each
-    team: Team = ALONE  # its first process reads and writes
     refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
     failed: dict[int, tuple[int, str]] = dataclasses.field(
         default_factory=dict
@@ -62,7 +61,7 @@ class LaneCheckpoints:
           FolderError: no checkpoint can be used, unless `restart`.
         """
         state = init()
-        if not self.team.share(lambda: len(run_folder.checkpoints(self.folder))):
+        if not processes.broadcast(lambda: len(run_folder.checkpoints(self.folder))):
             return Start(state)
         template = jax.tree.map(self._shape_of, state)
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
@@ -74,7 +73,7 @@ class LaneCheckpoints:
             if not self.restart:
                 raise
             self.report(f"{error}; training these runs from their start")
-            self.refused.extend(run_folder.checkpoints(self.folder) if self.team.leads else [])
+            self.refused.extend(run_folder.checkpoints(self.folder))
             return Start(init())
         for path, why in restored.refused.items():
             self.report(f"not used: {why}")
@@ -85,25 +84,16 @@ class LaneCheckpoints:
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
 
     def _read(self, template: TrainState) -> Restored:
-        """Returns the checkpoint that the first process reads; raises FolderError in all processes."""
-        arrays: list[Any] = []
-
-        def decide() -> list[Any]:
-            try:
-                restored = checkpoint.read(self.folder, template, [*map(loggers.whole_epochs, self.folders)])
-            except FolderError as error:
-                return [str(error)]
-            arrays.extend(restored.state)
-            path, epoch, wall_seconds, _, runs, refused, failed = restored
-            return [str(path), epoch, wall_seconds, runs, {str(path): why for path, why in refused.items()}, [*failed.items()]]
-
-        path, *told = self.team.share(decide)
-        if not told:
-            raise FolderError(path)
-        epoch, wall_seconds, runs, refused, failed = told
-        state = checkpoint.place(self.team.share_arrays(arrays), template)
-        paths = {Path(name): why for name, why in refused.items()}
-        return Restored(Path(path), epoch, wall_seconds, state, runs, paths, {lane: tuple(how) for lane, how in failed})
+        """Returns the newest whole checkpoint; raises FolderError in all processes if one of them cannot read it."""
+        problem: FolderError | None = None
+        try:
+            restored = checkpoint.restore(self.folder, template, [*map(loggers.whole_epochs, self.folders)])
+        except FolderError as error:
+            problem = error
+        if processes.any_process(problem is not None):
+            raise problem or FolderError(f"another process cannot read {self.folder}: all of them need the same file system")
+        processes.check_equal({"checkpoint": restored.path})
+        return restored
 
     def _shape_of(self, leaf: Any) -> jax.ShapeDtypeStruct:
         sharding = leaf.sharding if len(leaf.sharding.device_set) > 1 else None
@@ -125,11 +115,9 @@ class LaneCheckpoints:
         Raises:
           CheckpointError: it cannot be written.
         """
-        state = progress.state
-        if self.team.size > 1:
-            state = self.team.collect(checkpoint.without_keys(state))
-            if not self.team.leads:
-                return self.shared
+        state = processes.collect(checkpoint.without_keys(progress.state))
+        if state is None:
+            return self.shared
         folder = self.folder
         if folder not in self.folders:
             files.make_folder(folder)
@@ -153,7 +141,7 @@ class LaneCheckpoints:
 
         With `keep_end` the newest stays that is in the run's own folder.
         """
-        if not self.team.leads:
+        if not processes.leads():
             return
         own = self.folders[0] / run_folder.CHECKPOINTS
         for path in run_folder.checkpoints(self.folders[0])[1:] if keep_end else ():
