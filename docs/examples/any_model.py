@@ -1,4 +1,4 @@
-"""Any MuJoCo model, stepped by MuJoCo C on all cores from inside a compiled JAX program; here a figure that falls and kicks.
+"""Steps any MuJoCo model by MuJoCo C on all cores, from inside a compiled JAX program. Here a figure falls and kicks.
 
 python docs/examples/any_model.py
 """
@@ -39,7 +39,7 @@ FIGURE = """
 
 
 def main(argv=None):
-    """Prints how high the torsos of many figures are after random kicks."""
+    """Prints the heights of many figures after random kicks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--num-envs", type=int, default=256)
     parser.add_argument("--steps", type=int, default=100, help="of five timesteps each")
@@ -62,7 +62,7 @@ def main(argv=None):
         return jax.vmap(sim.forward)(data)  # makes the centre of mass that of the last state
 
     data = play(jax.random.key(0))
-    height = data.derived["subtree_com"][:, 1, 2]  # [num_envs] m, of the torso and all that hangs on it
+    height = data.derived["subtree_com"][:, 1, 2]  # [num_envs] m, of the torso and the bodies below it
     print(f"after {float(data.time[0]):.2f} s the centre of mass is {height.mean():.2f} m high, {height.max():.2f} m at most")
 
 
