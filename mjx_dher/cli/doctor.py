@@ -8,33 +8,34 @@ import json
 from rich.console import Console
 
 from mjx_dher.cli.commands import parse
+from mjx_dher.config import check_number
 
 
 @dataclasses.dataclass(frozen=True)
 class DoctorArgs:
-    """Say what works on this machine, for a report of a fault: versions, devices, engines, ways to draw, folders.
+    """Show what works on this machine, for a bug report: versions, devices, engines, drawing backends and folders.
 
-    Ends with status 0 if at least one engine works, else with 1.
+    Exits with status 0 if at least one engine works, else with status 1.
     """
 
     json: bool = False
     """Print one JSON object instead."""
     seconds: float = 180.0
-    """Time that each engine and each way to draw may take. Warp compiles its kernels, once a machine, for a minute or more."""
+    """Time limit of each trial. Warp compiles its kernels, once a machine, for a minute or more."""
 
 
 def doctor_command(argv: list[str], console: Console) -> int:
-    """Says what works on this machine."""
+    """Shows what works on this machine."""
     from mjx_dher.tools import doctor
 
     args = parse(DoctorArgs, argv)
-    doctor.check(args.seconds)
+    check_number("seconds", args.seconds, "(0, 3600]", float)
     if not args.json:
-        console.print("trying the engines and the ways to draw ...")
+        console.print("trying the engines and the drawing backends ...")
     report = doctor.examine(args.seconds)
     if args.json:
         print(json.dumps(report, indent=2))
     else:
         for line in doctor.lines(report):
             console.print(line, soft_wrap=True)
-    return 0 if doctor.some_engine_works(report) else 1
+    return 0 if any(map(doctor.works, report["engines"].values())) else 1

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mjx_dher import config as config_lib
-from mjx_dher.components import reads
-from mjx_dher.config import Config, HParams
+from mjx_dher.config import Config
 from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
@@ -60,13 +60,6 @@ def changes(before: RunSpec, now: RunSpec) -> str:
     return "given beside it: " + (", ".join(told) or "nothing")
 
 
-def text(value: Any) -> str:
-    """Returns a setting's value as a command line has it."""
-    if isinstance(value, (tuple, list)):
-        return " ".join(map(str, value)) or "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
 def check_out(out: Path | None) -> None:
     """Checks without a trace that a run folder can be made at `out`.
 
@@ -91,16 +84,6 @@ def check_writable(out: Path) -> None:
         os.rmdir(tempfile.mkdtemp(dir=parent))  # permissions do not say it: not to root, nor of a file system that is full
     except OSError as error:
         raise FolderError(f"out: {parent} cannot be written to ({error.strerror})") from None
-
-
-def groups(run: RunSpec) -> Iterator[tuple[str, str]]:
-    """Yields the settings that a run reads, in three groups with a heading each."""
-    values = {**fingerprint.settings(run), "seed": run.seed}
-    sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
-    parts = [name for name in values if name not in (*sizes, *numbers)]
-    for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
-        read_here = [name for name in names if reads(values, name)]
-        yield title, "; ".join(f"{name} {text(values[name])}" for name in read_here)
 
 
 def amount(config: Config, episode_length: int, runs: int = 1) -> str:

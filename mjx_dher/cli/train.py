@@ -136,8 +136,8 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     check_platform()
     env = make_env(args.spec)
     memory = settings.memory_lines(env, [args.spec])
-    for title, told in settings.groups(args.spec):
-        console.print(f"{title}: {told}", soft_wrap=True)
+    for title, values in fingerprint.groups(args.spec).items():
+        console.print(f"{title}: {'; '.join(f'{name} {fingerprint.text(x)}' for name, x in values.items())}", soft_wrap=True)
     amount = settings.amount(args.spec.config, env.episode_length)
     for line in (amount, *memory, "one program to train, one for the last evaluation; nothing was written"):
         console.print(line, soft_wrap=True)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from mjx_dher import __version__
-from mjx_dher.components import reads
-from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import comparison, plotting, tables
@@ -22,28 +20,31 @@ REPORT = "report.html"
 
 
 def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> str:
-    """Returns the page about the run in `folder`, however far it came.
+    """HTML page about the run in `folder`, whose training may still be under way.
 
     Args:
       folder: of the run.
       report: called with a line about each video that is left out.
 
     Raises:
-      FolderError: no run folder, or one that cannot be believed.
+      FolderError: no run folder, or a damaged one.
     """
     curve = curves.read_curve(folder, allow_empty=True)
     spec = curve.spec
-    body = [html.paragraph(curves.title(curve), "failed" if curve.status == FAILED else ""), html.facts(_facts(curve))]
+    body = [html.element("p", curves.title(curve), "failed" if curve.status == FAILED else ""), html.facts(_facts(curve))]
     body += _videos(folder, report)
     if curve.rows:
-        body += [html.heading("Curves"), html.figure(figures.to_svg(curves.draw_curve(curve), 0))]
+        body += [html.element("h2", "Curves"), html.figure(figures.to_svg(curves.draw_curve(curve), 0))]
         columns = [name for name in curve.rows[0] if name != "digest"]
         rows = [[_number(row.get(name)) for name in columns] for row in curve.rows]
         body.append(html.details(f"every epoch ({len(rows)})", html.table(columns, rows)))
     else:
-        body.append(html.paragraph("No epoch of the run has ended."))
-    body += [html.heading("Settings"), *_settings(spec, curve.content)]
-    body += [html.code(f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"), _footer(curve.content.get("versions"))]
+        body.append(html.element("p", "No epoch of the run has ended."))
+    body += [html.element("h2", "Settings"), *_settings(spec, curve.content)]
+    body += [
+        html.element("code", f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"),
+        _footer(curve.content.get("versions")),
+    ]
     return html.page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
 
 
@@ -63,13 +64,10 @@ def _facts(curve: Curve) -> Iterator[tuple[str, str]]:
 
 
 def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
-    """Yields the settings that a run reads, beside the defaults of the library where they differ."""
-    values, defaults = {**fingerprint.settings(spec), "seed": spec.seed}, fingerprint.settings(RunSpec())
-    sizes, numbers = [field.name for field in dataclasses.fields(Config)], HParams._fields
-    parts = [name for name in values if name not in (*sizes, *numbers)]
-    for title, names in (("run", parts), ("sizes", sizes), ("numbers", numbers)):
-        own = [name for name in names if reads(values, name)]
-        rows = [[n, _value(values[n]), _value(defaults[n]) if n in defaults and defaults[n] != values[n] else ""] for n in own]
+    """Yields the settings that a run reads, beside the defaults of the library if they differ."""
+    defaults = fingerprint.settings(RunSpec())
+    for title, values in fingerprint.groups(spec).items():
+        rows = [[n, text(x), text(defaults[n]) if n in defaults and defaults[n] != x else ""] for n, x in values.items()]
         if title == "run":
             rows.append(["physics", content["physics"], ""])
         yield html.details(title, html.table((title, "value", "default, where it differs"), rows))
@@ -86,7 +84,7 @@ def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
 
 
 def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
-    """Returns the page about the sweep in `folder`: of all runs that have ended.
+    """HTML page about all ended runs of the sweep in `folder`.
 
     Args:
       folder: of the sweep.
@@ -95,22 +93,24 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
       report: called with a line about each video that is left out.
 
     Raises:
-      FolderError: no sweep, none of its runs has ended, or one that cannot be believed.
+      FolderError: no sweep, none of its runs has ended, or a damaged one.
     """
     trials = tables.read(folder)
     failed = [trial for trial in trials if trial["status"] == FAILED]
-    body = [html.paragraph(f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")]
+    body = [
+        html.element("p", f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")
+    ]
     body += _videos(folder, report)
     for number, (env, groups) in enumerate(comparison.groups(trials).items()):
         rows = comparison.compare(groups, baseline, threshold)
-        body += [html.heading(env), html.table(*comparison.table(rows))]
+        body += [html.element("h2", env), html.table(*comparison.table(rows))]
         compared = f"P(better) and p: against {baseline}" if any(row.better == row.better for row in rows) else "no baseline"
-        body.append(html.paragraph(f"epochs to a success rate of {threshold:g}; {compared}"))
+        body.append(html.element("p", f"epochs to a success rate of {threshold:g}; {compared}"))
         for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
             body.append(html.figure(figures.to_svg(figure, 10 * number + place), name))
     plotting.close()
-    body += [html.heading("Runs"), html.details(f"all {len(trials)} runs", _runs(trials))]
-    body += [html.heading("Settings"), *_shared_settings(trials)]
+    body += [html.element("h2", "Runs"), html.details(f"all {len(trials)} runs", _runs(trials))]
+    body += [html.element("h2", "Settings"), *_shared_settings(trials)]
     body.append(_footer(None))
     return html.page(f"Sweep {folder.absolute().name}", body)
 
@@ -121,7 +121,7 @@ def _runs(trials: Sequence[dict[str, Any]]) -> str:
     rows = []
     for trial in trials:
         final, seconds = trial["final"], [None, *trial["curve"].get("wall_seconds", ())][-1]
-        values = [_value(trial["settings"][name]) for name in varying]
+        values = [text(trial["settings"][name]) for name in varying]
         numbers = map(_number, (final.get("success_rate"), final.get("reset_success_rate"), seconds))
         rows.append([trial["folder"].name, *values, trial["seed"], trial["status"], *numbers, trial["reason"]])
     return html.table(head, rows)
@@ -135,20 +135,14 @@ def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
 def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
     varying, first = _varying(trials), trials[0]["settings"]
     if varying:
-        yield html.paragraph(f"What differs between runs: {', '.join(varying)}.")
-    rows = [(name, _value(value)) for name, value in first.items() if name not in varying]
+        yield html.element("p", f"What differs between runs: {', '.join(varying)}.")
+    rows = [(name, text(value)) for name, value in first.items() if name not in varying]
     yield html.details("the same in all runs", html.table(("setting", "value"), rows))
 
 
 def _footer(versions: Any) -> str:
     told = ", ".join(f"{name} {version}" for name, version in versions.items()) if isinstance(versions, dict) else ""
-    return html.paragraph(f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, (tuple, list)):
-        return " ".join(map(str, value)) or "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return html.element("p", f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
 
 
 def _number(value: Any) -> str:

@@ -1,9 +1,7 @@
-"""The report for a bug report: versions, devices, folders, and which engines and drawing backends work on this machine.
+"""The report for a bug report: versions, devices, and the engines and drawing backends that work on this machine.
 
 JAX and MuJoCo are loaded in child processes with a time limit, so a driver that hangs or crashes costs one line of the report.
-A child process is this file, run as a program:
-
-    python -m mjx_dher.tools.doctor machine|native|jax|warp
+A child process is this file: `python -m mjx_dher.tools.doctor machine|native|jax|warp`.
 """
 
 from __future__ import annotations
@@ -12,10 +10,11 @@ import contextlib
 import json
 import os
 import platform
+import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
@@ -25,151 +24,86 @@ from mjx_dher import __version__, presets, spec
 from mjx_dher.system import caches, memory, subprocesses
 from mjx_dher.tools import render, transfer
 
-LONGEST_SECONDS = 3600.0  # longest time limit of a child process
 ENGINES = tuple(name for name in spec.ENGINES if name != "auto")
-NOT_STEPPED = "jax"  # its step takes some 20 s to compile on two cores, that of native 1 s
-MACHINE = ("cores", "devices", "memory", "auto", "preset")  # parts of the section `machine`
-PROCESSES = 4  # most child processes at once
 LONGEST_ERROR = 400  # characters
-
-PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
-EXTRAS = {  # extra: packages that only it installs
-    "cuda": ("jax-cuda12-plugin", "warp-lang"),
-    "gym": ("gymnasium",),
-    "plot": ("matplotlib",),
-    "video": ("imageio-ffmpeg",),
-    "export": ("onnx", "safetensors"),
-    "tensorboard": ("tensorboardX", "tensorboard"),
-    "wandb": ("wandb",),
-    "view": ("viser",),
-    "ray": ("ray",),
-    "docs": ("sphinx", "furo", "myst-nb"),
-}
-EXTRA_OF = {package: extra for extra, packages in EXTRAS.items() for package in packages}
-
-# Texts for None in the report, by name; "unknown" for the others.
-_NONE = {"MUJOCO_GL": "not set", "step": "not tried, because it takes long to compile", "bytes": "no such folder"}
 
 Report = dict[str, dict[str, Any]]
 
 
-def check(seconds: float) -> None:
-    """Raises ValueError unless `seconds` is an allowed time limit of a child process."""
-    if not 0 < seconds <= LONGEST_SECONDS:
-        raise ValueError(f"seconds must lie in (0, {LONGEST_SECONDS:g}]; got {seconds:g}")
-
-
 def examine(seconds: float) -> Report:
-    """Examines the machine; on a GPU, Warp keeps the kernels that it compiles, and nothing else is left behind.
+    """Examines the machine. On a GPU, Warp keeps the kernels that it compiles; nothing else is left behind.
 
     Args:
       seconds: time limit of each child process.
 
     Returns:
-      Sections of named parts, as JSON takes them. A part that could not be determined is {"error": ONE LINE}.
-      versions: strings, None for a package that is not installed.
-      machine: cores; memory, bytes that can be allocated; devices of JAX, a list of {platform, kind, memory in bytes};
-        auto, the engine that it stands for; preset.
-      engines: {works, import, build, step in s}, where step is None if it was not tried, or {works, error, ...}.
-      drawing: MUJOCO_GL as the user has set it; {works} or {works, error} for each of its values ("system" where there is
-        only one backend); ffmpeg, its path.
-      folders: cache: {path, bytes}; originals: {path, ready}. Bytes are None if there is no such folder.
+      Sections `versions`, `machine`, `engines`, `drawing` and `folders`. Each value is a text, or for an engine a text for each
+      stage that it came through; the text of a failure begins with "error: ".
     """
-    requested = os.environ.get("MUJOCO_GL")
+    requested = os.environ.get("MUJOCO_GL", "")
     backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])
-    with ThreadPoolExecutor(min(PROCESSES, os.cpu_count() or 1)) as pool:
-        engines = {name: pool.submit(ask, _command(name), seconds) for name in ENGINES}
-        machine = pool.submit(ask, _command("machine"), seconds)
-        drawing = {name or "system": pool.submit(render.try_gl, name, seconds) for name in backends}
-    answer = machine.result()
-    versions = {"mjx_dher": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+        asked = {topic: pool.submit(ask, topic, seconds) for topic in ("machine", *ENGINES)}
+        drawn = {name or "system": pool.submit(render.try_gl, name, seconds) for name in backends}
+    failures = {name: future.result() for name, future in drawn.items()}
     return {
-        "versions": {**versions, **{name: version(name) for name in (*PACKAGES, *EXTRA_OF)}},
-        "machine": {name: answer[name] if name in answer else {"error": answer["error"]} for name in MACHINE},
-        "engines": {name: _trial(future.result()) for name, future in engines.items()},
+        "versions": _versions(),
+        "machine": asked["machine"].result(),
+        "engines": {name: asked[name].result() for name in ENGINES},
         "drawing": {
-            "MUJOCO_GL": requested,
-            **{name: _trial({"error": future.result()} if future.result() else {}) for name, future in drawing.items()},
-            "ffmpeg": guarded(lambda: _brief(render.ffmpeg())),
+            "MUJOCO_GL": requested or "not set",
+            **{name: f"error: {failure}" if failure else "works" for name, failure in failures.items()},
+            "ffmpeg": _guarded(lambda: _brief(render.ffmpeg())),
         },
-        "folders": {"cache": guarded(_cache), "originals": guarded(_originals)},
+        "folders": {"cache": _guarded(_cache), "originals": _guarded(_originals)},
     }
 
 
-def some_engine_works(report: Report) -> bool:
-    """Returns whether anything can be trained on this machine."""
-    return any(engine.get("works") for engine in report["engines"].values())
+def works(engine: Mapping[str, str]) -> bool:
+    """Whether a trial of an engine came to its end."""
+    return "error" not in engine
 
 
 def lines(report: Report) -> list[str]:
     """Formats the report of `examine` as text."""
-    width = max(len(name) for parts in report.values() for name in parts)
+    width = max(len(name) for values in report.values() for name in values)
     text = []
-    for section, parts in report.items():
+    for section, values in report.items():
         text.append(section)
-        for name, value in parts.items():
-            shown = _missing(name) if section == "versions" and value is None else _text(name, value)
-            text.append(f"  {name:{width}}  {shown}")
+        for name, value in values.items():
+            stages = ["works" if works(value) else "fails", *map(": ".join, value.items())] if section == "engines" else [value]
+            text.append(f"  {name:{width}}  {', '.join(stages)}")
     return text
 
 
-def _missing(package: str) -> str:
-    return f"not installed (extra {EXTRA_OF[package]})" if package in EXTRA_OF else "not installed"
+def _versions() -> dict[str, str]:
+    """Versions of this library and the packages that it requires; an extra's package that is missing names the extra."""
+    versions = {"mjx_dher": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    versions |= dict.fromkeys(("jax", "jaxlib", "jax-cuda12-plugin", "mujoco"), "not installed")
+    with contextlib.suppress(metadata.PackageNotFoundError):  # a checkout that is not installed
+        for requirement in metadata.requires("mjx-dher") or ():
+            name, _, extra = re.match(r"([\w.-]+)(.*extra == [\"'](\w+))?", requirement).groups()  # type: ignore[union-attr]
+            if extra != "test":
+                versions.setdefault(name, f"not installed (extra {extra})" if extra else "not installed")
+    for name in list(versions)[3:]:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
 
 
-def _text(name: str, value: Any) -> str:
-    if value is None:
-        return _NONE.get(name, "unknown")
-    if isinstance(value, dict):
-        return ", ".join(f"{key}: {_text(key, inner)}" for key, inner in value.items())
-    if isinstance(value, list):
-        return "; ".join(_text(name, inner) for inner in value)
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.1f} s"
-    return memory.format_bytes(value) if name in ("memory", "bytes") else str(value)
+def ask(topic: str, seconds: float) -> dict[str, str]:
+    """Runs a child process, which prints one JSON object per line, and returns their union.
 
-
-def version(package: str) -> str | None:
-    """Returns the version of a package, None if it is not installed."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def guarded(part: Callable[[], Any]) -> Any:
-    """Calls `part` and returns its result, or {"error": ONE LINE} if it raises."""
-    try:
-        return part()
-    except Exception as error:
-        return {"error": one_line(error)}
-
-
-def one_line(error: BaseException) -> str:
-    """Formats a caught error in one line, with its type and place unless it is a ValueError, whose text is enough."""
-    text = str(error)
-    if type(error) is not ValueError:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"{type(error).__name__}: {text} ({Path(place.filename).name}, line {place.lineno})"
-    text = " ".join(text.split())
-    return text if len(text) <= LONGEST_ERROR else text[:LONGEST_ERROR] + " ..."
-
-
-def ask(command: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Runs a child process that prints one JSON object per line, and returns their union.
-
-    If it fails, "error" says why in one line, beside the results from before the failure.
+    A failure is the value of "error", beside the results from before it.
     """
-    root = str(subprocesses.PACKAGE.parent)
+    command = [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]  # -P: no file here takes a library's place
     variables = {
-        "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(subprocesses.PACKAGE.parent), os.environ.get("PYTHONPATH")])),
         # Otherwise JAX would reserve three quarters of a GPU's memory, which a training run may be using.
         "XLA_PYTHON_CLIENT_PREALLOCATE": os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "false"),
     }
     answer = subprocesses.ask(command, variables, seconds)
-    results: dict[str, Any] = {}
+    results: dict[str, str] = {}
     for line in answer.out.splitlines():
         with contextlib.suppress(ValueError):  # an unfinished line of a killed process
             results |= json.loads(line)
@@ -188,30 +122,25 @@ def main(argv: Sequence[str]) -> None:
             print(json.dumps({"error": one_line(error)}), file=out, flush=True)
 
 
-def _examine_machine() -> Iterator[tuple[str, Any]]:
-    """Yields the name and the value of each part of the section `machine`."""
+def _examine_machine() -> Iterator[tuple[str, str]]:
     import jax
 
     from mjx_dher.envs import engines
     from mjx_dher.envs.engines import native
 
-    def devices() -> list[dict[str, Any]]:
-        limit = lambda device: (device.memory_stats() or {}).get("bytes_limit")  # noqa: E731
-        return [{"platform": d.platform, "kind": d.device_kind, "memory": limit(d)} for d in jax.devices()]
+    def devices() -> str:
+        sizes = {device: (device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()}
+        return "; ".join(f"{d.device_kind}{f', {memory.format_bytes(size)}' if size else ''}" for d, size in sizes.items())
 
-    functions: list[Callable[[], Any]] = [
-        native.usable_cores,
-        devices,
-        memory.available_bytes,
-        lambda: engines.resolve_engine("auto"),
-        presets.machine_preset,
-    ]
-    for name, function in zip(MACHINE, functions):
-        yield name, guarded(function)
+    yield "cores", str(native.usable_cores())
+    yield "devices", _guarded(devices)
+    yield "memory", _guarded(lambda: memory.format_bytes(memory.available_bytes() or 0))
+    yield "engine", _guarded(lambda: engines.resolve_engine("auto"))
+    yield "preset", _guarded(presets.machine_preset)
 
 
-def _try_engine(engine: str) -> Iterator[tuple[str, float | None]]:
-    """Tries an engine with one step of `reach`; yields the name and the duration in s of each stage."""
+def _try_engine(engine: str) -> Iterator[tuple[str, str]]:
+    """Tries an engine with one step of `reach`; yields the name and the duration of each stage."""
     start = time.perf_counter()
     import jax
     import jax.numpy as jnp
@@ -219,12 +148,12 @@ def _try_engine(engine: str) -> Iterator[tuple[str, float | None]]:
     from mjx_dher import envs
     from mjx_dher.envs import engines, reach  # noqa: F401 - as `make` will
 
-    yield "import", time.perf_counter() - start
+    yield "import", f"{time.perf_counter() - start:.1f} s"
     start = time.perf_counter()
     env = envs.make("reach", engine=engine)
-    yield "build", time.perf_counter() - start
-    if engine == NOT_STEPPED:
-        yield "step", None
+    yield "build", f"{time.perf_counter() - start:.1f} s"
+    if engine == "jax":  # its step takes some 20 s to compile on two cores, that of native 1 s
+        yield "step", "not tried, because it takes long to compile"
         return
     start = time.perf_counter()
     action = jnp.ones(env.action_size)
@@ -234,31 +163,41 @@ def _try_engine(engine: str) -> Iterator[tuple[str, float | None]]:
     moved = after.obs["achieved_goal"] - before.obs["achieved_goal"]
     if after.failed or not (moved > 0).all():
         raise ValueError(f"a step that asks the gripper to move by 5 cm along x, y and z moved it by {moved.tolist()} m")
-    yield "step", time.perf_counter() - start
+    yield "step", f"{time.perf_counter() - start:.1f} s"
 
 
-def _trial(answer: dict[str, Any]) -> dict[str, Any]:
-    return {"works": "error" not in answer, **answer}
+def _guarded(part: Callable[[], str]) -> str:
+    try:
+        return part()
+    except Exception as error:
+        return f"error: {one_line(error)}"
 
 
-def _command(topic: str) -> list[str]:
-    # -P: a file in the current folder must not take a library's place.
-    return [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]
+def one_line(error: BaseException) -> str:
+    """Formats a caught error in one line, with its type and place unless it is a ValueError, whose text is enough."""
+    text = str(error)
+    if type(error) is not ValueError:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {text} ({Path(place.filename).name}, line {place.lineno})"
+    text = " ".join(text.split())
+    return text if len(text) <= LONGEST_ERROR else text[:LONGEST_ERROR] + " ..."
 
 
-def _cache() -> dict[str, Any]:
+def _cache() -> str:
     folder = caches.user_cache()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
-    return {"path": _brief(folder), "bytes": sum(path.stat().st_size for path in files) if folder.is_dir() else None}
+    size = memory.format_bytes(sum(path.stat().st_size for path in files))
+    return f"{_brief(folder)}, {size if folder.is_dir() else 'not there'}"
 
 
-def _originals() -> dict[str, Any]:
+def _originals() -> str:
     environment = transfer.default_environment()
-    return {"path": _brief(environment), "ready": transfer.is_ready(transfer.interpreter(environment))}
+    ready = transfer.is_ready(transfer.interpreter(environment))
+    return f"{_brief(environment)}, {'ready' if ready else 'not ready'}"
 
 
 def _brief(path: str | Path) -> str:
-    """Returns a path that can be shown to others: without the user's home folder."""
+    """A path that can be shown to others: without the user's home folder."""
     path = Path(path)
     return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else str(path)
 

@@ -1,4 +1,4 @@
-"""Parts of a page of HTML that holds all that it shows: no file, script, font or address outside of it."""
+"""Pieces of a self-contained HTML page: no file, script, font or address outside of it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ code { background: #f4f4f4; padding: 0 3px }
 
 
 def page(title: str, body: Iterable[str]) -> str:
-    """Returns a whole page with a heading."""
+    """A whole page with a heading."""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{text(title)}</title>\n'
@@ -33,49 +33,38 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def text(value: object) -> str:
-    """Returns what a reader is to see, with what HTML would take for markup escaped."""
+    """Text of a value, escaped."""
     return html.escape(str(value))
 
 
-def heading(title: str) -> str:
-    """Returns the heading of a section."""
-    return f"<h2>{text(title)}</h2>"
-
-
-def paragraph(words: str, kind: str = "") -> str:
-    """Returns a paragraph, of a class of its own if one is given."""
-    return f'<p class="{kind}">{text(words)}</p>' if kind else f"<p>{text(words)}</p>"
-
-
-def code(command: str) -> str:
-    """Returns a command as a paragraph."""
-    return f"<p><code>{text(command)}</code></p>"
+def element(name: str, words: object, kind: str = "") -> str:
+    """An element such as h2, p or code around a text, of a class if one is given."""
+    return f"<{name}{f' class={kind}' if kind else ''}>{text(words)}</{name}>"
 
 
 def facts(values: Iterable[tuple[str, str]]) -> str:
-    """Returns figures beside one another, each with its name."""
-    return '<div class="facts">' + "".join(f"<div><b>{text(v)}</b>{text(name)}</div>" for name, v in values) + "</div>"
+    """Figures side by side, each with its name."""
+    return '<div class="facts">' + "".join(f"<div>{element('b', v)}{text(name)}</div>" for name, v in values) + "</div>"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Returns a table."""
-    first = "".join(f"<th>{text(name)}</th>" for name in head)
-    rest = "\n".join("<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table>\n<tr>{first}</tr>\n{rest}\n</table></div>'
+    """A table."""
+    lines = ["".join(element("th", name) for name in head), *("".join(element("td", cell) for cell in row) for row in rows)]
+    return '<div class="wide"><table>\n' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "\n</table></div>"
 
 
 def details(summary: str, inside: str) -> str:
-    """Returns something that a click opens."""
-    return f"<details><summary>{text(summary)}</summary>\n{inside}\n</details>"
+    """HTML that a click opens."""
+    return f"<details>{element('summary', summary)}\n{inside}\n</details>"
 
 
 def figure(content: str, caption: str = "") -> str:
-    """Returns a picture, an element of HTML, with a caption."""
-    return f"<figure>{content}" + (f"<figcaption>{text(caption)}</figcaption>" if caption else "") + "</figure>"
+    """A picture in HTML, with a caption."""
+    return f"<figure>{content}" + (element("figcaption", caption) if caption else "") + "</figure>"
 
 
 def video(path: Path) -> str:
-    """Returns a film, a file of one of VIDEOS, as an element that holds it."""
+    """An element that holds a video, a file of one of VIDEOS."""
     kind = VIDEOS[path.suffix.lower()]
     source = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
     if kind.startswith("image"):

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_dher import lookup
-from mjx_dher.config import HParams
+from mjx_dher.components import reads
+from mjx_dher.config import Config, HParams
 from mjx_dher.spec import RunSpec, custom_components
 
 MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
@@ -35,6 +36,21 @@ def settings(spec: RunSpec) -> dict[str, Any]:
         **dataclasses.asdict(spec.config),
         **spec.hparams._asdict(),
     }
+
+
+def groups(spec: RunSpec) -> dict[str, dict[str, Any]]:
+    """The settings that a run reads, and its seed, in the groups run, sizes and numbers."""
+    values = {**settings(spec), "seed": spec.seed}
+    sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
+    names = {"run": [name for name in values if name not in (*sizes, *numbers)], "sizes": sizes, "numbers": numbers}
+    return {group: {name: values[name] for name in own if reads(values, name)} for group, own in names.items()}
+
+
+def text(value: Any) -> str:
+    """A setting's value as it is written on a command line."""
+    if isinstance(value, (tuple, list)):
+        return " ".join(map(str, value)) or "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def sources(spec: RunSpec) -> dict[str, str]:
