@@ -182,7 +182,7 @@ def load(field: str, value: Any, *parameters: str) -> Any:
     """
     if isinstance(value, str):
         table = COMPONENTS[field]
-        check_name(field, value, table, own=True)
+        check_name(field, value, table, custom=True)
         value = load_import_path(field, table[value].path if value in table else value)
     return check_function(field, value, parameters) if parameters else value
 

@@ -44,7 +44,7 @@ def _run(name: str, argv: list[str]) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
-        return run(name, argv, Console(highlight=False, markup=False, emoji=False))
+        return run(name, argv, Console(highlight=False, markup=False, emoji=False, soft_wrap=True))
     except KeyboardInterrupt:  # outside of training, which ends in order
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT

@@ -41,5 +41,5 @@ def check_command(argv: list[str], console: Console) -> int:
     from mjx_dher.testing import check_parts
 
     for line in check_parts(make_env(run), run):
-        console.print(line, soft_wrap=True)
+        console.print(line)
     return 0

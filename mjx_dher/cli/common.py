@@ -38,8 +38,7 @@ def warn_of_tau(polyak: float, console: Console) -> None:
     """Prints what a small polyak means, which is more likely meant as the tau of other libraries."""
     if polyak < LEAST_LIKELY_POLYAK:
         console.print(
-            f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries",
-            soft_wrap=True,
+            f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries"
         )
 
 
@@ -89,7 +88,7 @@ def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
             for line in check_parts(env, dataclasses.replace(spec, seed=0)):
                 if line not in tried:
                     tried.add(line)
-                    console.print(line, soft_wrap=True)
+                    console.print(line)
 
 
 def find_run(run: Path, console: Console) -> Path:
@@ -100,9 +99,9 @@ def find_run(run: Path, console: Console) -> Path:
     """
     path = bundled.find(run)
     if bundled.is_shipped(path):
-        console.print(f"{run}: the policy of the package; its card is {path / bundled.CARD}", soft_wrap=True)
+        console.print(f"{run}: the policy of the package; its card is {path / bundled.CARD}")
     elif str(run) in bundled.names():
-        console.print(f"{run}: the run in the current folder, not the policy of the package by that name", soft_wrap=True)
+        console.print(f"{run}: the run in the current folder, not the policy of the package by that name")
     return path
 
 
@@ -114,7 +113,7 @@ def read_run(path: Path, console: Console) -> RunSpec:
     """
     content, spec = run_folder.read_run(path)
     for text in run_folder.changed_code(content, spec):
-        console.print(f"since {path} was trained: {text}", soft_wrap=True)
+        console.print(f"since {path} was trained: {text}")
     return spec
 
 
@@ -123,8 +122,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
     console.print(
         f"success {summary['success_rate']:.3f} (95 % interval {summary['success_low']:.3f} to {summary['success_high']:.3f},"
         f" {summary['episodes']} episodes); already at reset {summary['reset_success_rate']:.3f};"
-        f" mean return {summary['return_mean']:.2f}",
-        soft_wrap=True,
+        f" mean return {summary['return_mean']:.2f}"
     )
 
 
@@ -135,14 +133,12 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
         table.add_row(*row)
     width = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
     if not console.is_terminal:
-        Console(file=console.file, width=width, highlight=False, markup=False, emoji=False).print(
-            table
-        )  # `print` allows no wider one
+        Console(file=console.file, width=width, highlight=False, markup=False, emoji=False).print(table)
     elif width <= console.width:
-        console.print(table)
+        console.print(table, soft_wrap=False)
     else:
         for row in rows:
-            console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n", soft_wrap=True)
+            console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n")
 
 
 def compare(
@@ -157,7 +153,7 @@ def compare(
     for env, groups in by_env.items():
         if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
             labels = "; ".join(group.label for group in groups)
-            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}", soft_wrap=True)
+            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}")
     return rows
 
 
@@ -207,7 +203,7 @@ class Screen:
             curve = sparkline(self._success, progress.num_epochs, ascii_only=self._console.options.ascii_only)
             self._bar.update(self._task, completed=self._done, description=line, curve=curve)
         elif self._single or last or time.monotonic() - self._printed > SECONDS_PER_LINE:
-            self._console.print(line, soft_wrap=True, highlight=False)
+            self._console.print(line, highlight=False)
             self._printed = time.monotonic()
 
     def _line_of_one(self, progress: Any, eta: str) -> str:

@@ -37,5 +37,5 @@ def doctor_command(argv: list[str], console: Console) -> int:
         print(json.dumps(report, indent=2))
     else:
         for line in doctor.lines(report):
-            console.print(line, soft_wrap=True)
+            console.print(line)
     return 0 if any(map(doctor.works, report["engines"].values())) else 1

@@ -53,7 +53,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
-    remarks = Console(stderr=True, highlight=False, markup=False, emoji=False) if args.json else console
+    remarks = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True) if args.json else console
     folders = [find_run(run, remarks) for run in args.runs]
     runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:

@@ -50,7 +50,6 @@ def export_command(argv: list[str], console: Console) -> int:
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(
         f"{run.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"
-        f" the same actions for {export.CHECKED:,} observations (largest difference {difference:.1g}); wrote {out}",
-        soft_wrap=True,
+        f" the same actions for {export.CHECKED:,} observations (largest difference {difference:.1g}); wrote {out}"
     )
     return 0

@@ -81,5 +81,5 @@ def list_command(argv: list[str], console: Console) -> int:
     for kind, (option, lines) in chosen.items():
         console.print(f"{kind} ({option})")
         for name, line in lines.items():
-            console.print(f"  {name:{width}}  {line}", soft_wrap=True)
+            console.print(f"  {name:{width}}  {line}")
     return 0

@@ -55,7 +55,7 @@ def plot_command(argv: list[str], console: Console) -> int:
     for ending in args.formats:  # drawn anew: a figure that was written before has another layout
         path = out / f"{name}.{ending}"
         figures.write(curves.draw_together(runs) if together else curves.draw_curve(runs[0]), path)
-        console.print(f"wrote {path}", soft_wrap=True)
+        console.print(f"wrote {path}")
     return 0
 
 
@@ -70,5 +70,5 @@ def _plot_sweep(args: PlotArgs, console: Console) -> int:
     for env, groups in by_env.items():
         own = [row for row in rows if row.env == env]
         for path in plotting.write(out, groups, own, args.threshold, args.formats):
-            console.print(f"wrote {path}", soft_wrap=True)
+            console.print(f"wrote {path}")
     return 0

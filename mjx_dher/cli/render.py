@@ -61,7 +61,7 @@ def render_command(argv: list[str], console: Console) -> int:
         folder = find_run(args.run, console)
         played, policy = read_run(folder, console), load_policy(folder)
     elif args.env is not None and args.run is None:
-        check_name("env", args.env, envs.list_envs(), own=True)
+        check_name("env", args.env, envs.list_envs(), custom=True)
         played, policy = RunSpec(env=args.env), None
     else:
         raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")

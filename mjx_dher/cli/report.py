@@ -51,7 +51,7 @@ def report_command(argv: list[str], console: Console) -> int:
     from mjx_dher.sweeps import report
 
     def tell(text: str) -> None:
-        console.print(text, soft_wrap=True)
+        console.print(text)
 
     if args.video:
         for run, out in _to_film(args.folder, sweep):

@@ -110,7 +110,7 @@ class ResumeArgs:
 
 def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
-    args = parse_train_args(argv, lambda text: console.print(text, soft_wrap=True))
+    args = parse_train_args(argv, console.print)
     if args.dry_run:
         return _dry_run(args, console)
     port = address.check(Page().host, args.view_port) if args.view else None
@@ -137,10 +137,10 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     env = make_env(args.spec)
     memory = settings.memory_lines(env, [args.spec])
     for title, values in fingerprint.groups(args.spec).items():
-        console.print(f"{title}: {'; '.join(f'{name} {fingerprint.text(x)}' for name, x in values.items())}", soft_wrap=True)
+        console.print(f"{title}: {'; '.join(f'{name} {fingerprint.text(x)}' for name, x in values.items())}")
     amount = settings.amount(args.spec.config, env.episode_length)
     for line in (amount, *memory, "one program to train, one for the last evaluation; nothing was written"):
-        console.print(line, soft_wrap=True)
+        console.print(line)
     return 0
 
 
@@ -191,11 +191,10 @@ def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> t
     if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
         console.print(
             f"step sizes fall to {run.hparams.lr_end:g} of their start over the whole run, whose length has changed: they go on"
-            " from what they would be at this point of a run of the new length",
-            soft_wrap=True,
+            " from what they would be at this point of a run of the new length"
         )
     told = "; ".join(f"{name} {getattr(options, name)}" for name in fields if name != "log")
-    console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}", soft_wrap=True)
+    console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}")
     return run, dataclasses.replace(options, log=tuple(options.log))
 
 
@@ -278,7 +277,7 @@ def _train(
     from mjx_dher.runs import driver
     from mjx_dher.runs.folder.locks import last_checkpoint
 
-    console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}", soft_wrap=True)
+    console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}")
     before = [row["success_rate"] for row in loggers.read_rows(folder / run_folder.METRICS_FILE)]
     stop, screen = Stop(console, folder), Screen(console, [run], before)
     curve = curve and processes.leads()
@@ -299,7 +298,7 @@ def _train(
                 options=options,
                 devices=devices,
                 should_stop=lambda: stop.asked is not None,
-                report=lambda text: console.print(text, soft_wrap=True),
+                report=console.print,
                 on_epoch=on_epoch,
             )
     finally:
@@ -307,15 +306,14 @@ def _train(
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
-            f" `{lookup.command_name()} resume {folder}` goes on",
-            soft_wrap=True,
+            f" `{lookup.command_name()} resume {folder}` goes on"
         )
         return 128 + (stop.asked or 0)
     if result.status == run_folder.FAILED:
         _draw(folder, curve, console)
         raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")
     print_summary(result.content, console)
-    console.print(f"run folder: {folder}", soft_wrap=True)
+    console.print(f"run folder: {folder}")
     _draw(folder, curve, console)
     return 0
 
@@ -327,6 +325,6 @@ def _draw(folder: Path, curve: bool, console: Console) -> None:
     picture = folder / f"{curves.CURVE}.png"
     try:
         figures.write(curves.draw_curve(curves.read_curve(folder)), picture)
-        console.print(f"learning curve: {picture}", soft_wrap=True)
+        console.print(f"learning curve: {picture}")
     except Exception as error:  # the run itself has ended as it should
-        console.print(f"the learning curve could not be drawn ({type(error).__name__}: {error})", soft_wrap=True)
+        console.print(f"the learning curve could not be drawn ({type(error).__name__}: {error})")

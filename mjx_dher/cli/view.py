@@ -86,7 +86,7 @@ def _view(args: ViewArgs, console: Console) -> int:
     if not args.runs and args.env is None:
         raise ValueError(f"view takes run folders, policies of the package ({', '.join(bundled.names())}), or --env")
     if args.env is not None:
-        check_name("env", args.env, envs.list_envs(), own=True)
+        check_name("env", args.env, envs.list_envs(), custom=True)
     check_engine(args.engine)
     check_episodes(1, args.seed)
     to_arguments(args.env_kwargs)
@@ -109,11 +109,11 @@ def _view(args: ViewArgs, console: Console) -> int:
             server.Viewer([*given, *others], _maker(args.engine), args.page.host, port, args.seed) as viewer,
             _until_ctrl_c() as stopped,
         ):
-            console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)", soft_wrap=True)
+            console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)")
             if args.page.host not in address.LOOPBACK:
-                console.print(f"whoever can reach {args.page.host} can see it, and move things", soft_wrap=True)
+                console.print(f"whoever can reach {args.page.host} can see it, and move things")
             if args.page.open and not address.open_browser(viewer.address):
-                console.print("there is no browser here that could be opened: open that address in one", soft_wrap=True)
+                console.print("there is no browser here that could be opened: open that address in one")
             sys.stdout.flush()
             viewer.run(lambda: stopped.is_set() or (PARENT in os.environ and os.environ[PARENT] != str(os.getppid())))
         interrupted = stopped.is_set()
@@ -173,12 +173,10 @@ class Beside:
             command = (sys.executable, "-c", code, "view", str(self._folder), "--port", str(self._port))
             variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
             self._process = self._stack.enter_context(subprocesses.started(command, variables))
-            self._console.print(
-                f"the run is to be seen at {address.address(Page().host, self._port)} in a moment", soft_wrap=True
-            )
+            self._console.print(f"the run is to be seen at {address.address(Page().host, self._port)} in a moment")
         elif self._process.poll() is not None:
             failure = subprocesses.answer(self._process).failure or "it was closed"
-            self._console.print(f"the viewer has ended ({failure}); the run goes on", soft_wrap=True)
+            self._console.print(f"the viewer has ended ({failure}); the run goes on")
             self._port = None
 
 
