@@ -69,7 +69,7 @@ class Timed:
         self.shape = (self.at_once // self.delay, self.delay, batch_size)
         self.learner, self.sampler, self.ring = learner, sampler, full_ring()
         self.hparams = jax.tree.map(jnp.float32, HParams(priority_fraction=0.5))
-        self.cumulative = replay.cumulative_priority(self.ring)
+        self.cumulative = replay.cumulative(self.ring)
         self.keys = jax.random.split(jax.random.key(2), seeds)
         self.states = jax.vmap(learner.init)(self.keys)
         self.each = self.at_once * self.draws * seeds

@@ -14,6 +14,7 @@ import resource
 import apart
 
 from mjx_dher import presets
+from mjx_dher.rollout import env_spec
 
 
 def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
@@ -31,7 +32,7 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
     )
     environment = envs.make(env, engine=engine)
     program = trainer.make_train(environment, config)
-    learner = learners.make(spec.learner, config, trainer.env_sizes(environment), spec.networks)
+    learner = learners.make(spec.learner, config, env_spec(environment), spec.networks)
     run = train(environment, config, spec.hparams, sampler=samplers.make("weighted"), learner=learner)
     next(run)
     run.close()

@@ -22,7 +22,8 @@ import jax
 from timing import print_table
 
 from mjx_dher import envs, learners, presets, samplers
-from mjx_dher.trainer import env_sizes, make_train
+from mjx_dher.rollout import env_spec
+from mjx_dher.trainer import make_train
 
 
 def device_events(folder: Path):
@@ -59,7 +60,7 @@ def main() -> None:
     spec = presets.preset(args.preset, args.env)
     config = dataclasses.replace(spec.config, cycles_per_epoch=1, updates_per_cycle=200)
     env = envs.make(args.env)
-    learner = learners.make(spec.learner, config, env_sizes(env), spec.networks)
+    learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
     program = make_train(env, config, sampler=samplers.make("weighted"), learner=learner)
     state = jax.jit(program.init)(jax.random.key(0), spec.hparams)
     epoch = jax.jit(program.epoch, donate_argnums=0)

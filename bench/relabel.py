@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--flashbax", action="store_true")
     args = parser.parse_args()
     hparams, ring = HParams(), full_ring()
-    cumulative = replay.cumulative_priority(ring)
+    cumulative = replay.cumulative(ring)
     shape = (max(1, MAX_TRANSITIONS_PER_DRAW // args.batch_size), args.batch_size)
     num_drawn = shape[0] * shape[1]
     rates = {}

@@ -15,14 +15,13 @@ import jax
 from timing import median_seconds, print_table
 
 from mjx_dher import Config, HParams, envs, learners
-from mjx_dher.rollout import rollout
-from mjx_dher.trainer import env_sizes
+from mjx_dher.rollout import env_spec, rollout
 
 
 def measure(task: str, engine: str, num_envs: int, repeats: int = 5) -> tuple[float, float]:
     """Environment steps a second, and seconds of the first call, which compiles."""
     hparams, env = HParams(), envs.make(task, engine=engine)
-    learner = learners.make("ddpg", Config(), env_sizes(env))
+    learner = learners.make("ddpg", Config(), env_spec(env))
     state = learner.init(jax.random.key(0))
 
     @jax.jit

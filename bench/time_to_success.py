@@ -18,8 +18,9 @@ from pathlib import Path
 import jax
 from timing import print_table
 
-from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats, trainer
+from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats
 from mjx_dher.evaluate import play_policy
+from mjx_dher.rollout import env_spec
 from mjx_dher.runs.program.loop import train
 from mjx_dher.system.caches import keep_compiled_programs
 
@@ -43,7 +44,7 @@ def main() -> None:
         else:
             config = dataclasses.replace(config, **{name: int(value)})
     env = envs.make(args.env, engine=args.engine)
-    learner = learners.make(spec.learner, config, trainer.env_sizes(env), spec.networks)
+    learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
     parts = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority), "learner": learner}
     keep_compiled_programs()
     rows, curve, compiled = [], [], []

@@ -13,7 +13,6 @@ __version__ = "0.2.0"
 if TYPE_CHECKING:  # for type checkers; `_HOME` says the same when the program runs
     from mjx_dher import config as config
     from mjx_dher import envs as envs
-    from mjx_dher import generators as generators
     from mjx_dher import learners as learners
     from mjx_dher import normalizer as normalizer
     from mjx_dher import presets as presets
@@ -38,7 +37,7 @@ if TYPE_CHECKING:  # for type checkers; `_HOME` says the same when the program r
     from mjx_dher.trainer import TrainState as TrainState
     from mjx_dher.trainer import make_train as make_train
 
-_MODULES = "config envs generators learners normalizer presets priorities relabel replay rollout samplers stats testing trainer"
+_MODULES = "config envs learners normalizer presets priorities relabel replay rollout samplers stats testing trainer"
 _HOME = {
     **{name: name for name in _MODULES.split()},
     "Config": "config:Config",

@@ -29,7 +29,8 @@ def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floatin
         result = jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(f"{expected}; got {describe(value)}") from None
-    if result.shape != tuple(shape) or not jnp.issubdtype(result.dtype, kind):
+    fits = jnp.issubdtype(result.dtype, kind) or (kind is jnp.number and result.dtype == bool)
+    if result.shape != tuple(shape) or not fits:
         raise ValueError(f"{expected}; got {describe(result)}")
     return result
 

@@ -57,9 +57,9 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         ),
     },
     "weight_kernel": {
-        "linear": Component("mjx_dher.samplers:linear", "weights that fall linearly with the relative distance"),
-        "inverse": Component("mjx_dher.samplers:inverse", "weights that fall as a power of the relative distance"),
-        "softmax": Component("mjx_dher.samplers:softmax", "weights that fall exponentially with the relative distance"),
+        "linear": Component("mjx_dher.distance_normalization:linear", "weights fall linearly with distance"),
+        "inverse": Component("mjx_dher.distance_normalization:inverse", "weights fall as a power of distance"),
+        "softmax": Component("mjx_dher.distance_normalization:softmax", "weights fall exponentially with distance"),
     },
     "weight_normalization": {
         "mean": Component("mjx_dher.distance_normalization:by_mean", "distances relative to their mean"),
@@ -93,9 +93,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             (),
             "episodes",
         ),
-        "energy": Component(
-            "mjx_dher.contrib.episodes:energy", "episodes by the energy given to the object (EBP)", (), "episodes"
-        ),
+        "energy": Component("mjx_dher.priorities:energy", "episodes by the energy given to the object (EBP)", (), "episodes"),
         "max_entropy": Component(
             "mjx_dher.contrib.episodes:max_entropy",
             "episodes by how rare their achieved goals are in the ring (MEP)",
@@ -112,7 +110,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             "transitions",
         ),
         "td_error": Component(
-            "mjx_dher.contrib.transitions:td_error",
+            "mjx_dher.priorities:td_error",
             "episodes, and transitions with hindsight goals, by their errors of one step (HGR)",
             (),
             "transitions",
@@ -131,7 +129,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         ),
     },
     "generator": {
-        "reset": Component("mjx_dher.generators:reset", "the goals that the resets drew"),
+        "reset": Component("mjx_dher.contrib.generators:reset", "the goals that the resets drew"),
         "hgg": Component(
             "mjx_dher.contrib.goals:hgg", "goals achieved before, on the way to those of the resets (Hindsight Goal Generation)"
         ),

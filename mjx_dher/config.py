@@ -114,8 +114,8 @@ class HParams(NamedTuple):
     """Standard deviation of the Gaussian noise on the other actions; a learner that draws its actions needs none."""
     random_noise: Share = 0.0
     """Noise on the random actions, too, as a fraction of noise_std; actions are clipped to [-1, 1] after it."""
-    her_k: NotNegative = 4.0
-    """Hindsight goals per original one: k/(k+1) of each batch is relabelled."""
+    her_k: Annotated[float, Number("[0, inf]")] = 4.0
+    """Hindsight goals per original one: k/(k+1) of each batch is relabelled; inf: all of it."""
     priority_fraction: Share = 0.0
     """Fraction of each batch drawn from episodes in proportion to their priority; the rest is uniform."""
     epsilon: Share = 0.2
@@ -218,6 +218,12 @@ def check_all(*calls: tuple[Any, ...]) -> None:
             messages.append(str(error))
     if messages:
         raise ValueError("\n".join(messages))
+
+
+def of_one_device(config: Config, devices: int) -> Config:
+    """Sizes of one of the devices that share a run; `check_parts` says whether they can be divided."""
+    divided = ("num_envs", "batch_size", "replay_size", "total_steps", "eval_episodes")
+    return dataclasses.replace(config, **{name: math.ceil(getattr(config, name) / devices) for name in divided})
 
 
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:

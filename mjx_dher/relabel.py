@@ -1,202 +1,224 @@
-"""Hindsight: transitions whose goal is replaced by an achieved one, with the reward computed anew."""
+"""Hindsight: transitions whose goal is replaced by an achieved one, with the reward recomputed."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import priorities, replay, samplers
+from mjx_dher import check, priorities, replay, samplers
 from mjx_dher.config import HParams
-from mjx_dher.context import View
+from mjx_dher.context import Context
 from mjx_dher.priorities import Priority
-from mjx_dher.replay import ReplayState, Sample
+from mjx_dher.replay import Cumulative, Pool, ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.types import Array, Batch, PRNGKey, RewardFn
+from mjx_dher.types import Array, Batch, PRNGKey
 
-CHOOSE = 0x43686F69  # folded into a draw's key, for what chooses among transitions; no index of `jax.random.split`
+CHOOSE = 0x43686F69  # folded into a draw's key, for a choice among transitions; no index of `jax.random.split`
 
 
-def hindsight_goals(
-    state: ReplayState,
-    sample: Sample,
-    sampler: Sampler | LogWeightsFn,
-    hparams: HParams,
-    key: PRNGKey,
-    scores: Array | None = None,
-) -> Array:
-    """Chooses one achieved goal for each transition of `sample` by `sampler`; returns them as [B, G].
+class Hindsight(NamedTuple):
+    """Hindsight goals, one for each transition."""
 
-    A transition for which the sampler offers no goal (no weight is positive, or one is NaN or infinite) keeps its own.
-    `scores` are those of the ring's episodes [E, T+1], for a sampler that wants them (`scores.of_episodes`).
+    goals: Array  # [B, G]
+    offered: Array  # [B] whether the sampler offered a goal, bool; without one, `goals` has the transition's own
+
+
+def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey) -> Hindsight:
+    """Chooses an achieved goal for each transition of `sample` by `sampler`.
+
+    Args:
+      sample: transitions. For a sampler that takes goals of other episodes `sample.pool` must be there, for one with a score
+        `sample.score` (`add_choices` adds both).
+      sampler: a `Sampler`, or a function like `Sampler.log_weights`.
+      hparams: numbers that the sampler reads.
+      key: random key.
 
     Raises:
-      ValueError: its log weights are not one floating-point number for each goal of an episode.
+      ValueError: log weights that are no floats [T+1], or a sample without what the sampler needs.
     """
-    return _choose(state, sample, sampler, hparams, key, scores)[0]
-
-
-def _choose(
-    state: ReplayState,
-    sample: Sample,
-    sampler: Sampler | LogWeightsFn,
-    hparams: HParams,
-    key: PRNGKey,
-    scores: Array | None,
-) -> tuple[Array, Array]:
-    """Returns the goals [B, G] of `hindsight_goals`, and whether the sampler offered one [B]."""
     sampler = samplers.make(sampler)
-    pool_key, draw_key = jax.random.split(key)
     batch_size = sample.step.shape[0]
-    pool = sample.episode_goals
+    goals, length = sample.episode_goals, sample.length
     if sampler.cross_episode:
-        other = replay.sample_episode_goals(state, pool_key, batch_size)
-        pool = jnp.where(sampler.cross_episode(hparams), other, pool) if callable(sampler.cross_episode) else other
+        if sample.pool is None:
+            raise ValueError("pool is missing: this sampler takes goals of other episodes (relabel.add_choices)")
+        goals, length = _from_pool(sampler, sample, hparams)
     weigh = functools.partial(samplers.weigh, sampler)
-    score = None if scores is None else scores[sample.row]
-    axes = (0, 0, 0, None, None if score is None else 0)
-    log_weights = jax.vmap(weigh, in_axes=axes)(pool, sample.desired_goal, sample.step, hparams, score)
-    index = samplers.draw(draw_key, log_weights)
-    offered = index < pool.shape[1]
-    return jnp.where(offered[:, None], pool[jnp.arange(batch_size), index], sample.desired_goal), offered
+    axes = (0, 0, 0, None, None if sample.score is None else 0, 0 if sample.ends else None)
+    last = length if sample.ends else None
+    log_weights = jax.vmap(weigh, in_axes=axes)(goals, sample.desired_goal, sample.step, hparams, sample.score, last)
+    index = samplers.draw(key, log_weights)
+    offered = index < goals.shape[1]
+    chosen = goals[jnp.arange(batch_size), index]
+    return Hindsight(jnp.where(offered[:, None], chosen, sample.desired_goal), offered)
 
 
-def draw_batches(
-    state: ReplayState,
-    key: PRNGKey,
-    shape: tuple[int, ...],
-    sampler: Sampler | LogWeightsFn,
-    compute_reward: RewardFn,
-    hparams: HParams,
-    cumulative: Array,
-    n_step: int = 1,
-    scores: Array | None = None,
-    priority: Priority | None = None,
-    view: View | None = None,
-) -> Batch:
-    """Draws and relabels transitions as the learner takes them, all at once; leaves lead with `shape`.
+def _from_pool(sampler: Sampler, sample: Sample, hparams: HParams) -> Pool:
+    """Goals and lengths of other episodes, or of the transition's own if a traced `cross_episode` says so."""
+    pool = sample.pool
+    assert pool is not None
+    if not callable(sampler.cross_episode):
+        return pool
+    own, crosses = Pool(sample.episode_goals, sample.length), sampler.cross_episode(hparams)
+    return jax.tree.map(lambda other, own: jnp.where(crosses, other, own), pool, own)
 
-    A fraction `hparams.priority_fraction` of them is from episodes drawn by priority; `cumulative` is
-    `replay.cumulative_priority(state)`. The ring must not be empty. `n_step` is what `look_ahead` takes, `scores` what
-    `hindsight_goals` does. Where `priority` chooses among transitions, more are drawn and it looks at `view`, too.
+
+def _keys(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey]:
+    """Keys for which transitions to relabel, for goals of other episodes, and for the choice among goals."""
+    coin_key, goal_key = jax.random.split(key)
+    pool_key, draw_key = jax.random.split(goal_key)
+    return coin_key, pool_key, draw_key
+
+
+def add_choices(ring: ReplayState, sample: Sample, sampler: Sampler, scores: Array | None, key: PRNGKey) -> Sample:
+    """Adds to `sample` what `sampler` needs beside its episode's goals: goals of other episodes of `ring`, and scores.
+
+    `scores` are those of the ring's episodes [E, T+1] (`samplers.score_episodes`), or None. `key` is the key for `relabel`.
     """
-    number = math.prod(shape)
-
-    def draw(count: int) -> tuple[Sample, Batch]:
-        row_key, sample_key, relabel_key = jax.random.split(key, 3)
-        rows = replay.draw_rows(state, row_key, count, hparams.priority_fraction, cumulative)
-        sample = replay.sample(state, sample_key, count, rows)
-        return sample, relabel(state, sample, sampler, compute_reward, hparams, relabel_key, scores)
-
-    if priority is None or priority.choose is None:
-        sample, batch = draw(number)
-    else:
-        view = View(compute_reward, hparams) if view is None else view
-        candidates = draw(priorities.CANDIDATES * number)
-        sample, batch = priorities.chosen(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, view)
-    if n_step > 1:
-        batch = look_ahead(state, sample, batch, compute_reward, hparams.gamma, n_step)
-    factor = hindsight_factor(sample, batch, hparams)
-    batch = dataclasses.replace(batch, reward=batch.reward.astype(factor.dtype) * factor)
-    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
+    if sampler.cross_episode:
+        sample = dataclasses.replace(sample, pool=replay.sample_pool(ring, _keys(key)[1], sample.step.shape[0]))
+    return sample if scores is None else dataclasses.replace(sample, score=scores[sample.row])
 
 
-def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
-    """Returns by what each reward [B] is multiplied: `hindsight_reward` where the goal was replaced by another, else 1.
+class Relabelled(NamedTuple):
+    """A relabelled batch, and the share of its transitions that should have got a goal and were offered none."""
 
-    Lanka & Wu 2018 (ARCHER): hindsight rewards are numerically greater than real ones. Rewards here are 0 or negative, so a
-    factor below 1 makes them so; all returns stay in [-1/(1-gamma), 0].
-    """
-    replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
-    dtype = jnp.promote_types(batch.reward.dtype, jnp.float32)  # rewards may be whole numbers, the factor is none
-    return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, dtype), jnp.ones(replaced.shape, dtype))
+    batch: Batch
+    no_goal_share: Array  # []
 
 
-def look_ahead(
-    state: ReplayState, sample: Sample, batch: Batch, compute_reward: RewardFn, gamma: Array | float, n_step: int
-) -> Batch:
-    """Returns the batch that `relabel` made of `sample`, with returns of up to `n_step` steps of its episodes.
+def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, key: PRNGKey) -> Relabelled:
+    """Relabels each transition with probability k/(k+1), k = `hparams.her_k`; k may be infinite.
 
-    A return ends where the episode does, and where the goal is reached (a reward of 0, the most there is): what the episode
-    did after that, it did for another goal. Up to there, actions are those of the policies that played (Hessel et al. 2018,
-    whose multi-step returns are not corrected for that either).
-    """
-    last = sample.episode_goals.shape[1] - 1
-    ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]
-    achieved = sample.episode_goals[jnp.arange(sample.step.shape[0]), jnp.minimum(ahead, last)]
-    rewards = jax.vmap(compute_reward, in_axes=(0, None))(achieved, batch.desired_goal)
-    rewards = rewards.astype(jnp.promote_types(rewards.dtype, jnp.float32))
-    going_on = jnp.cumprod((rewards < 0) & (ahead < last), axis=0)  # after the i-th step
-    counted = jnp.concatenate([jnp.ones_like(going_on[:1]), going_on[:-1]])
-    num_steps = jnp.sum(counted, axis=0)
-    powers = jnp.asarray(gamma, rewards.dtype) ** jnp.arange(n_step, dtype=rewards.dtype)[:, None]
-    return dataclasses.replace(
-        batch,
-        next_observation=jax.tree.map(lambda x: x[sample.row, sample.step + num_steps], state.episodes.observation),
-        reward=jnp.sum(powers * counted * rewards, axis=0),
-        discount=jnp.asarray(gamma, rewards.dtype) ** num_steps,
-    )
+    The reward is that of the goal achieved at the transition's end, `compute_reward(achieved at step+1, goal)`. The discount is
+    gamma, or 0 where no future follows: after a failure, and after the goal is reached if that ends the episode.
 
-
-def relabel(
-    state: ReplayState,
-    sample: Sample,
-    sampler: Sampler | LogWeightsFn,
-    compute_reward: RewardFn,
-    hparams: HParams,
-    key: PRNGKey,
-    scores: Array | None = None,
-) -> Batch:
-    """Returns `sample` as a batch in which each transition was relabelled with probability k/(k+1), k = `hparams.her_k`.
-
-    The reward is that of the goal achieved at the transition's end: `compute_reward(achieved at step+1, goal)`. Of `hparams`
-    it reads her_k, and whatever the sampler reads; `draw_batches` reads priority_fraction and hindsight_reward, too. `scores`
-    is what `hindsight_goals` takes.
+    Args:
+      sample: transitions, with what `hindsight_goals` needs.
+      sampler: a `Sampler`, or a function like `Sampler.log_weights`.
+      context: rewards, and numbers: her_k, gamma and whatever the sampler reads. `Context(compute_reward, HParams())` will do.
+      key: random key.
 
     Raises:
-      ValueError: the sampler's log weights are not [T+1], or the rewards not [B].
+      ValueError: log weights that are not [T+1], or rewards that are not [B].
     """
-    return relabel_counted(state, sample, sampler, compute_reward, hparams, key, scores)[0]
-
-
-def relabel_counted(
-    state: ReplayState,
-    sample: Sample,
-    sampler: Sampler | LogWeightsFn,
-    compute_reward: RewardFn,
-    hparams: HParams,
-    key: PRNGKey,
-    scores: Array | None = None,
-) -> tuple[Batch, Array]:
-    """Returns the batch that `relabel` returns, and the share [] of transitions to be relabelled that were offered no goal."""
-    coin_key, goal_key = jax.random.split(key)
+    hparams = context.hparams
+    coin_key, _, goal_key = _keys(key)
     batch_size = sample.step.shape[0]
-    relabelled = jax.random.uniform(coin_key, (batch_size,)) < hparams.her_k / (hparams.her_k + 1.0)
-    goals, offered = _choose(state, sample, sampler, hparams, goal_key, scores)
-    desired_goal = jnp.where(relabelled[:, None], goals, sample.desired_goal)
+    k = jnp.asarray(hparams.her_k, jnp.float32)
+    share = jnp.where(jnp.isinf(k), 1.0, k / (k + 1.0))
+    relabelled = jax.random.uniform(coin_key, (batch_size,)) < share
+    hindsight = hindsight_goals(sample, sampler, hparams, goal_key)
+    desired_goal = jnp.where(relabelled[:, None], hindsight.goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
-    reward = compute_reward(achieved_goal, desired_goal)
-    _check_rewards(reward, desired_goal)
+    reward = context.compute_reward(achieved_goal, desired_goal)
     batch = Batch(
         observation=sample.observation,
         next_observation=sample.next_observation,
         desired_goal=desired_goal,
         action=sample.action,
-        reward=reward,
+        reward=check.array("compute_reward: rewards [B]", reward, (batch_size,), jnp.number),
+        discount=jnp.where(_is_terminal(sample, achieved_goal, desired_goal, context), 0.0, _gamma(context)),
+        row=sample.row,
     )
-    missed = jnp.sum(relabelled & ~offered, dtype=jnp.float32)
-    return batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0)
+    missed = jnp.sum(relabelled & ~hindsight.offered, dtype=jnp.float32)
+    return Relabelled(batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0))
 
 
-def _check_rewards(reward: Any, goal: Array) -> None:
-    """Raises ValueError unless rewards of goals [B, G] are [B]."""
-    if getattr(reward, "shape", None) != goal.shape[:1]:
-        given = list(reward.shape) if hasattr(reward, "shape") else f"a {type(reward).__name__}"
-        raise ValueError(
-            f"compute_reward gives rewards [B] = {list(goal.shape[:1])} of goals [B, G] = {list(goal.shape)}; this one gives"
-            f" {given}"
-        )
+def _gamma(context: Context) -> Array:
+    return jnp.asarray(context.hparams.gamma, jnp.float32)
+
+
+def _is_terminal(sample: Sample, achieved: Array, desired: Array, context: Context) -> Array:
+    """Whether no future follows transitions [B] that end with `achieved` [B, G], bool [B]."""
+    return sample.terminal | context.reached(achieved, desired) if context.ends_at_goal else sample.terminal
+
+
+def draw_batches(
+    ring: ReplayState,
+    key: PRNGKey,
+    shape: tuple[int, ...],
+    sampler: Sampler | LogWeightsFn,
+    context: Context,
+    weights: Cumulative,
+    n_step: int = 1,
+    scores: Array | None = None,
+    priority: Priority | None = None,
+) -> Batch:
+    """Draws and relabels transitions as the learner takes them, all at once.
+
+    Args:
+      ring: the replay ring, which must not be empty.
+      key: random key.
+      shape: leading axes of the batch's leaves.
+      sampler: a `Sampler`, or a function like `Sampler.log_weights`.
+      context: a fraction `hparams.priority_fraction` of the transitions is from episodes drawn by priority.
+      weights: `replay.cumulative(ring)`.
+      n_step: steps of a return (`look_ahead`).
+      scores: [E, T+1] `samplers.score_episodes` of the ring's episodes, for a sampler with a score.
+      priority: if it chooses among transitions, several candidates are drawn for each.
+    """
+    number, sampler = math.prod(shape), samplers.make(sampler)
+
+    def draw(count: int) -> tuple[Sample, Batch]:
+        row_key, sample_key, relabel_key = jax.random.split(key, 3)
+        rows = replay.draw_rows(ring, row_key, count, context.hparams.priority_fraction, weights)
+        sample = replay.sample(ring, sample_key, count, rows)
+        sample = add_choices(ring, sample, sampler, scores, relabel_key)
+        return sample, relabel(sample, sampler, context, relabel_key).batch
+
+    if priority is None or priority.choose is None:
+        sample, batch = draw(number)
+    else:
+        candidates = draw(priorities.CANDIDATES * number)
+        sample, batch = priorities.choose(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, context)
+    if n_step > 1:
+        batch = look_ahead(ring, sample, batch, context, n_step)
+    factor = hindsight_factor(sample, batch, context.hparams)
+    batch = dataclasses.replace(batch, reward=batch.reward.astype(factor.dtype) * factor)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batch)
+
+
+def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
+    """Reward factor [B]: `hindsight_reward` if the goal was replaced by another, else 1.
+
+    Lanka & Wu 2018 (ARCHER): hindsight rewards are numerically greater than real ones. Negative rewards times a factor below 1
+    are greater, and all returns stay in their bounds.
+    """
+    replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
+    dtype = jnp.promote_types(batch.reward.dtype, jnp.float32)  # rewards may be integers, the factor is none
+    return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, dtype), jnp.ones(replaced.shape, dtype))
+
+
+def look_ahead(ring: ReplayState, sample: Sample, batch: Batch, context: Context, n_step: int) -> Batch:
+    """Extends the batch that `relabel` made of `sample` to returns of up to `n_step` steps.
+
+    A return ends with the episode, and when the goal is reached: the actions after that were aimed at another goal. Until then
+    actions are those of the policies that played; as in Hessel et al. 2018, the returns are not corrected for that.
+    """
+    last = sample.length if sample.ends else sample.episode_goals.shape[1] - 1
+    ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]
+    achieved = sample.episode_goals[jnp.arange(sample.step.shape[0]), jnp.minimum(ahead, last)]
+    goals = jnp.broadcast_to(batch.desired_goal, achieved.shape)
+    rewards = context.compute_reward(achieved, goals)
+    rewards = rewards.astype(jnp.promote_types(rewards.dtype, jnp.float32))
+    reached = context.reached(achieved, goals)
+    goes_on = jnp.cumprod(~reached & (ahead < last), axis=0)  # after the i-th step
+    counted = jnp.concatenate([jnp.ones_like(goes_on[:1]), goes_on[:-1]])
+    num_steps = jnp.sum(counted, axis=0)
+    gamma = jnp.asarray(context.hparams.gamma, rewards.dtype)
+    powers = gamma ** jnp.arange(n_step, dtype=rewards.dtype)[:, None]
+    end = jnp.minimum(sample.step + num_steps, last)
+    ended_at_goal = jnp.any(reached & (counted > 0), axis=0) if context.ends_at_goal else False
+    terminal = ring.episodes.terminal[sample.row] & (end == last) if sample.ends else sample.terminal
+    return dataclasses.replace(
+        batch,
+        next_observation=jax.tree.map(lambda x: x[sample.row, end], ring.episodes.observation),
+        reward=jnp.sum(powers * counted * rewards, axis=0),
+        discount=jnp.where(terminal | ended_at_goal, 0.0, gamma**num_steps),
+    )

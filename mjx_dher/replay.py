@@ -1,17 +1,21 @@
 """A ring of whole episodes on the device.
 
-Each observation is stored once (there is no next-observation copy), and what a sampled transition may look at is its own
-episode's row, so an index cannot reach into a neighbour. All episodes of a ring have one length, T: one that
-ends early has to be filled up, with a state that it stays in. All functions are pure.
+Each observation is stored once (there is no next-observation copy), and a sampled transition looks only at its own episode's
+row, so an index cannot reach into a neighbour. An episode that ended early is padded to T steps; padded steps are never drawn.
+All functions are pure.
 """
 
 from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from mjx_dher.check import array, describe
 from mjx_dher.types import Array, Episode, PRNGKey, PyTree, check_size
 
 
@@ -23,51 +27,78 @@ class ReplayState:
     priority: Array  # [E] weight by which `draw_rows` can draw the episode, float32
     cursor: Array  # [] row that is written next, int32
     size: Array  # [] rows that hold an episode, int32
+    ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T (`EnvSpec.ends`)
 
 
 @struct.dataclass
 class Sample:
-    """Transitions drawn from the ring, each with what a goal sampler may look at."""
+    """Transitions drawn from the ring, each with everything that relabelling reads."""
 
     observation: PyTree  # [B, D]
     next_observation: PyTree  # [B, D]
     action: Array  # [B, A]
-    episode_goals: Array  # [B, T+1, G] the achieved goals of the transition's episode
+    episode_goals: Array  # [B, T+1, G] achieved goals of the transition's episode
     desired_goal: Array  # [B, G] the goal that the episode was played for
     step: Array  # [B] the transition leads from `step` to `step + 1`, int32
-    row: Array  # [B] of the ring, which holds the episode, int32
+    row: Array  # [B] ring row of the episode, int32
+    length: Array  # [B] steps of the episode, int32
+    terminal: Array  # [B] whether no future follows this transition, for any goal, bool
+    pool: Pool | None = None  # goals of other episodes, for a sampler that takes them
+    score: Array | None = None  # [B, T+1] scores of `episode_goals`, for a sampler that has them (`samplers.Sampler`)
+    ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T
 
 
-def init(episode: Episode, num_episodes: int) -> ReplayState:
-    """Makes an empty ring for `num_episodes` episodes like `episode` (arrays or `jax.ShapeDtypeStruct`s, unbatched).
+class Pool(NamedTuple):
+    """Achieved goals of one random episode for each transition."""
+
+    goals: Array  # [B, T+1, G]
+    length: Array  # [B] int32
+
+
+class Cumulative(NamedTuple):
+    """Cumulative weights [E] of the rows, int32, from which `draw_rows` draws. A loop of draws computes them once."""
+
+    priority: Array  # of priorities (times lengths, if episodes can be shorter than T)
+    length: Array | None  # of lengths; None if all are T, and rows are drawn uniformly
+
+
+def init(episode: Episode, num_episodes: int, ends: bool = False) -> ReplayState:
+    """Makes an empty ring.
+
+    Args:
+      episode: one unbatched episode whose shapes and dtypes the ring takes (arrays or `jax.ShapeDtypeStruct`s).
+      num_episodes: rows E.
+      ends: whether episodes can be shorter than T.
 
     Raises:
       ValueError: fewer than one episode, or leaves whose shapes do not agree.
     """
     check_size("num_episodes", num_episodes)
+    episode = episode.filled()
     _check_one(episode)
     return ReplayState(
         episodes=jax.tree.map(lambda x: jnp.zeros((num_episodes, *x.shape), x.dtype), episode),
         priority=jnp.zeros(num_episodes, jnp.float32),
         cursor=jnp.zeros((), jnp.int32),
         size=jnp.zeros((), jnp.int32),
+        ends=ends,
     )
 
 
 def _check_one(episode: Episode) -> None:
-    """Raises ValueError unless one, unbatched episode is arrays of the shapes that `Episode` says."""
+    """Raises ValueError unless one unbatched episode has the shapes that `Episode` documents."""
     leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(episode)}
     for name, leaf in leaves.items():
-        if not hasattr(leaf, "shape"):
-            raise ValueError(f"leaf {name} of an episode must be an array; got a {type(leaf).__name__}")
-        if 0 in leaf.shape:
-            raise ValueError(f"leaf {name} of an episode must not be empty; got shape {leaf.shape}")
+        if not hasattr(leaf, "shape") or 0 in leaf.shape:
+            raise ValueError(f"leaf {name} of an episode must be an array that is not empty; got {describe(leaf)}")
     action, achieved, desired = (np.shape(x) for x in (episode.action, episode.achieved_goal, episode.desired_goal))
     if len(action) != 2:
         raise ValueError(f"leaf .action of one episode must be [T, A]; got shape {action}")
     for name, leaf in leaves.items():
-        if not name.startswith((".action", ".desired_goal")) and leaf.shape[:1] != (action[0] + 1,):
+        if name.startswith((".observation", ".achieved_goal")) and leaf.shape[:1] != (action[0] + 1,):
             raise ValueError(f"leaf {name} must lead with T+1 = {action[0] + 1} (T actions); got shape {leaf.shape}")
+        if name in (".length", ".terminal") and leaf.shape != ():
+            raise ValueError(f"leaf {name} of one episode must be a scalar []; got shape {leaf.shape}")
     if len(desired) != 1 or achieved[1:] != desired:
         raise ValueError(
             f"leaves .achieved_goal and .desired_goal must be [T+1, G] and [G], of one size G; got shapes {achieved} and"
@@ -76,27 +107,28 @@ def _check_one(episode: Episode) -> None:
 
 
 def nbytes(episode: Episode, num_episodes: int) -> int:
-    """Returns the bytes that `init` allocates for the episodes."""
+    """Bytes that `init` allocates for the episodes."""
     return num_episodes * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(episode))
 
 
 def capacity(state: ReplayState) -> int:
-    """Returns the number of episodes that the ring holds, E."""
+    """Number of rows E."""
     return state.episodes.action.shape[0]
 
 
 def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, valid: Array | None = None) -> ReplayState:
-    """Returns the ring with `episodes` (leaves lead with [N]) written over its oldest.
+    """Writes `episodes` (leaves lead with [N]) over the ring's oldest.
 
     Args:
       state: the ring.
-      episodes: N of them.
-      priority: [N], or one for all: weight by which `draw_rows` can draw an episode; what `as_priority` takes.
-      valid: [N] which of them to write; the others leave no trace. All, where None.
+      episodes: N episodes.
+      priority: [N], or one number for all: weight by which `draw_rows` can draw an episode, as `as_priority` takes it.
+      valid: [N] which of them to write, bool. The others leave no trace. None: all.
 
     Raises:
-      ValueError: more episodes at once than the ring holds, or arrays of other shapes or types than its own.
+      ValueError: more episodes at once than the ring holds, or arrays of other shapes or dtypes than its own.
     """
+    episodes = episodes.filled()
     num_new, num_rows = _check_new(state, episodes, priority, valid), capacity(state)
     if num_new > num_rows:
         raise ValueError(f"cannot add {num_new} episodes at once to a ring of {num_rows}")
@@ -109,7 +141,8 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
     def write(ring: Array, new: Array | float) -> Array:
         return ring.at[rows].set(new, mode="drop", unique_indices=True)
 
-    return ReplayState(
+    return dataclasses.replace(
+        state,
         episodes=jax.tree.map(write, state.episodes, episodes),
         priority=write(state.priority, as_priority(priority)),
         cursor=(state.cursor + written) % num_rows,
@@ -118,17 +151,10 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
 
 
 def as_priority(weight: Array | float) -> Array:
-    """Returns weights as float32; what is not a positive, finite number is 0.
-
-    Raises:
-      ValueError: something that is no real number.
-    """
-    try:
-        weight = jnp.asarray(weight)
-    except (TypeError, ValueError):
-        raise ValueError(f"a priority must be a number; got {weight!r}") from None
+    """Converts weights to float32; anything but a positive, finite number becomes 0. Raises ValueError for other types."""
+    weight = array("priority", weight, jnp.shape(weight), jnp.number)
     if jnp.issubdtype(weight.dtype, jnp.complexfloating):
-        raise ValueError(f"a priority must be a real number; got {weight.dtype}")
+        raise ValueError(f"priority must be a real number; got {describe(weight)}")
     weight = weight.astype(jnp.float32)
     return jnp.where((weight > 0) & jnp.isfinite(weight), weight, 0.0)
 
@@ -161,60 +187,75 @@ def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, v
 
 
 def can_sample(state: ReplayState) -> Array:
-    """Returns [] whether the ring holds any episode."""
+    """Whether the ring holds any episode, bool []."""
     return state.size > 0
 
 
 def mean_priority(state: ReplayState) -> Array:
-    """Returns the mean [] of the priorities of the rows that hold an episode; 0 where none does."""
+    """Mean priority [] of the rows that hold an episode; 0 for an empty ring."""
     return jnp.sum(state.priority) / jnp.maximum(state.size, 1).astype(jnp.float32)
 
 
-def cumulative_priority(state: ReplayState) -> Array:
-    """Returns the sums [E] of the priorities up to and with each row, int32, in units that make the last about 2^29.
+def cumulative(state: ReplayState) -> Cumulative:
+    """Cumulative weights of the ring's rows, for `draw_rows`."""
+    if not state.ends:
+        return Cumulative(_cumulate(state.priority), None)
+    length = state.episodes.length.astype(jnp.float32)
+    return Cumulative(_cumulate(state.priority * length), _cumulate(length))
 
-    Integers make the sums exact and never falling, whatever the order of addition; the unit is a power of two, so that
-    priorities of 0 and 1 are exact. `draw_rows` takes the sums, so that a loop of draws from one ring makes them once.
+
+def _cumulate(weight: Array) -> Array:
+    """Cumulative sums [E] of weights, int32, in units that make the last about 2^29.
+
+    Integers make the sums exact and monotone, whatever the order of addition. The unit is a power of two, so that weights of
+    0 and 1 are exact.
     """
-    largest_power = 0x7F800000  # the exponent's bits of a float32: what they alone stand for is the power of two below it
-    total = jnp.maximum(jnp.sum(state.priority), jnp.finfo(jnp.float32).tiny)
-    bits = jax.lax.bitcast_convert_type(total, jnp.int32) & largest_power
+    exponent_bits = 0x7F800000  # of a float32: alone they stand for the largest power of two that is not greater
+    total = jnp.maximum(jnp.sum(weight), jnp.finfo(jnp.float32).tiny)
+    bits = jax.lax.bitcast_convert_type(total, jnp.int32) & exponent_bits
     unit = jax.lax.bitcast_convert_type(bits, jnp.float32)
-    return jnp.cumsum(jnp.round(state.priority / unit * 2.0**29).astype(jnp.int32), dtype=jnp.int32)
+    return jnp.cumsum(jnp.round(weight / unit * 2.0**29).astype(jnp.int32), dtype=jnp.int32)
 
 
-def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array | float, cumulative: Array) -> Array:
-    """Draws rows [B] of the ring: with probability `fraction` in proportion to their priorities, else uniformly.
+def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array | float, weights: Cumulative) -> Array:
+    """Draws rows [B] of the ring, so that a uniform step of each row is a transition of the ring.
 
-    While all priorities are 0, uniformly. `cumulative` is `cumulative_priority(state)`. The ring must not be empty.
+    With probability `fraction`, a transition is drawn in proportion to its episode's priority, else uniformly; also uniformly
+    while all priorities are 0. `weights` is `cumulative(state)`. The ring must not be empty.
     """
     coin_key, bits_key = jax.random.split(key)
-    total = cumulative[-1]
     any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size))
-    rank = 1 + randint_from_bits(rank_bits, total)
-    by_priority = jnp.searchsorted(cumulative, rank).astype(jnp.int32)
+    by_priority = _row_at(weights.priority, rank_bits)
+    any_row = randint_from_bits(any_bits, state.size) if weights.length is None else _row_at(weights.length, any_bits)
     coin = jax.random.uniform(coin_key, (batch_size,)) < fraction
-    return jnp.where(coin & (total > 0), by_priority, randint_from_bits(any_bits, state.size))
+    return jnp.where(coin & (weights.priority[-1] > 0), by_priority, any_row)
+
+
+def _row_at(cumulative: Array, bits: Array) -> Array:
+    """Maps random `bits` [B] to rows, in proportion to the weights whose cumulative sums are given."""
+    rank = 1 + randint_from_bits(bits, cumulative[-1])
+    return jnp.searchsorted(cumulative, rank).astype(jnp.int32)
 
 
 def take(state: ReplayState, rows: Array) -> ReplayState:
-    """Returns a full ring of the episodes in `rows` [R], with their priorities."""
+    """Makes a full ring of the episodes in `rows` [R], with their priorities."""
     episodes = jax.tree.map(lambda x: x[rows], state.episodes)
     number = jnp.asarray(rows.shape[0], jnp.int32)
-    return ReplayState(episodes=episodes, priority=state.priority[rows], cursor=jnp.zeros_like(number), size=number)
+    cursor = jnp.zeros_like(number)
+    return dataclasses.replace(state, episodes=episodes, priority=state.priority[rows], cursor=cursor, size=number)
 
 
 def newest_and_others(state: ReplayState, key: PRNGKey, newest: int, others: int) -> Array:
-    """Returns the rows [newest + others] of the newest episodes, and of others drawn at random, with replacement.
+    """Rows [newest + others] of the newest episodes, and of others drawn at random, with replacement.
 
-    Rows of `newest` hold no episode where as many have not been written. The ring must not be empty for the others.
+    Rows of `newest` hold no episode while fewer have been written. The ring must not be empty for the others.
     """
     new = (state.cursor - 1 - jnp.arange(newest, dtype=jnp.int32)) % capacity(state)
     return jnp.concatenate([new, randint_from_bits(jax.random.bits(key, (others,)), state.size)])
 
 
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
-    """Draws `batch_size` transitions, with replacement: a uniform step of each of `rows` [B].
+    """Draws `batch_size` transitions with replacement: a uniform step of each of `rows` [B].
 
     Without `rows`, uniform over all transitions in the ring, which must not be empty.
 
@@ -222,13 +263,16 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
       ValueError: fewer than one transition, or `rows` that are not integers [B].
     """
     check_size("batch_size", batch_size)
-    if rows is not None and (jnp.shape(rows) != (batch_size,) or not jnp.issubdtype(jnp.result_type(rows), jnp.integer)):
-        raise ValueError(f"rows must be integers [B] = [{batch_size}]; got {jnp.result_type(rows)}{list(jnp.shape(rows))}")
     row_bits, step_bits = jax.random.bits(key, (2, batch_size))
-    if rows is None:
-        rows = randint_from_bits(row_bits, state.size)
-    steps = randint_from_bits(step_bits, state.episodes.action.shape[1])
     episodes = state.episodes
+    if rows is not None:
+        rows = array("rows [B]", rows, (batch_size,), jnp.integer)
+    elif state.ends:
+        rows = _row_at(_cumulate(episodes.length.astype(jnp.float32)), row_bits)
+    else:
+        rows = randint_from_bits(row_bits, state.size)
+    length = episodes.length[rows]
+    steps = randint_from_bits(step_bits, length if state.ends else episodes.action.shape[1])
     return Sample(
         observation=jax.tree.map(lambda x: x[rows, steps], episodes.observation),
         next_observation=jax.tree.map(lambda x: x[rows, steps + 1], episodes.observation),
@@ -237,19 +281,23 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
         desired_goal=episodes.desired_goal[rows],
         step=steps,
         row=rows,
+        length=length,
+        terminal=episodes.terminal[rows] & (steps + 1 == length),
+        ends=state.ends,
     )
 
 
-def sample_episode_goals(state: ReplayState, key: PRNGKey, batch_size: int) -> Array:
-    """Draws `batch_size` episodes uniformly; returns their achieved goals [B, T+1, G]. The ring must not be empty."""
-    return state.episodes.achieved_goal[randint_from_bits(jax.random.bits(key, (batch_size,)), state.size)]
+def sample_pool(state: ReplayState, key: PRNGKey, batch_size: int) -> Pool:
+    """Draws one episode for each of `batch_size` transitions, uniformly. The ring must not be empty."""
+    rows = randint_from_bits(jax.random.bits(key, (batch_size,)), state.size)
+    return Pool(state.episodes.achieved_goal[rows], state.episodes.length[rows])
 
 
 def randint_from_bits(bits: Array, number: Array | int) -> Array:
     """Maps random `bits`, uint32 of any shape, to int32 in [0, number), by the high word of bits * number (Lemire 2019).
 
-    The bias is at most `number` / 2^32. `jax.random.randint` makes three draws, each of them more than a hundred operations
-    to a compiler. Returns 0 where `number` is 0.
+    `number` is one for all, or of the shape of `bits`; the result is 0 for 0. The bias is at most `number` / 2^32.
+    `jax.random.randint` makes three draws, each of more than a hundred operations to a compiler.
     """
     number = jnp.asarray(number, jnp.uint32)
     high, low, number_high, number_low = bits >> 16, bits & 0xFFFF, number >> 16, number & 0xFFFF

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -9,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.types import Array, Env, Episode, GoalObs, PRNGKey, PyTree, Sizes, check_env_parts, check_size
+from mjx_dher import context
+from mjx_dher.config import HParams
+from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, Sizes, check_env_parts, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
@@ -20,11 +23,20 @@ GoalsFn = Callable[[GoalObs], Array]
 class Outcome(NamedTuple):
     """Outcomes of episodes; all [N]."""
 
-    success: Array  # 1.0 where the goal is reached at the last step
-    reset_success: Array  # 1.0 where it was reached at the reset, before any action
+    success: Array  # 1.0 if the goal is reached at the last step
+    reset_success: Array  # 1.0 if it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
     valid: Array  # whether all observations, actions and rewards are finite and the environment is not `failed`, bool
-    bad_rewards: Array  # share of the episode's rewards outside [-1, 0]
+    bad_rewards: Array  # share of the episode's rewards outside the reward range
+    length: Array  # steps that were played, int32
+
+
+class _Playing(NamedTuple):
+    """Loop state of a rollout."""
+
+    state: PyTree  # of the environments
+    over: Array  # [N] whether the episode has ended, bool
+    length: Array  # [N] int32
 
 
 def rollout(
@@ -32,60 +44,110 @@ def rollout(
 ) -> tuple[Episode, Outcome]:
     """Plays `num_envs` episodes side by side.
 
+    An episode that ends early keeps its last state until all of them have had `episode_length` steps.
+
     Args:
       env: an unbatched environment.
       policy: called with one step of `inputs` and the observations of all environments.
       key: of the first states; or [N], one for each.
       num_envs: episodes, N.
       inputs: further arguments of the policy, such as noise, or keys for one that draws; leaves lead with [T]. None for none.
-      goals: gives the goals to play for, which `env.with_goal` sets; those of the reset where None.
+      goals: maps the observations of the resets to goals [N, G] to play for, set by `env.with_goal`. None: the reset's own.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
 
     Raises:
       ValueError: actions that are not [N, A], inputs that do not lead with [T], something that is no environment, or states
-        that are not what `types.Env` says.
+        that are not what `types.Env` and its spec say.
     """
-    check_env_parts(env)
+    spec = env_spec(env)
     check_size("num_envs", num_envs)
-    _check_inputs(inputs, env.episode_length)
+    _check_inputs(inputs, spec.episode_length)
     first = jax.vmap(env.reset)(_keys(key, num_envs))
     check_first(first, (num_envs,))
     if goals is not None:
         first = _with_goals(env, first, goals(first.obs))
 
-    def step(state, step_inputs):
+    def step(playing: _Playing, step_inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:
+        state = playing.state
         action = policy(step_inputs, state.obs)
         if np.shape(action) != (num_envs, env.action_size):
             raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
         following = jax.vmap(env.step)(state, action)
         _check_same_shapes(state, following)
-        played = (state.obs["observation"], state.obs["achieved_goal"], action, following.reward)
-        return following, played
+        reward = following.reward
+        if spec.ends:
+            following = _where(playing.over, state, following)
+            action, reward = (_where(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
+        played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
+        length = playing.length + ~playing.over
+        return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
 
-    last, (observation, achieved_goal, action, reward) = jax.lax.scan(step, first, inputs, length=env.episode_length)
-
-    def whole(steps, end):  # [T, N, ...] and [N, ...] -> [N, T+1, ...]
-        return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)
+    start = _Playing(first, jnp.zeros(num_envs, bool), jnp.zeros(num_envs, jnp.int32))
+    end, (observation, achieved_goal, action, reward) = jax.lax.scan(step, start, inputs, length=spec.episode_length)
+    last = end.state
 
     episodes = Episode(
-        observation=jax.tree.map(whole, observation, last.obs["observation"]),
-        achieved_goal=whole(achieved_goal, last.obs["achieved_goal"]),
+        observation=jax.tree.map(_whole, observation, last.obs["observation"]),
+        achieved_goal=_whole(achieved_goal, last.obs["achieved_goal"]),
         desired_goal=first.obs["desired_goal"],
         action=jnp.moveaxis(action, 0, 1),
+        length=end.length,
+        terminal=jnp.broadcast_to(getattr(last, "terminal", False), (num_envs,)),
     )
-    arrays = (episodes.observation, episodes.achieved_goal, episodes.desired_goal, episodes.action, jnp.moveaxis(reward, 0, 1))
-    valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,))
-    for leaf in jax.tree.leaves(arrays):
-        valid &= jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+    valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,)) & _is_finite((episodes, jnp.moveaxis(reward, 0, 1)))
     return episodes, Outcome(
         success=jnp.where(valid, last.success, 0.0),
         reset_success=first.success,
         ret=jnp.sum(reward, axis=0),
         valid=valid,
-        bad_rewards=jnp.mean((reward < -1.0) | (reward > 0.0), axis=0, dtype=jnp.float32),
+        bad_rewards=_bad_rewards(spec, reward, end.length),
+        length=end.length,
     )
+
+
+def _whole(steps: Array, end: Array) -> Array:
+    """Joins the arrays of T steps [T, N, ...] and of the last state [N, ...] to [N, T+1, ...]."""
+    return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)
+
+
+def _is_finite(arrays: PyTree) -> Array:
+    """Whether all floats of each episode are finite, bool [N]; leaves lead with [N]."""
+    floats = [leaf for leaf in jax.tree.leaves(arrays) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return functools.reduce(jnp.logical_and, (jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim))) for leaf in floats))
+
+
+def _bad_rewards(spec: EnvSpec, reward: Array, length: Array) -> Array:
+    """Share [N] of the played rewards [T, N] that lie outside the reward range."""
+    low, high = spec.reward_range
+    bad = (reward < low) | (reward > high)
+    if not spec.ends:
+        return jnp.mean(bad, axis=0, dtype=jnp.float32)
+    played = jnp.arange(spec.episode_length)[:, None] < length[None]
+    return jnp.sum(bad & played, axis=0, dtype=jnp.float32) / length
+
+
+def _has_ended(env: Any, spec: EnvSpec, state: Any) -> Array:
+    """Whether the episodes of N environments have ended with `state`, bool [N]."""
+    ended = jnp.zeros(state.reward.shape, bool)
+    if spec.ends:
+        ended |= getattr(state, "done", False)
+        ended |= getattr(state, "terminal", False)
+    if spec.ends_at_goal:
+        ended |= context.of_env(env, HParams()).reached(state.obs["achieved_goal"], state.obs["desired_goal"])
+    return ended
+
+
+def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
+    """Selects `yes` or `no` by `condition` [N]; leaves lead with [N]."""
+
+    def select(a: Array, b: Array) -> Array:
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(select(jax.random.key_data(a), jax.random.key_data(b)))
+        return jnp.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(select, yes, no)
 
 
 def _check_inputs(inputs: PyTree, num_steps: int) -> None:
@@ -96,8 +158,15 @@ def _check_inputs(inputs: PyTree, num_steps: int) -> None:
             raise ValueError(f"inputs{name} must lead with [T] = [{num_steps}], one for each step; got {shape}")
 
 
+def check_with_goal(env: Any) -> None:
+    """Raises ValueError for an environment whose goals cannot be set."""
+    if not callable(getattr(env, "with_goal", None)):
+        raise ValueError(f"a goal generator needs an environment with with_goal(state, goal) -> state; {env!r} has none")
+
+
 def _with_goals(env: Any, first: Any, goals: Array) -> Any:
-    """Returns the first states of N episodes with other goals [N, G]; raises ValueError where the environment changes more."""
+    """The first states of N episodes with other goals [N, G]."""
+    check_with_goal(env)
     changed = jax.vmap(env.with_goal)(first, goals)
     _check_same_shapes(first, changed, "with_goal")
     return changed
@@ -109,6 +178,9 @@ def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
     return key if key.ndim > one else jax.random.split(key, num_envs)
 
 
+FLAGS = ("failed", "done", "terminal")  # optional fields of a state, [] bool
+
+
 def check_first(state: Any, leading: tuple[int, ...]) -> None:
     """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
     for name in ("obs", "reward", "success"):
@@ -117,14 +189,14 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
     for name in ("observation", "achieved_goal", "desired_goal"):
         if not isinstance(state.obs, Mapping) or name not in state.obs:
             raise ValueError(f"reset: obs must be a dict of observation, achieved_goal and desired_goal; it has no {name}")
-    for name in ("reward", "success", *(["failed"] if hasattr(state, "failed") else [])):
+    for name in ("reward", "success", *(flag for flag in FLAGS if hasattr(state, flag))):
         value = getattr(state, name)
         if not hasattr(value, "shape"):
             raise ValueError(f"reset: {name} must be a scalar, []; it is a {type(value).__name__}")
         if value.shape != leading:
             raise ValueError(f"reset: {name} must be a scalar, []; it has shape {value.shape[len(leading) :]}")
-        if name == "failed" and value.dtype != bool:
-            raise ValueError(f"reset: failed must be bool; it is {value.dtype}")
+        if name in FLAGS and value.dtype != bool:
+            raise ValueError(f"reset: {name} must be bool; it is {value.dtype}")
         if jnp.issubdtype(value.dtype, jnp.complexfloating):
             raise ValueError(f"reset: {name} must be a real number; it is {value.dtype}")
     achieved, desired = (jnp.shape(state.obs[name])[len(leading) :] for name in ("achieved_goal", "desired_goal"))
@@ -158,37 +230,57 @@ def check_steps(env: Env) -> None:
         check()
 
 
-def env_sizes(env: Env) -> Sizes:
-    """Returns the sizes of an environment's observation, goal and action, without running it.
+def env_spec(env: Env) -> EnvSpec:
+    """The spec of an environment, which is not run: its own `spec`, or one that follows from its attributes and arrays.
 
     Raises:
-      ValueError: the observation is not a single vector.
+      ValueError: `env` is no environment, or its spec disagrees with its arrays; the message names the field.
     """
-    template = episode_template(env)
-    return Sizes(template.observation.shape[-1], template.desired_goal.shape[-1], env.action_size)
+    return _spec_and_shapes(env)[0]
 
 
-def episode_template(env: Env) -> Episode:
-    """Returns the shapes and types of one episode of `env`, without running it.
-
-    Raises:
-      ValueError: the observation is not a single vector, or `env` is no environment.
-    """
+def _spec_and_shapes(env: Env) -> tuple[EnvSpec, Any]:
     check_env_parts(env)
     first = jax.eval_shape(env.reset, jax.random.key(0))
     check_first(first, ())
-    obs = first.obs
-    observation = obs["observation"]
-    if not (hasattr(observation, "shape") and len(observation.shape) == 1):
-        raise ValueError(f"the learner takes observations of one vector [D]; this environment gives {observation}")
+    observation, goal_size = first.obs["observation"], first.obs["achieved_goal"].shape[0]
+    sizes = {"goal_size": goal_size, "action_size": env.action_size, "episode_length": env.episode_length}
+    own = getattr(env, "spec", None)
+    spec = EnvSpec(observation=observation, **sizes) if own is None else own
+    if not isinstance(spec, EnvSpec):
+        raise ValueError(f"spec of an environment must be an EnvSpec; it is {spec!r}")
+    for name, value in {**sizes, "observation": observation}.items():
+        given, needed = (jax.tree.map(_say, x) for x in (getattr(spec, name), value))
+        if given != needed:
+            raise ValueError(f"spec: {name} must be {needed}, as the environment has it; got {given}")
+    flags = [name for name in ("done", "terminal") if hasattr(first, name)]
+    if flags and not spec.ends:
+        raise ValueError(f"spec: ends must be True, because the environment's state has {flags[0]}; got False")
+    if spec.ends and not flags and not spec.ends_at_goal:
+        raise ValueError("spec: ends must be False for a state without done and terminal, unless ends_at_goal; got True")
+    return spec, first
+
+
+def _say(leaf: Any) -> Any:
+    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
+
+
+def env_sizes(env: Env) -> Sizes:
+    """Sizes of an environment's observation, goal and action. Raises ValueError unless the observation is one vector."""
+    return env_spec(env).sizes
+
+
+def episode_template(env: Env) -> Episode:
+    """Shapes and dtypes of one episode of `env`, which is not run. Raises ValueError if `env` is no environment."""
+    spec, first = _spec_and_shapes(env)
 
     def repeat(x: Any, times: int) -> Any:
         return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
 
-    num_steps = env.episode_length
+    num_steps = spec.episode_length
     return Episode(
-        observation=repeat(observation, num_steps + 1),
-        achieved_goal=repeat(obs["achieved_goal"], num_steps + 1),
-        desired_goal=obs["desired_goal"],
+        observation=jax.tree.map(lambda x: repeat(x, num_steps + 1), first.obs["observation"]),
+        achieved_goal=repeat(first.obs["achieved_goal"], num_steps + 1),
+        desired_goal=first.obs["desired_goal"],
         action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
-    )
+    ).filled()

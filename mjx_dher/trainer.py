@@ -16,25 +16,30 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from mjx_dher import check, evaluate, learners, priorities, replay, samplers
 from mjx_dher import config as config_lib
-from mjx_dher import evaluate, generators, learners, priorities, replay, samplers, scores
+from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.context import View
-from mjx_dher.generators import GenerateFn, Generator
+from mjx_dher.context import Context
 from mjx_dher.learners import Learner
-from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.learners.updates import update_round
+from mjx_dher.parallel import split
+from mjx_dher.parallel.split import AxisName
 from mjx_dher.priorities import Priority, PriorityFn
-from mjx_dher.relabel import draw_batches, relabel_counted
+from mjx_dher.relabel import add_choices, draw_batches, relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import env_sizes, episode_template, rollout
+from mjx_dher.rollout import check_with_goal, env_spec, episode_template, rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.types import Array, Env, Episode, GoalObs, Metrics, PRNGKey, PyTree, check_env_parts
-from mjx_dher.updates import update_round
+from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGKey, PyTree
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
 # Folded into a cycle's key, for its goals and for the rows that are renewed; no indices of `jax.random.split`.
 GENERATE, RENEW = 0x476F616C, 0x52656E65
+
+
+# generator(key, obs with leading [N], ring, context) -> goals [N, G] to play for; `contrib.generators.Generator` is one
+GoalsFn = Callable[[PRNGKey, GoalObs, ReplayState, Context], Array]
 
 
 @struct.dataclass
@@ -45,7 +50,7 @@ class TrainState:
     replay: ReplayState
     hparams: HParams
     key: PRNGKey
-    env_steps: Array  # [] int32
+    env_steps: Array  # [] int32; of a run on several devices those of one device
 
 
 class Train(NamedTuple):
@@ -55,42 +60,38 @@ class Train(NamedTuple):
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
     learner: Learner
     replay_bytes: int  # memory of one run's ring on a device
-    split: Split = ALONE
+    axis_name: AxisName = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """Parts of a training loop; static."""
+    """Components of a training loop; static."""
 
     env: Env
+    spec: EnvSpec
     config: Config
     sampler: Sampler
     priority: Priority
-    generator: Generator
+    generator: GoalsFn | None
     learner: Learner
     template: Episode  # shapes and dtypes of an episode
-    split: Split = ALONE
-    max_transitions_per_draw: int = MAX_TRANSITIONS_PER_DRAW
+    axis_name: AxisName
 
     @property
     def num_episodes(self) -> int:
-        """Episodes that the ring holds, E: that of a part, of a run in parts."""
-        return self.split.share(config_lib.episodes_capacity(self.config, self.env.episode_length))
+        """Episodes that the ring holds, E."""
+        return config_lib.episodes_capacity(self.config, self.spec.episode_length)
 
     @property
     def uses_values(self) -> bool:
-        """Need of one of the parts for the learner's values."""
-        return self.sampler.score is not None or self.priority.uses_values or self.generator.uses_values
+        """Whether a component needs the learner's values."""
+        generator = getattr(self.generator, "uses_values", False)
+        return self.sampler.score is not None or self.priority.uses_values or generator
 
     @property
     def steps_per_cycle(self) -> int:
-        """Environment steps of a cycle."""
-        return self.config.num_envs * self.env.episode_length
-
-    @property
-    def num_updates(self) -> int:
-        """Updates of the whole run."""
-        return config_lib.num_updates(self.config, self.env.episode_length)
+        """Environment steps of a cycle, if no episode ends early."""
+        return self.config.num_envs * self.spec.episode_length
 
     @property
     def policy_delay(self) -> int:
@@ -104,10 +105,10 @@ class Loop:
 
     @property
     def rounds_per_draw(self) -> int:
-        """Rounds whose batches are drawn at once: as many as `max_transitions_per_draw` allows, at least one."""
+        """Rounds whose batches are drawn at once: as many as MAX_TRANSITIONS_PER_DRAW allows, at least one."""
         rounds = self.config.updates_per_cycle // self.updates_per_round
-        batch_size = self.split.share(self.config.batch_size)
-        return _largest_divisor(rounds, self.max_transitions_per_draw // (self.updates_per_round * batch_size))
+        most = max(1, MAX_TRANSITIONS_PER_DRAW // (self.updates_per_round * self.config.batch_size))
+        return next(divisor for divisor in range(min(rounds, most), 0, -1) if rounds % divisor == 0)
 
 
 def make_train(
@@ -116,49 +117,52 @@ def make_train(
     *,
     sampler: Sampler | LogWeightsFn | None = None,
     priority: Priority | PriorityFn | None = None,
-    generator: Generator | GenerateFn | None = None,
+    generator: GoalsFn | None = None,
     learner: Learner | None = None,
-    split: Split = ALONE,
+    axis_name: AxisName = None,
 ) -> Train:
     """Makes the training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
-    and returns the next TrainState with these metrics, each []: success_rate, reset_success_rate and return_mean of the
-    evaluation; train_success_rate and train_return_mean of the exploring policy, and the mean of its episodes' priorities,
-    priority_mean; of their transitions the relabelled_share and, over these, relabel_distance, the mean Euclidean distance
-    from the episode's goal to the hindsight goal; discarded_episodes, whose physics blew up and which were not learned from;
-    bad_rewards and bad_success (`evaluate.faults`) and no_goal_share (`relabel.relabel_counted`), which ought to be 0; and what
-    the learner reports, for DDPG critic_loss, actor_loss, q_mean, actor_norm and critic_norm.
+    and returns the next TrainState with metrics, each [] (docs/logs.md): those of `evaluate.summary`, of the exploring policy,
+    of relabelling, faults that ought to be 0, and what the learner reports.
 
     Args:
       env: the environment.
-      config: sizes.
-      sampler: of hindsight goals, or a function like `Sampler.log_weights`; `future` where None.
-      priority: of episodes or transitions, for `hparams.priority_fraction` of each batch; `eventful` where None.
-      generator: of the goals that training episodes are played for; those of the reset where None.
-      learner: DDPG where None, made of `config`.
-      split: of a run in parts on several devices, whose `init` and `epoch` are then called inside `jax.shard_map`.
+      config: sizes; of a run on several devices, those of one device.
+      sampler: of hindsight goals, or a function like `Sampler.log_weights`. None: `future`.
+      priority: of episodes or transitions, for `hparams.priority_fraction` of each batch. None: `eventful`.
+      generator: gives the goals that training episodes are played for. None: those of the reset.
+      learner: None: DDPG, made of `config`.
+      axis_name: of the devices that share the run, which call `init` and `epoch` inside `jax.shard_map` over that axis with the
+        same key. They average gradients and metrics; each has its own environments, ring and batches.
 
     Raises:
-      ValueError: a Config that cannot run, here or at all, an observation that is not one vector, or an argument of another
-        kind. `epoch` raises it where a part gives arrays of the wrong shape, as soon as it is traced.
+      ValueError: a Config that cannot run, here or at all, observations that the learner cannot take, or an argument of another
+        kind. `epoch` raises it if a component gives arrays of the wrong shape, as soon as it is traced.
     """
-    _check_arguments(env, config, learner)
-    config_lib.check_parts(config, env.episode_length, split.number)
-    learner = learners.make("ddpg", config, env_sizes(env)) if learner is None else learner
+    spec = env_spec(env)
+    if not isinstance(config, Config):
+        raise ValueError(f"config must be a Config; got {config!r}")
+    config_lib.validate(config, HParams(), spec.episode_length)
+    if learner is None:
+        learner = learners.make("ddpg", config, spec)
+    learners.check_methods(learner, learner)
     loop = Loop(
         env=env,
+        spec=spec,
         config=config,
         sampler=samplers.make("future" if sampler is None else sampler),
         priority=priorities.whole(priorities.make("eventful" if priority is None else priority)),
-        generator=generators.make("reset" if generator is None else generator),
-        learner=learner if split.number == 1 else learners.over_axis(learner, split.axis),
+        generator=generator,
+        learner=learner if axis_name is None else learners.over_axis(learner, axis_name),
         template=episode_template(env),
-        split=split,
+        axis_name=axis_name,
     )
     if problem := config_lib.delay_problem(config, loop.policy_delay):
         raise ValueError(problem)
-    generators.check_env(loop.generator, env)
+    if generator is not None:
+        check_with_goal(env)
     if loop.uses_values:
         learners.check_values(loop.learner)
     return Train(
@@ -166,24 +170,15 @@ def make_train(
         epoch=functools.partial(_epoch, loop),
         learner=loop.learner,
         replay_bytes=replay.nbytes(loop.template, loop.num_episodes),
-        split=split,
+        axis_name=axis_name,
     )
-
-
-def _check_arguments(env: Env, config: Config, learner: Learner | None) -> None:
-    check_env_parts(env)
-    if not isinstance(config, Config):
-        raise ValueError(f"config must be a Config; got {config!r}")
-    config_lib.validate(config, HParams(), env.episode_length)
-    if learner is not None:
-        learners.check_methods(learner, learner)
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
     key, learner_key = jax.random.split(key)
     return TrainState(
         learner=loop.learner.init(learner_key),
-        replay=replay.init(loop.template, loop.num_episodes),
+        replay=replay.init(loop.template, loop.num_episodes, loop.spec.ends),
         hparams=as_arrays(hparams),
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
@@ -193,11 +188,12 @@ def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
 def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     state, cycles = jax.lax.scan(lambda state, _: _cycle(loop, state), state, length=loop.config.cycles_per_epoch)
     key, eval_key = jax.random.split(state.key)
-    discarded = jnp.sum(cycles.pop("discarded_episodes"))
-    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes, loop.split)
-    means = jax.tree.map(jnp.mean, cycles)
-    faults = {name: jnp.maximum(means[name], share) for name, share in evaluate.faults(outcome).items()}
-    metrics = evaluate.summary(outcome) | means
+    discarded = split.total(jnp.sum(cycles.pop("discarded_episodes")), loop.axis_name)
+    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes, loop.axis_name)
+    means = split.mean(jax.tree.map(jnp.mean, cycles), loop.axis_name)
+    evaluated = split.mean((evaluate.summary(outcome), evaluate.faults(outcome)), loop.axis_name)
+    faults = {name: jnp.maximum(means[name], share) for name, share in evaluated[1].items()}
+    metrics = evaluated[0] | means
     summary = loop.learner.summary(state.learner)
     learners.check_metrics("summary", summary, means)
     metrics |= summary
@@ -206,34 +202,34 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
 def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     """Rolls out, adds to the ring, updates the normalizers, learns."""
-    env, config, hparams, split = loop.env, loop.config, state.hparams, loop.split
-    key, rollout_key, noise_key, normalizer_key, learn_key = jax.random.split(state.key, 5)
+    env, config, hparams = loop.env, loop.config, state.hparams
+    key, *keys = jax.random.split(state.key, 5)
+    rollout_key, noise_key, normalizer_key, learn_key = (split.own_key(own, loop.axis_name) for own in keys)
 
     def policy(noise: Any, obs: GoalObs) -> Array:
         return loop.learner.explore(state.learner, obs, noise, hparams)
 
     noise = loop.learner.noise(noise_key, env.episode_length, config.num_envs, hparams)
     learners.check_noise(noise, env.episode_length, config.num_envs)
-    progress = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / loop.num_updates
-    goals = _goals(loop, state, progress)
-    first, num_envs = split.keys(rollout_key, config.num_envs), split.share(config.num_envs)
-    episodes, outcome = rollout(env, policy, first, num_envs, split.own(noise, axis=1), goals)
-    weights = priorities.weights(loop.priority, episodes, env.compute_reward, hparams)
+    updates = config_lib.num_updates(config, loop.spec.episode_length)
+    progress = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / updates
+    before = _context(loop, state.learner, hparams, progress)
+    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, _goals(loop, state, before))
+    weights = priorities.weights(loop.priority, episodes, before)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
-    before = _view(loop, state.learner, hparams, progress)
-    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, split.key(normalizer_key))
-    annealed = anneal(hparams, progress)
-    view = _view(loop, learner, annealed, progress)
-    ring = priorities.renewed(loop.priority, ring, view, _rows_to_renew(loop, state, ring, num_envs))
-    learned, losses = _learn(loop, learner, ring, view, split.key(learn_key))
-    # As long as the ring, or that of a part, is empty, nothing is learned.
-    learner = jax.tree.map(lambda new, old: jnp.where(split.all(replay.can_sample(ring)), new, old), learned, learner)
-    outcome = split.gather(outcome)
+    learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
+    context = _context(loop, learner, anneal(hparams, progress), progress)
+    ring = priorities.renew(loop.priority, ring, context, _rows_to_renew(loop, state, ring))
+    learned, losses = _learn(loop, learner, ring, context, learn_key)
+    # While the ring is empty, nothing is learned.
+    can_learn = split.all_true(replay.can_sample(ring), loop.axis_name)
+    learner = jax.tree.map(lambda new, old: jnp.where(can_learn, new, old), learned, learner)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": split.mean(jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring)),
+        "priority_mean": jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring),
+        **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,
         **losses,
@@ -242,108 +238,100 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     return TrainState(learner=learner, replay=ring, hparams=hparams, key=key, env_steps=env_steps), metrics
 
 
-def _view(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> View:
+def _context(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> Context:
     values = learners.values_of(loop.learner, learner, hparams) if loop.uses_values else None
-    return View(loop.env.compute_reward, hparams, progress, values)
+    return context_lib.of_env(loop.env, hparams, progress=progress, values=values)
 
 
-def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState, num_new: int) -> Array | None:
-    """Returns the rows whose priorities are renewed after `num_new` episodes were added; None for all of them."""
-    number = loop.config.renewals * num_new
+def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState) -> Array | None:
+    """Rows whose priorities are renewed after a cycle's episodes were added; None for all of them."""
+    new = loop.config.num_envs
+    number = loop.config.renewals * new
     if loop.priority.renew is None or not loop.priority.by_part or not 0 < number < replay.capacity(ring):
         return None
-    key = loop.split.key(jax.random.fold_in(state.key, RENEW))
-    return replay.newest_and_others(ring, key, num_new, number - num_new)
+    key = split.own_key(jax.random.fold_in(state.key, RENEW), loop.axis_name)
+    return replay.newest_and_others(ring, key, new, number - new)
 
 
-def _goals(loop: Loop, state: TrainState, progress: Array) -> Callable[[GoalObs], Array] | None:
-    """Returns what gives the goals of a rollout; None where the reset's own are played for."""
-    if loop.generator is generators.reset:
+def _goals(loop: Loop, state: TrainState, context: Context) -> Callable[[GoalObs], Array] | None:
+    """Maps a rollout's first observations to the goals to play for. None, and goals that are not finite: the reset's own."""
+    generator = loop.generator
+    if generator is None:
         return None
-    view = _view(loop, state.learner, state.hparams, progress)
-    key = loop.split.key(jax.random.fold_in(state.key, GENERATE))
-    return lambda obs: generators.goals_of(loop.generator, key, obs, state.replay, view)
+    key = split.own_key(jax.random.fold_in(state.key, GENERATE), loop.axis_name)
+
+    def goals_of(obs: GoalObs) -> Array:
+        own = obs["desired_goal"]
+        goals = check.array("generator: goals [N, G]", generator(key, obs, state.replay, context), own.shape)
+        return jnp.where(jnp.all(jnp.isfinite(goals), axis=-1, keepdims=True), goals.astype(own.dtype), own)
+
+    return goals_of
 
 
 def _update_normalizers(
-    loop: Loop, learner: PyTree, episodes: Episode, valid: Array, view: View, key: PRNGKey
+    loop: Loop, learner: PyTree, episodes: Episode, valid: Array, context: Context, key: PRNGKey
 ) -> tuple[PyTree, Metrics]:
     """Updates the normalizers; goals are relabelled first, so that their statistics match those of training batches."""
     num_new, num_steps = episodes.action.shape[:2]
-    fresh = replay.add(replay.init(loop.template, num_new), episodes, valid=valid)
+    fresh = replay.add(replay.init(loop.template, num_new, loop.spec.ends), episodes, valid=valid)
     sample_key, relabel_key = jax.random.split(key)
     sample = replay.sample(fresh, sample_key, num_new * num_steps)
-    hparams, score = view.hparams, scores.of_episodes(loop.sampler.score, fresh.episodes, view)
-    batch, no_goal_share = relabel_counted(fresh, sample, loop.sampler, view.compute_reward, hparams, relabel_key, score)
-    updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, hparams, valid)
+    scores = samplers.score_episodes(loop.sampler, fresh.episodes, context)
+    sample = add_choices(fresh, sample, loop.sampler, scores, relabel_key)
+    batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
+    updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, context.hparams, valid)
     learners.check_kept("update_normalizers", learner, updated)
-    metrics = _relabel_metrics(sample.desired_goal, batch.desired_goal, loop.split)
-    return updated, {**metrics, "no_goal_share": loop.split.mean(no_goal_share)}
+    distance = context.goal_distance(batch.desired_goal, sample.desired_goal)
+    replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1).astype(jnp.float32)
+    return updated, {
+        "relabelled_share": jnp.mean(replaced),
+        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1.0),
+        "no_goal_share": no_goal_share,
+    }
 
 
-def _learn(loop: Loop, learner: PyTree, ring: ReplayState, view: View, key: PRNGKey) -> tuple[PyTree, Metrics]:
+def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key: PRNGKey) -> tuple[PyTree, Metrics]:
     """Makes a cycle's updates. The ring does not change meanwhile, so batches are drawn many at once.
 
     On a GPU, drawing one batch takes twice as long as learning from it, and drawing 40 hardly longer.
     """
-    config, hparams = loop.config, view.hparams
-    cumulative = replay.cumulative_priority(ring)
-    score = scores.of_episodes(loop.sampler.score, ring.episodes, view)
-    shape = (loop.rounds_per_draw, loop.updates_per_round, loop.split.share(config.batch_size))
+    config, weights = loop.config, replay.cumulative(ring)
+    scores = samplers.score_episodes(loop.sampler, ring.episodes, context)
+    shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
+    update = functools.partial(update_round, loop.learner, config.target_period, context.hparams)
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
-        numbers = hparams, cumulative, config.n_step, score
-        batches = draw_batches(ring, key, shape, loop.sampler, view.compute_reward, *numbers, loop.priority, view)
-        return jax.lax.scan(functools.partial(update_round, loop.learner, config.target_period, hparams), learner, batches)
+        batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, scores, loop.priority)
+        return jax.lax.scan(update, learner, batches)
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))
     learner, losses = jax.lax.scan(draw_and_update, learner, keys)
-    return learner, loop.split.mean(jax.tree.map(jnp.mean, losses))
-
-
-def _relabel_metrics(goal: Array, hindsight: Array, split: Split = ALONE) -> Metrics:
-    """Returns the share of goals [B, G] that were replaced, and the mean distance of those that took their place."""
-    distance = jnp.linalg.norm(hindsight - goal, axis=-1)
-    replaced = (distance > 0).astype(jnp.float32)
-    return {
-        "relabelled_share": split.mean(jnp.mean(replaced)),
-        "relabel_distance": split.sum(jnp.sum(distance)) / jnp.maximum(split.sum(jnp.sum(replaced)), 1.0),
-    }
-
-
-def _largest_divisor(number: int, limit: int) -> int:
-    """Returns the largest divisor of `number` up to `limit`; at least 1."""
-    return next(divisor for divisor in range(max(1, min(number, limit)), 0, -1) if number % divisor == 0)
+    return learner, jax.tree.map(jnp.mean, losses)
 
 
 def evaluate_state(
-    env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int, split: Split = ALONE
+    env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int, axis_name: AxisName = None
 ) -> evaluate.Outcome:
-    """Plays the learner's policy without exploration; returns the outcomes [num_episodes], of all parts."""
+    """Plays the learner's policy without exploration; returns the outcomes [num_episodes] of this device."""
 
     def act(obs: GoalObs) -> Array:
         return learner.act(state.learner, obs, state.hparams)
 
-    if split.number == 1:
-        return evaluate.evaluate(env, act, key, num_episodes)
-    share = -(-num_episodes // split.number)
-    keys = jax.random.split(key, num_episodes)[jnp.arange(split.number * share) % num_episodes]  # some are played twice
-    outcomes = split.gather(evaluate.evaluate(env, act, split.own(keys), share))
-    return jax.tree.map(lambda x: x[:num_episodes], outcomes)
+    return evaluate.evaluate(env, act, split.own_key(key, axis_name), num_episodes)
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:
-    """Returns the numbers after a fraction `progress` of the run's updates: step sizes fall linearly to `lr_end`."""
+    """Numbers after a fraction `progress` of the run's updates: step sizes fall linearly to `lr_end`."""
     left: Any = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
     return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 
 
 def as_arrays(hparams: HParams) -> HParams:
-    """Returns the numbers as float32 arrays."""
+    """The numbers as float32 arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
 
 
 def is_finite(learner: PyTree) -> Array:
-    """Returns [] whether all of a learner's numbers are finite: once they are not, no epoch will mend them."""
+    """Whether all of a learner's numbers are finite, bool []; once they are not, no epoch changes that."""
     floats = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))

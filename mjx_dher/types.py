@@ -9,10 +9,12 @@ Dimension letters, used in every shape comment:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypedDict
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -31,12 +33,31 @@ class GoalObs(TypedDict):
 
 @struct.dataclass
 class Episode:
-    """A whole episode: every observation once, the last one included. Batched forms lead with [N] or [E]."""
+    """A whole episode: every observation once, the last one included. Batched forms lead with [N] or [E].
+
+    An episode that ended early is padded: its last observation and goal repeat up to T, and its actions are 0.
+    """
 
     observation: PyTree  # [T+1, D], or a pytree of arrays that all lead with T+1
     achieved_goal: Array  # [T+1, G]
     desired_goal: Array  # [G]
     action: Array  # [T, A]
+    length: Array = None  # type: ignore[assignment]  # [] steps that were played, int32; None stands for T (`filled`)
+    terminal: Array = None  # type: ignore[assignment]  # [] whether no future follows, for any goal; None stands for False
+
+    def filled(self) -> Episode:
+        """Fills in `length` and `terminal` where they are None. Arrays may be `jax.ShapeDtypeStruct`s."""
+        *leading, num_steps, _ = self.action.shape
+        shape = tuple(leading)
+        length: Any = self.length
+        terminal: Any = self.terminal
+        if isinstance(self.action, jax.ShapeDtypeStruct):
+            length = jax.ShapeDtypeStruct(shape, jnp.int32) if length is None else length
+            terminal = jax.ShapeDtypeStruct(shape, jnp.bool_) if terminal is None else terminal
+        else:
+            length = jnp.full(shape, num_steps, jnp.int32) if length is None else length
+            terminal = jnp.zeros(shape, bool) if terminal is None else terminal
+        return dataclasses.replace(self, length=length, terminal=terminal)
 
 
 @struct.dataclass
@@ -47,10 +68,11 @@ class Batch:
     next_observation: PyTree  # [B, D]
     desired_goal: Array  # [B, G]
     action: Array  # [B, A]
-    reward: Array  # [B]
-    # [B] what the value of the next observation counts; gamma where None. With n-step returns, `reward` is the discounted sum
-    # of m rewards, this is gamma^m, and the next observation is m steps ahead.
-    discount: Array | None = None
+    reward: Array  # [B] with n-step returns the discounted sum of m rewards
+    # [B] factor of the value of the next observation: gamma, 0 after a terminal transition. With n-step returns it is gamma^m,
+    # and the next observation is m steps ahead.
+    discount: Array
+    row: Array  # [B] ring row of the transition's episode, int32: equal rows are one episode
 
 
 class Sizes(NamedTuple):
@@ -61,6 +83,41 @@ class Sizes(NamedTuple):
     action: int
 
 
+@dataclasses.dataclass(frozen=True)
+class EnvSpec:
+    """The contract of a task as data. `rollout.env_spec` gives an environment's."""
+
+    observation: PyTree  # tree of `jax.ShapeDtypeStruct`s of one observation
+    goal_size: int  # G
+    action_size: int  # A
+    episode_length: int  # T, the maximum
+    reward_range: tuple[float, float] = (-1.0, 0.0)  # lowest and highest reward; infinite where there is no bound
+    ends: bool = False  # whether an episode can end before T: its state has `done`, `terminal` or both
+    ends_at_goal: bool = False  # whether reaching the goal ends the episode, so that no future follows for this goal
+
+    def __post_init__(self) -> None:
+        for name in ("goal_size", "action_size", "episode_length"):
+            check_size(name, getattr(self, name))
+        low, high = self.reward_range
+        if not low < high:
+            raise ValueError(f"reward_range must be (low, high) with low < high; got {self.reward_range}")
+        if self.ends_at_goal and not self.ends:
+            raise ValueError("ends must be True where ends_at_goal is")
+
+    @property
+    def observation_size(self) -> int:
+        """Size D of an observation that is one vector. Raises ValueError for any other tree."""
+        leaves = jax.tree.leaves(self.observation)
+        if len(leaves) != 1 or leaves[0] is not self.observation or len(leaves[0].shape) != 1:
+            raise ValueError(f"observation must be one vector [D] here; it is {self.observation}")
+        return int(leaves[0].shape[0])
+
+    @property
+    def sizes(self) -> Sizes:
+        """Sizes D, G and A. Raises ValueError unless the observation is one vector."""
+        return Sizes(self.observation_size, self.goal_size, self.action_size)
+
+
 # Scalars [] by name, for the log.
 Metrics = dict[str, Array]
 
@@ -68,10 +125,19 @@ Metrics = dict[str, Array]
 RewardFn = Callable[[Array, Array], Array]
 
 
+# reached(achieved_goal [..., G], desired_goal [..., G]) -> bool [...]
+ReachedFn = Callable[[Array, Array], Array]
+# goal_distance(achieved_goal [..., G], desired_goal [..., G]) -> distance [...], not negative
+DistanceFn = Callable[[Array, Array], Array]
+
+
 class EnvState(Protocol):
     """What the trainer reads of an environment's state; the rest belongs to the environment.
 
-    A state may have `failed`, [] bool: True when the episode is not to be learned from, as after its physics blew up.
+    Optional fields, all [] bool:
+      failed: the physics blew up; nothing is learned from the episode.
+      done: the episode ends here (needs `EnvSpec.ends`).
+      terminal: the episode ends here and no future follows, for any goal, as after a dropped object (needs `EnvSpec.ends`).
     """
 
     @property
@@ -81,20 +147,19 @@ class EnvState(Protocol):
     def reward(self) -> Array: ...  # []
 
     @property
-    def success(self) -> Array: ...  # [], 1.0 where the goal is reached
+    def success(self) -> Array: ...  # [], 1.0 if the goal is reached
 
 
 class Env(Protocol):
-    """An unbatched, pure, goal-conditioned environment of fixed horizon; `jax.vmap` is the batch.
+    """An unbatched, pure, goal-conditioned environment; `jax.vmap` is the batch. `testing.check_env` tries one out.
 
-    `step` takes an action [A]. `compute_reward` takes goals [..., G] and gives rewards [...]; the learner's targets are clipped
-    to [-1/(1-gamma), 0], so they should lie between -1 and 0. `testing.check_env` tries an environment out.
+    `step` takes an action [A]. `compute_reward` maps goals [..., G] to rewards [...]. Optional members:
 
-    It may have `with_goal(state, goal)`, which gives a first state with another desired goal [G] and else the same: goal
-    generators need it.
-
-    It may have `check()`, which the trainer calls on the host after each epoch, and which raises ValueError where the steps
-    were not what they should be and their results do not show it.
+      spec: an `EnvSpec`. Without it, rewards lie in [-1, 0] and every episode has `episode_length` steps.
+      reached(achieved_goal, desired_goal): whether the goal is reached, bool [...]. Default: the reward is at its maximum.
+      goal_distance(achieved_goal, desired_goal): distance [...] for metrics, `weighted` and logs. Default: Euclidean.
+      with_goal(state, goal): a first state with another desired goal [G]; goal generators need it.
+      check(): called on the host after each epoch; raises ValueError if steps were silently wrong.
     """
 
     @property

@@ -13,6 +13,7 @@ from test_trainer import SMALL
 from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trainer
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.rollout import env_spec
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program import loop
@@ -243,7 +244,7 @@ def test_a_learner_that_cannot_be_split_is_refused():
                 if not method.startswith("_"):
                     setattr(self, method, getattr(learner, method))
 
-    own = Own(learners.make("ddpg", CONFIG, trainer.env_sizes(ENV)))
+    own = Own(learners.make("ddpg", CONFIG, env_spec(ENV)))
     with pytest.raises(ValueError, match=r"learner Own .* axis_name"):
         next(loop.train(ENV, CONFIG, learner=own, devices=2))
 

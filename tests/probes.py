@@ -87,4 +87,5 @@ BATCH = Batch(
     action=jnp.array([[1.0], [-1.0]]),
     reward=jnp.array([-1.0, 0.0]),
     discount=jnp.array([0.5, 0.5]),
+    row=jnp.arange(2),
 )

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import HParams, RunSpec, generators, learners, make_train, priorities, replay, samplers, testing
+from mjx_dher import HParams, RunSpec, learners, make_train, priorities, replay, samplers, testing
+from mjx_dher import rollout as rollout_lib
 from mjx_dher.components import COMPONENTS
-from mjx_dher.context import View
-from mjx_dher.contrib import goals, metrics
+from mjx_dher.context import Context
+from mjx_dher.contrib import generators, goals, metrics
 from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.program.loop import state_template
-from mjx_dher.scores import LearnedMetric
+from mjx_dher.samplers import LearnedMetric
 from mjx_dher.testing import PartError
 from point_mass import PointMass
 
 ENV = PointMass()
-VIEW = View(ENV.compute_reward, HParams())
+CONTEXT = Context(ENV.compute_reward, HParams())
 
 
 class WithoutGoals(PointMass):
@@ -30,7 +31,7 @@ class WithoutGoals(PointMass):
     with_goal = None
 
 
-def corner(key, obs, ring, view):
+def corner(key, obs, ring, context):
     """All of them to one corner."""
     return jnp.full_like(obs["desired_goal"], 0.3)
 
@@ -57,25 +58,34 @@ def test_a_rollout_is_played_for_the_goals_that_are_given():
     assert outcome.valid.all()
 
 
+def played_for(generate):
+    """Goals of the episodes of a run's first cycle."""
+    train = make_train(ENV, dataclasses.replace(SMALL, cycles_per_epoch=1, total_steps=40), generator=generate)
+    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
+    return state.replay.episodes.desired_goal[: SMALL.num_envs]
+
+
 def test_a_goal_that_is_not_finite_leaves_the_reset_s():
-    first = first_of()
-    own = first.obs["desired_goal"]
-    some = generators.Generator(lambda key, obs, ring, view: own.at[1, 0].set(jnp.nan).at[0].set(0.1).at[2, 1].set(jnp.inf))
-    found = generators.goals_of(some, jax.random.key(0), first.obs, None, VIEW)
+
+    def some(key, obs, ring, context):
+        return obs["desired_goal"].at[1, 0].set(jnp.nan).at[0].set(0.1).at[2, 1].set(jnp.inf)
+
+    found = played_for(some)
+    own = played_for(lambda key, obs, ring, context: obs["desired_goal"])
     np.testing.assert_array_equal(found, own.at[0].set(0.1))
 
 
 @pytest.mark.parametrize(
     ("gives", "generate"),
     [
-        ("float32[5]", lambda key, obs, ring, view: obs["desired_goal"][:, 0]),
-        ("int32[5, 2]", lambda key, obs, ring, view: jnp.ones((5, 2), jnp.int32)),
-        ("a list", lambda key, obs, ring, view: [0.1, 0.2]),
+        ("float32[4]", lambda key, obs, ring, context: obs["desired_goal"][:, 0]),
+        ("int32[4, 2]", lambda key, obs, ring, context: jnp.ones((4, 2), jnp.int32)),
+        ("float32[2]", lambda key, obs, ring, context: [0.1, 0.2]),
     ],
 )
 def test_goals_of_the_wrong_shape_are_refused(gives, generate):
-    with pytest.raises(ValueError, match=r"goals \[N, G\] = \[5, 2\]") as error:
-        generators.goals_of(generators.Generator(generate), jax.random.key(0), first_of().obs, None, VIEW)
+    with pytest.raises(ValueError, match=r"goals \[N, G\] .*\[4, 2\]") as error:
+        played_for(generate)
     assert gives in str(error.value)
 
 
@@ -83,7 +93,7 @@ def test_make_takes_a_name_a_place_or_a_function():
     assert generators.make("reset") is generators.reset
     assert generators.make("mjx_dher.contrib.goals:hgg") is generators.make("hgg") is goals.hgg
     assert generators.make(corner).generate is corner
-    for wrong in ("hggg", "mjx_dher.generators:rset", lambda obs: obs, 3):
+    for wrong in ("hggg", "mjx_dher.contrib.generators:rset", lambda obs: obs, 3):
         with pytest.raises(ValueError, match="generator"):
             generators.make(wrong)
 
@@ -95,13 +105,13 @@ def test_a_generator_needs_an_environment_that_takes_goals():
 
 
 def test_what_asks_the_learner_needs_one_that_answers():
-    made = learners.make("ddpg", SMALL, learners.Sizes(2, 2, 2))
+    made = learners.make("ddpg", SMALL, rollout_lib.env_spec(ENV))
     silent = dataclasses.make_dataclass("Silent", [])()
     for name in (method for method in vars(learners.Learner) if not method.startswith("_")):
         object.__setattr__(silent, name, getattr(made, name))
     parts = (
         {"priority": priorities.make("td_error")},
-        {"generator": "hgg"},
+        {"generator": generators.make("hgg")},
         {"sampler": samplers.make("closest", metric="time_to_goal")},
     )
     for part in parts:
@@ -119,29 +129,29 @@ def test_what_is_half_a_priority_is_refused():
         with pytest.raises(ValueError, match=message):
             priorities.make(wrong)
     ring = testing.methods.ring_of(testing.trial.random_episodes(ENV))
-    with pytest.raises(ValueError, match=r"weights \[E\] = \[32\]; this one gives \[2\]"):
-        priorities.renewed(Priority(renew=lambda ring, view: jnp.ones(2)), ring, VIEW)
-    nan = priorities.renewed(Priority(renew=lambda ring, view: jnp.full(32, jnp.nan)), ring, VIEW)
+    with pytest.raises(ValueError, match=r"weights \[E\] .*\[32\]; got .*\[2\]"):
+        priorities.renew(Priority(renew=lambda ring, context: jnp.ones(2)), ring, CONTEXT)
+    nan = priorities.renew(Priority(renew=lambda ring, context: jnp.full(32, jnp.nan)), ring, CONTEXT)
     np.testing.assert_array_equal(nan.priority, 0)
     for wrong in (
-        lambda key, sample, batch, number, view: jnp.zeros(number),
-        lambda key, sample, batch, number, view: jnp.arange(2),
+        lambda key, sample, batch, number, context: jnp.zeros(number),
+        lambda key, sample, batch, number, context: jnp.arange(2),
     ):
-        with pytest.raises(ValueError, match=r"choose gives indices \[B\]"):
-            priorities.chosen(Priority(choose=wrong), jax.random.key(0), *_candidates(ring), 4, VIEW)
+        with pytest.raises(ValueError, match=r"indices \[B\] of choose"):
+            priorities.choose(Priority(choose=wrong), jax.random.key(0), *_candidates(ring), 4, CONTEXT)
 
 
 def _candidates(ring):
     sample = replay.sample(ring, jax.random.key(0), 16)
     from mjx_dher.relabel import relabel
 
-    return sample, relabel(ring, sample, samplers.make("future"), ENV.compute_reward, HParams(), jax.random.key(1))
+    return sample, relabel(sample, samplers.make("future"), CONTEXT, jax.random.key(1)).batch
 
 
 def test_a_score_of_the_wrong_kind_is_refused():
-    sampler = samplers.make("weighted", metric=LearnedMetric(lambda episode, view: jnp.zeros(3)))
+    sampler = samplers.make("weighted", metric=LearnedMetric(lambda episode, context: jnp.zeros(3)))
     program = make_train(ENV, SMALL, sampler=sampler)
-    with pytest.raises(ValueError, match=r"score gives numbers \[T\+1\] = \[11\]"):
+    with pytest.raises(ValueError, match=r"score \[T\+1\] .*\[11\]"):
         jax.eval_shape(program.epoch, state_template(program))
     with pytest.raises(ValueError, match="cross_episode"):
         samplers.make(samplers.Sampler(lambda *five: five[0], True, metrics.time_to_goal.score))
@@ -150,9 +160,9 @@ def test_a_score_of_the_wrong_kind_is_refused():
 def test_trials_name_what_is_wrong():
     episodes = testing.trial.random_episodes(ENV)
     for wrong, message in (
-        (lambda key, obs, ring, view: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
-        (lambda key, obs, ring, view: jnp.full((16, 2), jnp.nan), "no goal is finite"),
-        (lambda key, obs, ring, view: 1 / 0, "ZeroDivisionError"),
+        (lambda key, obs, ring, context: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
+        (lambda key, obs, ring, context: jnp.full((16, 2), jnp.nan), "no goal is finite"),
+        (lambda key, obs, ring, context: 1 / 0, "ZeroDivisionError"),
     ):
         with pytest.raises(PartError, match=message):
             testing.check_generator(wrong, ENV, None, episodes)
@@ -160,13 +170,13 @@ def test_trials_name_what_is_wrong():
         testing.check_generator(corner, WithoutGoals())
     assert "100% of the goals" in testing.check_generator(corner, ENV, None, episodes)
     with pytest.raises(PartError, match="negative"):
-        testing.check_priority(Priority(renew=lambda ring, view: -ring.priority - 1.0), ENV, None, episodes)
+        testing.check_priority(Priority(renew=lambda ring, context: -ring.priority - 1.0), ENV, None, episodes)
     with pytest.raises(PartError, match="indices"):
         testing.check_priority(
-            Priority(choose=lambda key, sample, batch, number, view: 99 + jnp.arange(number)), ENV, None, episodes
+            Priority(choose=lambda key, sample, batch, number, context: 99 + jnp.arange(number)), ENV, None, episodes
         )
     with pytest.raises(PartError, match="negative"):
-        testing.check_metric(LearnedMetric(lambda episode, view: -jnp.ones(11)), ENV, episodes)
+        testing.check_metric(LearnedMetric(lambda episode, context: -jnp.ones(11)), ENV, episodes)
 
 
 def test_built_in_parts_pass_their_trials():
@@ -231,8 +241,8 @@ def test_lanes_learn_as_runs_alone_do():
     together = make_train(
         ENV,
         SMALL,
-        priority=priorities.one_of(map(priorities.make, names[0])),
-        generator=generators.one_of(map(generators.make, names[1])),
+        priority=priorities.join(map(priorities.make, names[0])),
+        generator=generators.join(map(generators.make, names[1])),
     )
     lanes = [Lane(*hparams, 0, names[0].index(p), names[1].index(g)) for p, g in kinds]
     stacked = jax.tree.map(lambda *x: jnp.array(x, jnp.float32), *lanes)

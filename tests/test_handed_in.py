@@ -83,12 +83,12 @@ def test_what_a_sampler_gives_is_checked(ring, message, make):
 def test_samplers_side_by_side_are_checked_each(ring, gives):
     """In `one_of` a scalar would be spread over all goals, and an integer would become a number."""
     numbers = collections.namedtuple("Numbered", (*HParams._fields, "choice"))(*HParams(), 1)
-    together = samplers.one_of([future, lambda a, d, s, h: gives])
+    together = samplers.join([future, lambda a, d, s, h: gives])
     sample = replay.sample(ring, jax.random.key(0), 5)
     with pytest.raises(ValueError, match="a sampler gives log weights"):
         trace(lambda: relabel.hindsight_goals(ring, sample, together, numbers, jax.random.key(1)))
     with pytest.raises(ValueError, match="one or more samplers"):
-        samplers.one_of([])
+        samplers.join([])
 
 
 PRIORITIES = {
@@ -110,7 +110,7 @@ def test_a_priority_in_the_ring_is_a_positive_number_or_0(ring, episodes):
     weights = jnp.full(16, -1.0).at[:3].set(jnp.array([jnp.nan, jnp.inf, 2.0]))
     added = replay.add(replay.init(first(episodes), 16), episodes, weights)
     np.testing.assert_array_equal(added.priority, [0, 0, 2, *(0,) * 13])
-    sums = replay.cumulative_priority(added)
+    sums = replay.cumulative(added)
     rows = replay.draw_rows(added, jax.random.key(0), 50, 1.0, sums)
     np.testing.assert_array_equal(rows, 2)
     with pytest.raises(ValueError, match="a priority must be a number; got 'x'"):
@@ -278,7 +278,7 @@ LEARNERS = {
 
 @pytest.mark.parametrize("message", LEARNERS)
 def test_what_a_learner_gives_is_checked(message):
-    made = ddpg.make(SMALL, trainer.env_sizes(ENV), trainer.learners.networks.mlp)
+    made = ddpg.make(SMALL, rollout.env_spec(ENV), trainer.learners.networks.mlp)
     own = type("Own", (DDPG,), LEARNERS[message])(*(getattr(made, field.name) for field in dataclasses.fields(made)))
     train = make_train(ENV, SMALL, learner=own)
     with pytest.raises(ValueError, match=message):

@@ -100,7 +100,7 @@ EDITS = {
     ("weight_normalization",): "sum",
     ("metric",): "mjx_dher.samplers:position",
     ("priority",): "mjx_dher.priorities:eventful",
-    ("generator",): "mjx_dher.generators:reset",
+    ("generator",): "mjx_dher.contrib.generators:reset",
     ("learner",): "mjx_dher.learners.ddpg:make",
     ("networks",): "mjx_dher.networks:mlp",
     ("seed",): 7,

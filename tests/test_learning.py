@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_dher import envs, learners, presets, samplers, trainer
+from mjx_dher import envs, learners, presets, samplers
 from mjx_dher.evaluate import play_policy
+from mjx_dher.rollout import env_spec
 from mjx_dher.runs.program.loop import train
 
 
@@ -14,7 +15,7 @@ def test_reach_is_learned():
     """The preset `cpu`, physics included: at least 0.99 of 300 fresh episodes; an untrained policy reaches hardly any."""
     spec = presets.preset("cpu", "reach", sampler="weighted")
     env = envs.make("reach")
-    learner = learners.make(spec.learner, spec.config, trainer.env_sizes(env), spec.networks)
+    learner = learners.make(spec.learner, spec.config, env_spec(env), spec.networks)
     for progress in train(env, spec.config, spec.hparams, seed=0, sampler=samplers.make(*spec.sampler_choice), learner=learner):
         trained = progress.state.learner
     before, after = (

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from mjx_dher import priorities, relabel, replay, samplers, scores
+from mjx_dher import priorities, relabel, replay, samplers
 from mjx_dher.config import HParams
-from mjx_dher.context import Values, View
+from mjx_dher.context import Context, Values
 from mjx_dher.contrib import episodes, goals, metrics, transitions
 from mjx_dher.replay import Sample
 from mjx_dher.types import Batch, Episode
@@ -24,7 +24,7 @@ REWARD = Clock().compute_reward  # 0 within 0.1, else -1
 def episode_of(achieved, desired=None):
     achieved = jnp.asarray(achieved, jnp.float32)
     desired = jnp.zeros(achieved.shape[1]) if desired is None else jnp.asarray(desired, jnp.float32)
-    return Episode(achieved, achieved, desired, jnp.zeros((len(achieved) - 1, 2)))
+    return Episode(achieved, achieved, desired, jnp.zeros((len(achieved) - 1, 2))).filled()
 
 
 def test_next_future_mixes_the_step_s_own_goal_with_the_future():
@@ -61,26 +61,26 @@ def linear_values(observation, goal, action):
 
 
 VALUES = Values(lambda observation, goal: jnp.zeros((*observation.shape[:-1], 2)), linear_values)
-VIEW = View(REWARD, HP._replace(priority_fraction=1.0), 0.0, VALUES)
+CONTEXT = Context(REWARD, HP._replace(priority_fraction=1.0), values=VALUES)
 
 
 def test_time_to_goal_is_minus_the_learner_s_value():
     episode = episode_of([[0.0, 0], [0.2, 0], [0.6, 0]], [0.5, 0])
-    np.testing.assert_allclose(scores.score_of(metrics.time_to_goal.score, episode, VIEW), [5.0, 3.0, 1.0], rtol=1e-5)
+    np.testing.assert_allclose(metrics.time_to_goal.score(episode, CONTEXT), [5.0, 3.0, 1.0], rtol=1e-5)
     sampler = samplers.make("closest", metric="time_to_goal")
-    (score,) = scores.of_episodes(sampler.score, jax.tree.map(lambda x: x[None], episode), VIEW)
+    (score,) = samplers.score_episodes(sampler, jax.tree.map(lambda x: x[None], episode), CONTEXT)
     log_weights = samplers.weigh(sampler, episode.achieved_goal, episode.desired_goal, jnp.int32(0), HP, score)
     np.testing.assert_array_equal(log_weights, [-jnp.inf, -jnp.inf, 0.0])
-    with pytest.raises(ValueError, match="scores"):
+    with pytest.raises(ValueError, match="score"):
         samplers.weigh(sampler, episode.achieved_goal, episode.desired_goal, jnp.int32(0), HP)
 
 
 def test_energy_counts_what_was_gained():
     lifted = episode_of([[0, 0, 0.4], [0, 0, 0.4], [0, 0, 0.5], [0, 0, 0.5]])
     # 0.1 m in a step is 2.5 m/s: 0.981 + 3.125 J a kg gained at once; its loss when it stops does not count.
-    np.testing.assert_allclose(episodes.energy(lifted, REWARD, HP), 0.981 + 3.125, rtol=1e-4)
-    np.testing.assert_allclose(episodes.energy(episode_of([[0, 0], [0.1, 0], [0.1, 0]]), REWARD, HP), 3.125, rtol=1e-4)
-    assert episodes.energy(episode_of(jnp.ones((4, 3))), REWARD, HP) == 0.0
+    np.testing.assert_allclose(priorities.energy(lifted, CONTEXT), 0.981 + 3.125, rtol=1e-4)
+    np.testing.assert_allclose(priorities.energy(episode_of([[0, 0], [0.1, 0], [0.1, 0]]), CONTEXT), 3.125, rtol=1e-4)
+    assert priorities.energy(episode_of(jnp.ones((4, 3))), CONTEXT) == 0.0
 
 
 def test_diversity_is_a_sum_of_determinants():
@@ -89,7 +89,7 @@ def test_diversity_is_a_sum_of_determinants():
     unit = [(np.array(a) / np.linalg.norm(a), np.array(b) / np.linalg.norm(b)) for a, b in pairs]
     by_hand = sum(np.linalg.det(np.stack(pair) @ np.stack(pair).T) for pair in unit)  # 1 + 1/2 + 0
     np.testing.assert_allclose(by_hand, 1.5, rtol=1e-6)
-    np.testing.assert_allclose(episodes.diversity(episode_of(path), REWARD, HP), by_hand, rtol=1e-5)
+    np.testing.assert_allclose(episodes.diversity(episode_of(path), CONTEXT), by_hand, rtol=1e-5)
 
 
 def ring_with(paths, rows=None):
@@ -101,7 +101,7 @@ def ring_with(paths, rows=None):
 def test_max_entropy_ranks_rare_episodes_above_common_ones():
     common = [[[0.0, 0.0], [0.01 * i, 0.0]] for i in range(10)]
     rare = [[[0.0, 0.0], [0.0, 1.0]], [[0.0, 0.0], [0.0, -3.0]]]
-    renew = jax.jit(lambda ring: priorities.renewed(episodes.max_entropy, ring, VIEW))
+    renew = jax.jit(lambda ring: priorities.renew(episodes.max_entropy, ring, CONTEXT))
     renewed = renew(ring_with([*common, *rare], rows=20))
     weights = np.asarray(renewed.priority)
     assert sorted(weights[:12]) == list(range(12))
@@ -123,22 +123,23 @@ def candidates(desired, achieved_before, number, hindsight=True):
     path = jnp.stack([before, before], axis=1)
     own = desired + 7.0 if hindsight else desired
     zeros = jnp.zeros(len(desired), jnp.int32)
-    sample = Sample(before, before, before, path, own, zeros, zeros)
-    return sample, Batch(before, before, desired, before, REWARD(before, desired))
+    ones = jnp.ones_like(zeros)
+    sample = Sample(before, before, before, path, own, zeros, zeros, ones, zeros > 0)
+    return sample, Batch(before, before, desired, before, REWARD(before, desired), jnp.full(len(desired), HP.gamma), zeros)
 
 
 def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
     sample, batch = candidates([0.0, 0.05, 0.5, 0.05] * 50, [0.0] * 200, 50)
-    np.testing.assert_array_equal(transitions.not_misled(sample, batch, VIEW)[:4], [0, 0, 1, 0])
-    _, kept = priorities.chosen(transitions.not_misleading, jax.random.key(0), sample, batch, 50, VIEW)
+    np.testing.assert_array_equal(transitions.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
+    _, kept = priorities.choose(transitions.not_misleading, jax.random.key(0), sample, batch, 50, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
     own, as_it_is = candidates([0.0] * 4, [0.0] * 4, 1, hindsight=False)
-    np.testing.assert_array_equal(transitions.not_misled(own, as_it_is, VIEW), 1)
+    np.testing.assert_array_equal(transitions.not_misled(own, as_it_is, CONTEXT), 1)
 
 
 def test_where_all_candidates_are_misleading_any_is_kept():
     sample, batch = candidates([0.0, 0.01, 0.02, 0.03] * 200, [0.0] * 800, 200)
-    _, kept = priorities.chosen(transitions.not_misleading, jax.random.key(0), sample, batch, 200, VIEW)
+    _, kept = priorities.choose(transitions.not_misleading, jax.random.key(0), sample, batch, 200, CONTEXT)
     assert len(np.unique(kept.desired_goal[:, 0])) == 4
 
 
@@ -146,23 +147,23 @@ def test_errors_of_one_step_by_hand():
     sample, batch = candidates([0.05, 0.3, 0.5, 1.0], [0.0] * 4, 1)
     # Value of the next state = that of this: -10 |g|. r + 0.98 v - v, r -1 but for the first goal, which is within reach.
     by_hand = [0.0 - 0.98 * 0.5 + 0.5, -1 - 0.98 * 3 + 3, -1 - 0.98 * 5 + 5, -1 - 0.98 * 10 + 10]
-    np.testing.assert_allclose(VIEW.td_error(batch), by_hand, atol=1e-5)
+    np.testing.assert_allclose(CONTEXT.td_error(batch), by_hand, atol=1e-5)
     del sample
 
 
 def test_td_error_ranks_episodes_and_transitions():
     ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]], rows=3)
-    renewed = priorities.renewed(transitions.td_error, ring, VIEW)
+    renewed = priorities.renew(priorities.td_error, ring, CONTEXT)
     np.testing.assert_allclose(renewed.priority, [0.5 * 0.02, 1 - 5 * 0.02, 0.0], atol=1e-5)
     sample, batch = candidates([0.0, 0.0, 0.0, 0.5] * 100, [0.0] * 400, 100)  # an error of 0, three times, and 0.9
-    _, kept = priorities.chosen(transitions.td_error, jax.random.key(1), sample, batch, 100, VIEW)
+    _, kept = priorities.choose(priorities.td_error, jax.random.key(1), sample, batch, 100, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
 
 
 def test_weights_are_kept_in_proportion():
-    choose = priorities.by_weight(lambda sample, batch, view: batch.desired_goal[:, 0])
+    choose = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
     sample, batch = candidates([1.0, 2.0, 0.0, 5.0] * 4000, [0.0] * 16000, 4000)
-    indices = choose(jax.random.key(0), sample, batch, 4000, VIEW)
+    indices = choose(jax.random.key(0), sample, batch, 4000, CONTEXT)
     found = np.bincount(np.asarray(indices) % 4, minlength=4)
     expected = 4000 * np.array([1, 2, 5]) / 8
     assert found[2] == 0
@@ -171,16 +172,16 @@ def test_weights_are_kept_in_proportion():
 
 def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
     sample, batch = candidates([0.0, 0.0, 0.0, 1.0] * 2000, [0.5] * 8000, 2000)
-    half = VIEW._replace(hparams=HP._replace(priority_fraction=0.5))
-    by_last = priorities.Priority(choose=priorities.by_weight(lambda sample, batch, view: batch.desired_goal[:, 0]))
-    _, kept = priorities.chosen(by_last, jax.random.key(0), sample, batch, 2000, half)
+    half = CONTEXT._replace(hparams=HP._replace(priority_fraction=0.5))
+    by_last = priorities.Priority(choose=priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0]))
+    _, kept = priorities.choose(by_last, jax.random.key(0), sample, batch, 2000, half)
     assert abs(float(kept.desired_goal[:, 0].mean()) - 0.5) < 0.05
 
 
 def test_the_curriculum_goes_from_diverse_to_near_goals():
     group = [0.0, 0.0, 0.0, 1.0, 1.0, 5.0, 5.0, 5.0]
     sample, batch = candidates(group, [0.0] * 8, 2)
-    first = VIEW._replace(progress=0.0)
+    first = CONTEXT._replace(progress=0.0)
     chosen = transitions.pick_curriculum(jax.random.key(0), sample, batch, 2, first._replace(progress=-1.0))  # no proximity
     assert {group[int(i)] for i in chosen} == {0.0, 5.0}
     late = transitions.pick_curriculum(jax.random.key(0), sample, batch, 3, first._replace(progress=1.0))
@@ -194,14 +195,14 @@ def test_the_curriculum_s_gain_by_hand():
     distance = np.abs(goals_[:, None] - goals_)
     gain = np.exp(-(distance**2) / distance.mean() ** 2).sum(axis=1) - goals_
     sample, batch = candidates(goals_, [0.0] * 3, number)
-    assert int(transitions.pick_curriculum(jax.random.key(0), sample, batch, 1, VIEW)[0]) == int(np.argmax(gain))
+    assert int(transitions.pick_curriculum(jax.random.key(0), sample, batch, 1, CONTEXT)[0]) == int(np.argmax(gain))
 
 
 def test_a_2_dpp_draws_pairs_in_proportion_to_determinants():
     line = np.array([0.0, 0.3, 1.0, 1.0])
     sample, batch = candidates(line, [0.0] * 4, 1)
     keys = jax.random.split(jax.random.key(0), 20_000)
-    pairs = np.sort(jax.vmap(lambda key: transitions.pick_diverse(key, sample, batch, 2, VIEW))(keys), axis=1)
+    pairs = np.sort(jax.vmap(lambda key: transitions.pick_diverse(key, sample, batch, 2, CONTEXT))(keys), axis=1)
     kernel = np.exp(-((line[:, None] - line) ** 2) / (2 * 0.5**2))
     expected = {(i, j): np.linalg.det(kernel[np.ix_([i, j], [i, j])]) for i in range(4) for j in range(i + 1, 4)}
     total = sum(expected.values())
@@ -213,7 +214,7 @@ def test_groups_keep_their_own_and_take_any_number():
     for number in (1, 6):
         sample, batch = candidates(np.arange(4.0 * number), [0.0] * 4 * number, number)
         for priority in (transitions.curriculum, transitions.dpp):
-            indices = np.asarray(priority.choose(jax.random.key(0), sample, batch, number, VIEW))
+            indices = np.asarray(priority.choose(jax.random.key(0), sample, batch, number, CONTEXT))
             assert indices.shape == (number,)
             assert len(set(indices)) == number
             assert (indices >= 0).all()
@@ -226,10 +227,10 @@ def test_archer_multiplies_the_reward_of_replaced_goals_alone():
     own, as_it_is = candidates([0.5, 0.0], [0.0, 0.0], 1, hindsight=False)
     np.testing.assert_array_equal(relabel.hindsight_factor(own, as_it_is, HP._replace(hindsight_reward=0.5)), [1.0, 1.0])
     ring = ring_with([[[0.0, 0], [0.5, 0], [1.0, 0]]])
-    cumulative = replay.cumulative_priority(ring)
-    arguments = ring, jax.random.key(0), (64,), samplers.make("future"), REWARD
-    whole = relabel.draw_batches(*arguments, HP, cumulative)
-    half = relabel.draw_batches(*arguments, HP._replace(hindsight_reward=0.5), cumulative)
+    cumulative = replay.cumulative(ring)
+    arguments = ring, jax.random.key(0), (64,), samplers.make("future")
+    whole = relabel.draw_batches(*arguments, Context(REWARD, HP), cumulative)
+    half = relabel.draw_batches(*arguments, Context(REWARD, HP._replace(hindsight_reward=0.5)), cumulative)
     replaced = np.any(np.asarray(whole.desired_goal) != 0, axis=-1)
     np.testing.assert_array_equal(half.reward, np.where(replaced, 0.5, 1.0) * whole.reward)
     assert set(np.unique(half.reward)) == {-1.0, -0.5, 0.0}
@@ -252,11 +253,13 @@ def test_hgg_takes_achieved_goals_on_the_way_to_the_desired_ones():
     ring = ring_with([right, up, still, still])
     desired = jnp.tile(jnp.array([[2.0, 0.0], [0.0, 2.0]]), (32, 1))
     obs = {"observation": jnp.zeros((64, 2)), "achieved_goal": jnp.zeros((64, 2)), "desired_goal": desired}
-    flat = VIEW._replace(values=Values(VALUES.act, lambda observation, goal, action: 0.0 * observation[..., 0]))
+    flat = CONTEXT._replace(values=Values(VALUES.act, lambda observation, goal, action: 0.0 * observation[..., 0]))
     found = np.asarray(jax.jit(lambda ring: goals.hindsight_goals(jax.random.key(0), obs, ring, flat))(ring))
     assert np.mean(np.abs(found - np.tile([[0.6, 0.0], [0.0, 0.6]], (32, 1))).max(axis=1) < 1e-6) > 0.9  # rows are drawn
     # A critic that says that what is far takes long makes nearer goals of them: |g - a| - (1 - gamma) V D / L.
-    steep = VIEW._replace(hparams=HP, values=Values(VALUES.act, lambda o, goal, action: -50.0 * (jnp.abs(goal).sum(-1) > 0.5)))
+    steep = CONTEXT._replace(
+        hparams=HP, values=Values(VALUES.act, lambda o, goal, action: -50.0 * (jnp.abs(goal).sum(-1) > 0.5))
+    )
     shy = np.asarray(jax.jit(lambda ring: goals.hindsight_goals(jax.random.key(0), obs, ring, steep))(ring))
     assert np.mean(np.abs(shy - np.tile([[0.3, 0.0], [0.0, 0.3]], (32, 1))).max(axis=1) < 1e-6) > 0.9
 
@@ -265,6 +268,6 @@ def test_hgg_leaves_the_reset_s_goals_where_nothing_moved():
     obs = {"observation": jnp.zeros((4, 2)), "achieved_goal": jnp.zeros((4, 2)), "desired_goal": jnp.ones((4, 2))}
     still = ring_with([[[0.0, 0], [0.0, 0]]] * 2)
     empty = replay.init(episode_of([[0.0, 0], [0.0, 0]]), 2)
-    generate = jax.jit(lambda ring: goals.hindsight_goals(jax.random.key(0), obs, ring, VIEW))
+    generate = jax.jit(lambda ring: goals.hindsight_goals(jax.random.key(0), obs, ring, CONTEXT))
     for ring in (still, empty):
         np.testing.assert_array_equal(generate(ring), obs["desired_goal"])

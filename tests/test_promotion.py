@@ -65,7 +65,7 @@ def test_an_epoch_with_every_sampler_and_kernel_as_a_sweep_has_them():
         *(samplers.make("weighted", k) for k in COMPONENTS["weight_kernel"]),
     ]
     every += [samplers.make("weighted", normalization=n) for n in COMPONENTS["weight_normalization"]]
-    program = make_train(PointMass(), SMALL, sampler=samplers.one_of(every))
+    program = make_train(PointMass(), SMALL, sampler=samplers.join(every))
     lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)
     jax.eval_shape(jax.vmap(program.epoch), states)
@@ -78,9 +78,9 @@ def test_an_epoch_with_every_priority_and_generator_as_a_sweep_has_them(group):
     program = make_train(
         PointMass(),
         SMALL,
-        sampler=samplers.one_of([samplers.make("random"), *weighted]),
-        priority=priorities.one_of([priorities.make(name) for name in names]),
-        generator=generators.one_of([generators.make(name) for name in COMPONENTS["generator"]]),
+        sampler=samplers.join([samplers.make("random"), *weighted]),
+        priority=priorities.join([priorities.make(name) for name in names]),
+        generator=generators.join([generators.make(name) for name in COMPONENTS["generator"]]),
     )
     lanes = Lane(*(jnp.zeros(3) for _ in Lane._fields))
     states = jax.eval_shape(jax.vmap(program.init), jax.random.split(jax.random.key(0), 3), lanes)

@@ -105,7 +105,7 @@ def test_readings_are_lanes_of_one_program():
         for k in COMPONENTS["weight_kernel"]
     ]
     lane = collections.namedtuple("Lane", (*HParams._fields, "choice"))
-    joined = jax.jit(lambda choice: samplers.one_of(every).log_weights(ACHIEVED, DESIRED, jnp.array(1), lane(*HP, choice)))
+    joined = jax.jit(lambda choice: samplers.join(every).log_weights(ACHIEVED, DESIRED, jnp.array(1), lane(*HP, choice)))
     for choice, sampler in enumerate(every):
         np.testing.assert_allclose(samplers.probabilities(joined(choice)), table(sampler, 1), atol=1e-6)
     assert joined._cache_size() == 1

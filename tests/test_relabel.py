@@ -8,13 +8,15 @@ import pytest
 from mjx_dher import replay, samplers
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
-from mjx_dher.relabel import draw_batches, hindsight_goals, look_ahead, relabel
+from mjx_dher.context import Context
+from mjx_dher.relabel import add_choices, draw_batches, hindsight_goals, look_ahead, relabel
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Batch, Episode
 from probes import Clock
 
 HP = HParams()
 ENV = Clock(episode_length=12)
+CONTEXT = Context(ENV.compute_reward, HP)
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +34,14 @@ def index_of(goal, episode_goals):
     return np.where(equal.any(-1), equal.argmax(-1), -1)
 
 
+def goals_of(ring, sample, sampler, hparams, key):
+    return hindsight_goals(add_choices(ring, sample, sampler, None, key), sampler, hparams, key).goals
+
+
 @pytest.mark.parametrize("name", COMPONENTS["sampler"])
 def test_goals_come_from_where_the_sampler_may_look(ring, name):
     sample = replay.sample(ring, jax.random.key(1), 5000)
-    goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(2))
+    goals = goals_of(ring, sample, samplers.make(name), HP, jax.random.key(2))
     index, step = index_of(goals, sample.episode_goals), np.asarray(sample.step)
     if name == "random":
         anywhere = np.asarray(ring.episodes.achieved_goal[:64]).reshape(-1, 2)
@@ -56,17 +62,17 @@ def test_goals_come_from_where_the_sampler_may_look(ring, name):
 def test_a_sampler_s_log_weights_are_one_for_each_goal(ring, gives, log_weights):
     sample = replay.sample(ring, jax.random.key(1), 5)
     with pytest.raises(ValueError, match="log weights") as error:
-        hindsight_goals(ring, sample, samplers.Sampler(log_weights), HP, jax.random.key(0))
+        hindsight_goals(sample, samplers.Sampler(log_weights), HP, jax.random.key(0))
     assert "[13]" in str(error.value)
-    assert str(error.value).endswith(gives)
+    assert gives in str(error.value)
 
 
-@pytest.mark.parametrize("k", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("k", [0.0, 1.0, 4.0, np.inf])
 def test_relabelled_share(ring, k):
     sample = replay.sample(ring, jax.random.key(3), 20_000)
-    batch = relabel(ring, sample, samplers.make("future"), ENV.compute_reward, HP._replace(her_k=k), jax.random.key(4))
+    batch = relabel(sample, samplers.make("future"), Context(ENV.compute_reward, HP._replace(her_k=k)), jax.random.key(4)).batch
     kept = np.all(np.asarray(batch.desired_goal == sample.desired_goal), axis=-1)
-    expected = k / (k + 1)
+    expected = 1.0 if k == np.inf else k / (k + 1)
     assert abs((1 - kept.mean()) - expected) <= 4 * np.sqrt(expected * (1 - expected) / 20_000)
 
 
@@ -77,7 +83,7 @@ def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
     def draw(key):
         keys = jax.random.split(key, 3)
         sample = replay.sample(ring, keys[0], count)
-        return sample, relabel(ring, sample, samplers.make("weighted"), ENV.compute_reward, HP, keys[1])
+        return sample, relabel(sample, samplers.make("weighted"), CONTEXT, keys[1]).batch
 
     sample, batch = draw(jax.random.key(5))
     achieved = np.asarray(batch.next_observation)  # the probe observes just its achieved goal
@@ -94,7 +100,7 @@ def test_weighted_prefers_goals_near_the_desired_one(ring):
     sample = replay.sample(ring, jax.random.key(6), 20_000)
 
     def mean_distance(name):
-        goals = hindsight_goals(ring, sample, samplers.make(name), HP, jax.random.key(7))
+        goals = goals_of(ring, sample, samplers.make(name), HP, jax.random.key(7))
         return float(jnp.mean(jnp.linalg.norm(goals - sample.desired_goal, axis=-1)))
 
     assert mean_distance("closest") < mean_distance("epsilon_closest") < mean_distance("weighted") < mean_distance("future")
@@ -103,18 +109,18 @@ def test_weighted_prefers_goals_near_the_desired_one(ring):
 def test_one_of_several_samplers_draws_what_it_would_alone(ring):
     """Whichever a run is told to use by its number, to the bit; `random`, which looks elsewhere in the ring, too."""
     names = ("future", "random", "weighted", "closest", "final")
-    together = samplers.one_of([samplers.make(name) for name in names])
+    together = samplers.join([samplers.make(name) for name in names])
     Numbered = collections.namedtuple("Numbered", (*HParams._fields, "choice"))
     sample = replay.sample(ring, jax.random.key(0), 64)
     goals = set()
     for choice, name in enumerate(names):
         numbers = Numbered(*HParams(), choice)
-        found = hindsight_goals(ring, sample, together, numbers, jax.random.key(1))
-        alone = hindsight_goals(ring, sample, samplers.make(name), HParams(), jax.random.key(1))
+        found = goals_of(ring, sample, together, numbers, jax.random.key(1))
+        alone = goals_of(ring, sample, samplers.make(name), HParams(), jax.random.key(1))
         np.testing.assert_array_equal(found, alone)
         goals.add(found.tobytes())
     assert len(goals) == len(names)
-    assert samplers.one_of([together]) is together
+    assert samplers.join([together]) is together
 
 
 LINE = Episode(  # four steps along a line: 0, 1, 3, 6, 10
@@ -153,9 +159,12 @@ def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
         desired_goal=LINE.desired_goal[None],
         step=jnp.array([step]),
         row=jnp.array([1]),
+        length=jnp.array([4]),
+        terminal=jnp.array([False]),
     )
-    one = Batch(sample.observation, sample.next_observation, jnp.array([[goal]]), sample.action, jnp.array([9.0]))
-    batch = look_ahead(ring, sample, one, near, 0.5, 3)
+    ends = sample.observation, sample.next_observation
+    one = Batch(*ends, jnp.array([[goal]]), sample.action, jnp.array([9.0]), jnp.array([0.5]), sample.row)
+    batch = look_ahead(ring, sample, one, Context(near, HP._replace(gamma=0.5)), 3)
     np.testing.assert_allclose(batch.reward, [reward])
     np.testing.assert_allclose(batch.discount, [0.5**num_steps])
     np.testing.assert_array_equal(batch.next_observation, LINE.observation[step + num_steps][None])
@@ -164,13 +173,13 @@ def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
 
 def test_one_step_ahead_is_the_transition(ring):
     """Drawn alike with one step and several: the same transitions and goals; with one, the reward and gamma themselves."""
-    args = jax.random.key(5), (300,), samplers.make("future"), ENV.compute_reward, HP
+    args = jax.random.key(5), (300,), samplers.make("future"), CONTEXT
 
     def draw(ring, n_step):
-        return draw_batches(ring, *args, replay.cumulative_priority(ring), n_step)
+        return draw_batches(ring, *args, replay.cumulative(ring), n_step)
 
     single, several = (jax.jit(draw, static_argnums=1)(ring, n_step) for n_step in (1, 4))
-    assert single.discount is None
+    np.testing.assert_array_equal(single.discount, np.float32(HP.gamma))
     for name in ("observation", "action", "desired_goal"):
         np.testing.assert_array_equal(getattr(single, name), getattr(several, name))
     once = np.isclose(several.discount, HP.gamma)

@@ -10,15 +10,15 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, make_train, priorities, replay, testing
-from mjx_dher.context import View
-from mjx_dher.contrib import episodes, transitions
+from mjx_dher.context import Context
+from mjx_dher.contrib import episodes
 from mjx_dher.priorities import Priority
 from point_mass import PointMass
 
 ENV = PointMass()
-VIEW = View(ENV.compute_reward, HParams())
+CONTEXT = Context(ENV.compute_reward, HParams())
 # The share of the run that has been made says at which cycle an episode was renewed.
-BY_CYCLE = Priority(renew=lambda ring, view: jnp.full(ring.priority.shape, 1.0 + view.progress), by_part=True)
+BY_CYCLE = Priority(renew=lambda ring, context: jnp.full(ring.priority.shape, 1.0 + context.progress), by_part=True)
 
 
 def ring_of(number, rows):
@@ -41,12 +41,12 @@ def test_only_the_rows_that_are_named_are_renewed():
     ring = ring_of(5, rows=8)
     seen = []
 
-    def renew(part, view):
+    def renew(part, context):
         seen.append((part.priority, part.size, part.episodes))
         return 10.0 + part.priority
 
     rows = jnp.array([3, 1, 6, 3])  # a row twice, and one that holds no episode
-    renewed = priorities.renewed(Priority(renew=renew), ring, VIEW, rows)
+    renewed = priorities.renew(Priority(renew=renew), ring, CONTEXT, rows)
     np.testing.assert_array_equal(renewed.priority, [1, 12, 3, 14, 5, 0, 0, 0])
     ((weights, size, handed),) = seen
     np.testing.assert_array_equal(weights, [4, 2, 0, 4])
@@ -56,16 +56,16 @@ def test_only_the_rows_that_are_named_are_renewed():
 
 
 def test_weights_of_the_wrong_number_are_refused():
-    with pytest.raises(ValueError, match=r"weights \[E\] = \[2\]; this one gives \[8\]"):
-        priorities.renewed(Priority(renew=lambda part, view: jnp.ones(8)), ring_of(5, rows=8), VIEW, jnp.array([0, 1]))
+    with pytest.raises(ValueError, match=r"weights \[E\] .*shape \[2\]; got .*\[8\]"):
+        priorities.renew(Priority(renew=lambda part, context: jnp.ones(8)), ring_of(5, rows=8), CONTEXT, jnp.array([0, 1]))
 
 
 def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
     rows, ring = jnp.array([0, 2]), ring_of(5, rows=8)
-    joined = priorities.one_of([priorities.eventful, BY_CYCLE])
+    joined = priorities.join([priorities.eventful, BY_CYCLE])
     for number, alone in enumerate((priorities.whole(priorities.eventful), BY_CYCLE)):
-        found = priorities.renewed(joined, ring, VIEW._replace(hparams=SimpleNamespace(priority_choice=number)), rows)
-        np.testing.assert_array_equal(found.priority, priorities.renewed(alone, ring, VIEW, rows).priority)
+        found = priorities.renew(joined, ring, CONTEXT._replace(hparams=SimpleNamespace(priority_choice=number)), rows)
+        np.testing.assert_array_equal(found.priority, priorities.renew(alone, ring, CONTEXT, rows).priority)
 
 
 def renewed_at(renewals, priority):
@@ -81,12 +81,12 @@ def renewed_at(renewals, priority):
 def test_a_priority_that_compares_episodes_is_handed_all_of_them():
     for priority in (
         dataclasses.replace(BY_CYCLE, by_part=False),
-        priorities.one_of([BY_CYCLE, dataclasses.replace(BY_CYCLE, by_part=False)]),
+        priorities.join([BY_CYCLE, dataclasses.replace(BY_CYCLE, by_part=False)]),
     ):
         assert not priority.by_part
     np.testing.assert_array_equal(renewed_at(1, dataclasses.replace(BY_CYCLE, by_part=False)), 3)
-    assert priorities.one_of([priorities.eventful, BY_CYCLE]).by_part
-    assert transitions.td_error.by_part
+    assert priorities.join([priorities.eventful, BY_CYCLE]).by_part
+    assert priorities.td_error.by_part
     assert not episodes.max_entropy.by_part
 
 

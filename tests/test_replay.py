@@ -18,7 +18,7 @@ def make_episodes(ids, num_steps=T):
         achieved_goal=jnp.tile(steps, (1, 1, 2)),
         desired_goal=jnp.tile(base[:, 0] + 500, (1, 2)),
         action=steps[:, :-1],
-    )
+    ).filled()
 
 
 def make_ring(num_rows):
@@ -84,11 +84,11 @@ def test_refuses_an_empty_ring_and_lengths_that_disagree():
 
 def test_draw_rows_mixes_by_priority_and_uniform():
     ring = replay.add(make_ring(6), make_episodes([0, 1, 2, 3]), jnp.array([0.0, 1.0, 0.0, 1.0]))
-    cumulative = replay.cumulative_priority(ring)
-    np.testing.assert_array_equal(cumulative, np.array([0, 1, 1, 2, 2, 2]) << 28)
+    cumulative = replay.cumulative(ring)
+    np.testing.assert_array_equal(cumulative.priority, np.array([0, 1, 1, 2, 2, 2]) << 28)
 
     def shares(ring, share):
-        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, share, replay.cumulative_priority(ring))
+        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, share, replay.cumulative(ring))
         return np.bincount(rows, minlength=6) / 40_000
 
     # Rows 1 and 3 have a priority; rows 4 and 5 are empty.
@@ -106,7 +106,7 @@ def test_rows_are_drawn_in_proportion_to_any_weights():
     """Weights of very different sizes; 1e-30 and 0 are never drawn beside 1e30."""
     for weights in ([3.0, 1.0, 0.0, 6.0], [3e-30, 1e-30, 0.0, 6e-30], [0.0, 1e-30, 0.0, 1e30]):
         ring = replay.add(make_ring(4), make_episodes([0, 1, 2, 3]), jnp.array(weights))
-        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, 1.0, replay.cumulative_priority(ring))
+        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, 1.0, replay.cumulative(ring))
         expected = np.array(weights) / sum(weights)
         np.testing.assert_allclose(np.bincount(rows, minlength=4) / 40_000, expected, atol=0.01)
         assert not np.any((np.array(weights) == 0)[rows])
@@ -117,7 +117,7 @@ def test_cumulative_priorities_are_exact_and_never_fall():
     rng = np.random.default_rng(0)
     for weights in (rng.integers(0, 2, 3000), rng.exponential(size=3000), rng.exponential(size=3000) ** 8):
         ring = make_ring(3000).replace(priority=jnp.asarray(weights, jnp.float32))
-        cumulative = np.asarray(replay.cumulative_priority(ring), np.int64)
+        cumulative = np.asarray(replay.cumulative(ring).priority, np.int64)
         assert np.all(np.diff(cumulative) >= 0)
         assert 2**29 - 3000 <= cumulative[-1] <= 2**30 + 3000
         np.testing.assert_allclose(cumulative / cumulative[-1], np.cumsum(weights) / np.sum(weights), atol=1e-5)

@@ -174,7 +174,7 @@ def test_a_normalization_of_one_s_own(mine):
     for normalization in ("mine:nearest_is_1", mine.nearest_is_1):
         got = table(samplers.make("weighted", "softmax", normalization=normalization), 1)
         np.testing.assert_allclose(got, weights / weights.sum(), atol=1e-6)
-    with pytest.raises(ValueError, match=r"a normalization gives relative distances \[T\+1\] = \[5\]; .* gives \[2, 5\]"):
+    with pytest.raises(ValueError, match=r"relative distances \[T\+1\].*\[2, 5\]"):
         table(samplers.make("weighted", normalization="mine:pairs"), 1)
 
 

@@ -82,7 +82,7 @@ def test_replay():
     @typed
     def rows(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Rows:
         state = to_ring(ring)
-        cumulative = replay.cumulative_priority(state)
+        cumulative = replay.cumulative(state)
         return replay.draw_rows(state, key, B, 0.5, cumulative), cumulative, replay.can_sample(state)
 
     @typed
@@ -129,7 +129,7 @@ def test_relabel(name):
     @typed
     def batches(ring: Ring, key: Key[Array, ""], like: Float[Array, "T B"]) -> Batches:
         state = to_ring(ring)
-        args = samplers.make(name), reward, HP, replay.cumulative_priority(state)
+        args = samplers.make(name), reward, HP, replay.cumulative(state)
         return fields(relabel.draw_batches(state, key, (T, B), *args))
 
     jax.eval_shape(relabelled, from_ring(RING), from_sample(SAMPLE), KEY)

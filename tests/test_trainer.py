@@ -86,10 +86,10 @@ def test_batches_are_drawn_up_to_so_many_at_once(program, monkeypatch, at_once, 
         return relabel.draw_batches(ring, key, shape, *args)
 
     monkeypatch.setattr(trainer, "draw_batches", draw_batches)
-    parts = dataclasses.replace(program[0].epoch.args[0], max_transitions_per_draw=at_once)
-    state = jax.eval_shape(functools.partial(trainer._epoch, parts), loop.state_template(program[0]))[0]
+    monkeypatch.setattr(trainer, "MAX_TRANSITIONS_PER_DRAW", at_once)
+    state = jax.eval_shape(program[0].epoch, loop.state_template(program[0]))[0]
     assert set(shapes) == {(2 // draws, 2, 32)}
-    jaxpr = str(jax.make_jaxpr(functools.partial(trainer._epoch, parts))(loop.state_template(program[0])))
+    jaxpr = str(jax.make_jaxpr(program[0].epoch)(loop.state_template(program[0])))
     assert f"length={draws}" in jaxpr
     assert state.learner.num_updates.shape == ()
 
@@ -197,7 +197,7 @@ def learn():
     @functools.cache
     def compiled(dtype):
         config = dataclasses.replace(LEARNS, learner_dtype=dtype)
-        learner = learners.make("ddpg", config, trainer.env_sizes(ENV))
+        learner = learners.make("ddpg", config, rollout.env_spec(ENV))
         train = make_train(ENV, config, sampler=samplers.make("weighted"), learner=learner)
         return config, loop.compile_program(train, jax.random.key(0), HParams())
 
@@ -294,7 +294,7 @@ def test_observations_that_are_no_vector_are_refused():
             state = super().reset(key)
             return state.replace(obs={**state.obs, "observation": jnp.zeros((2, 2))})
 
-    with pytest.raises(ValueError, match="observations of one vector"):
+    with pytest.raises(ValueError, match="observation must be one vector"):
         make_train(Pixels(), SMALL)
 
 

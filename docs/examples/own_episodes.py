@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher import HParams, relabel, replay
+from mjx_dher.context import Context
 from mjx_dher.types import Episode
 from point_mass import PointMass, soon
 
@@ -30,7 +31,7 @@ def main() -> None:
     episodes = play(jax.random.key(0))
     ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), num_episodes=100), episodes)
     sample = replay.sample(ring, jax.random.key(1), batch_size=64)
-    batch = relabel.relabel(ring, sample, soon, env.compute_reward, HParams(), jax.random.key(2))
+    batch = relabel.relabel(sample, soon, Context(env.compute_reward, HParams()), jax.random.key(2)).batch
     print(f"{int(ring.size)} episodes; a batch of {len(batch.reward)}, mean reward {float(batch.reward.mean()):.2f}")
 
 

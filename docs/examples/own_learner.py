@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from mjx_dher import HParams, relabel, replay, rollout, samplers, trainer
+from mjx_dher import HParams, relabel, replay, rollout, samplers
 from mjx_dher.networks import Actor
 from point_mass import PointMass
 
@@ -22,7 +22,7 @@ def main(argv=None):
     parser.add_argument("--updates", type=int, default=100, help="a round, after 64 episodes; of 256 transitions each")
     args = parser.parse_args(argv)
     env, actor, adam, weighted = PointMass(), Actor(2, (64, 64)), optax.adam(1e-3), samplers.make("weighted")
-    ring = replay.init(trainer.episode_template(env), num_episodes=1000)
+    ring = replay.init(rollout.episode_template(env), num_episodes=1000)
     params = actor.init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2))
     moments = adam.init(params)
 
@@ -43,7 +43,7 @@ def main(argv=None):
         def update(learner, key):
             sample_key, goal_key = jax.random.split(key)
             sample = replay.sample(ring, sample_key, 256)
-            goal = relabel.hindsight_goals(ring, sample, weighted, HParams(), goal_key)
+            goal = relabel.hindsight_goals(sample, weighted, HParams(), goal_key).goals
             steps, moments = adam.update(jax.grad(loss)(learner[0], sample, goal), learner[1])
             return (optax.apply_updates(learner[0], steps), moments), None
 

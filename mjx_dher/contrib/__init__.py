@@ -1,1 +1,1 @@
-"""Published methods that claim to improve on `future`, each a short function; docs/samplers.md has their formulas."""
+"""Published methods that our own comparison found no use for, with the hooks that only they need (docs/what_helps.md)."""

@@ -1,44 +1,26 @@
-"""Priorities of whole episodes: by the energy an object was given, by how rare and by how diverse the achieved goals are."""
+"""Priorities of whole episodes: by how rare and by how diverse their achieved goals are."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.config import HParams
-from mjx_dher.context import View
-from mjx_dher.contrib.metrics import GRAVITY, STEP_SECONDS, displacements
+from mjx_dher.context import Context
 from mjx_dher.priorities import Priority
 from mjx_dher.replay import ReplayState
-from mjx_dher.types import Array, Episode, RewardFn
+from mjx_dher.types import Array, Episode
 
 COMPONENTS = 3  # Gaussians of the mixture that `max_entropy` fits
 ROUNDS = 10  # of expectation and maximization
 
 
-def energy(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
-    """Returns the energy that the object was given in an episode, in J a kg (Zhao & Tresp 2018, "EBP").
-
-    sum_t max(E_t - E_(t-1), 0),  E_t = g (z_t - z_0) + |v_t|^2 / 2,  E_0 = 0
-
-    with v_t from differences of achieved goals. Losses do not count, nor does rotation, which positions do not show. A goal of
-    fewer than three coordinates has no height.
-    """
-    del compute_reward, hparams
-    achieved = episode.achieved_goal
-    kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / STEP_SECONDS), axis=-1)
-    potential = GRAVITY * (achieved[:, 2] - achieved[0, 2]) if achieved.shape[-1] > 2 else jnp.zeros_like(kinetic)
-    total = potential + kinetic
-    return jnp.sum(jnp.maximum(total[1:] - total[:-1], 0.0))
-
-
-def diversity(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> Array:
-    """Returns how diverse an episode's achieved goals are (Dai, Liu & Bharath 2021, "DTGSH").
+def diversity(episode: Episode, context: Context) -> Array:
+    """Diversity of an episode's achieved goals (Dai, Liu & Bharath 2021, "DTGSH").
 
     The sum over pairs of successive goals of det(X X'), X the pair as unit vectors: 1 - c^2, c the cosine between them. In the
     form d^2 - d^4 / 4, d the distance of the unit vectors, small angles are not lost in rounding.
     """
-    del compute_reward, hparams
+    del context
     goals = episode.achieved_goal
     unit = goals / jnp.maximum(jnp.linalg.norm(goals, axis=-1, keepdims=True), 1e-12)
     squared = jnp.sum(jnp.square(unit[1:] - unit[:-1]), axis=-1)
@@ -46,7 +28,7 @@ def diversity(episode: Episode, compute_reward: RewardFn, hparams: HParams) -> A
 
 
 def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Array:
-    """Returns the log densities [E, components] of `rows` [E, K] under each component, its share included."""
+    """Log densities [E, components] of `rows` [E, K] under each component, its share included."""
     inverse = 1.0 / variances
     constant = jnp.sum(jnp.square(means) * inverse + jnp.log(2.0 * jnp.pi * variances), axis=1)
     squares = jnp.square(rows) @ inverse.T - 2.0 * rows @ (means * inverse).T + constant[None]
@@ -54,7 +36,7 @@ def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Ar
 
 
 def fit_mixture(rows: Array, counted: Array) -> Array:
-    """Returns the log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to those that are `counted` [E].
+    """Log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to those that are `counted` [E].
 
     Three components with diagonal covariances, by ten rounds of expectation and maximization, begun with means spread along the
     first principal axis that power iteration finds. Deterministic.
@@ -85,13 +67,13 @@ def fit_mixture(rows: Array, counted: Array) -> Array:
     return jax.nn.logsumexp(_log_parts(rows, *state), axis=1)
 
 
-def _by_rarity(ring: ReplayState, view: View) -> Array:
-    """Returns weights [E]: the ranks, from 0 for the most common, of episodes by how rare their achieved goals are.
+def _by_rarity(ring: ReplayState, context: Context) -> Array:
+    """Ranks [E] of episodes by the rarity of their achieved goals, from 0 for the most common.
 
     Zhao, Sun & Tresp 2019 ("MEP"): a mixture of three Gaussians over whole sequences of achieved goals gives their density; an
     episode is drawn in proportion to its rank by minus the log density.
     """
-    del view
+    del context
     goals = ring.episodes.achieved_goal
     filled = jnp.arange(goals.shape[0]) < ring.size
     rows = goals.reshape(goals.shape[0], -1)

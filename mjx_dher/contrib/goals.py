@@ -7,8 +7,8 @@ import jax.numpy as jnp
 
 from mjx_dher import replay
 from mjx_dher.config import HParams
-from mjx_dher.context import View
-from mjx_dher.generators import Generator
+from mjx_dher.context import Context
+from mjx_dher.contrib.generators import Generator
 from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import future
 from mjx_dher.types import Array, GoalObs, PRNGKey
@@ -67,7 +67,7 @@ def _nearest(achieved: Array, easy: Array, desired: Array) -> tuple[Array, Array
     return jax.lax.scan(earlier, start, (jnp.moveaxis(achieved, 1, 0), easy.T, steps))[0]
 
 
-def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, view: View) -> Array:
+def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
     """Returns goals [N, G] that were achieved before, each on the way to a desired one (Ren et al. 2019, "HGG").
 
     N stored episodes, drawn uniformly, are matched to the N resets at the least total cost
@@ -78,17 +78,17 @@ def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, view: View) -
     a_pt of the minimum. The authors match by a flow of least cost on the host; here the matching is soft (`match`) and each
     reset draws its episode from its row. Without an episode in which something moved, resets keep their own goals.
     """
-    assert view.values is not None
+    assert context.values is not None
     row_key, match_key = jax.random.split(key)
     start, desired = obs["achieved_goal"], obs["desired_goal"]
     number = desired.shape[0]
     rows = replay.randint_from_bits(jax.random.bits(row_key, (number,)), ring.size)
     achieved = ring.episodes.achieved_goal[rows]
-    first = jnp.broadcast_to(ring.episodes.observation[rows, :1], (*achieved.shape[:2], ring.episodes.observation.shape[-1]))
+    shape = achieved.shape[:2]
+    first = jax.tree.map(lambda x: jnp.broadcast_to(x[rows, :1], (*shape, *x.shape[2:])), ring.episodes.observation)
     diameter = jnp.max(jnp.linalg.norm(desired - start, axis=-1))
-    bound = -1.0 / (1.0 - view.hparams.gamma)
-    value = jnp.clip(view.values.of_state(first, achieved), bound, 0.0)
-    least, step = _nearest(achieved, value * (1.0 - view.hparams.gamma) * diameter / LIPSCHITZ, desired)
+    value = jnp.clip(context.values.of_state(first, achieved), *context.bounds())
+    least, step = _nearest(achieved, value * (1.0 - context.hparams.gamma) * diameter / LIPSCHITZ, desired)
     cost = least + START_WEIGHT * jnp.linalg.norm(start[:, None] - achieved[None, :, 0], axis=-1)
     moved = jnp.linalg.norm(achieved[:, -1] - achieved[:, 0], axis=-1) > STILL
     row = jax.random.categorical(match_key, match(cost, moved | ~jnp.any(moved)), axis=-1)

@@ -11,19 +11,12 @@ import functools
 
 import jax.numpy as jnp
 
-from mjx_dher.context import View
-from mjx_dher.samplers import position
-from mjx_dher.scores import LearnedMetric
+from mjx_dher.context import Context
+from mjx_dher.priorities import GRAVITY, STEP_SECONDS, displacements
+from mjx_dher.samplers import LearnedMetric, position
 from mjx_dher.types import Array, Episode
 
-STEP_SECONDS = 0.04  # of the Fetch tasks
-GRAVITY = 9.81  # m/s^2
 SPEED_STEPS = 5.0  # steps at its present velocity that count as much as the distance
-
-
-def displacements(achieved: Array) -> Array:
-    """Returns the displacements [T+1, G] of achieved goals [T+1, G] from those a step before; the first is 0."""
-    return jnp.concatenate([jnp.zeros_like(achieved[:1]), achieved[1:] - achieved[:-1]])
 
 
 def velocity(achieved: Array, desired: Array) -> Array:
@@ -53,11 +46,11 @@ resting_point = functools.partial(resting, friction=0.1)  # Slide's puck on its 
 resting_point_rough = functools.partial(resting, friction=1.0)  # the cube of Push and PickAndPlace
 
 
-def _steps_left(episode: Episode, view: View) -> Array:
+def _steps_left(episode: Episode, context: Context) -> Array:
     """Returns -V(s_i, g) [T+1], not negative: for rewards of -1 a step, the discounted number of steps to the goal."""
-    assert view.values is not None
+    assert context.values is not None
     goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal.shape)
-    return jnp.maximum(-view.values.of_state(episode.observation, goals), 0.0)
+    return jnp.maximum(-context.values.of_state(episode.observation, goals), 0.0)
 
 
 time_to_goal = LearnedMetric(_steps_left)

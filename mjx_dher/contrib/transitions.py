@@ -8,18 +8,18 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.context import View, of_each_episode
+from mjx_dher.context import Context
 from mjx_dher.contrib.episodes import diversity
 from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, by_weight
-from mjx_dher.replay import ReplayState, Sample
-from mjx_dher.types import Array, Batch, Episode, PRNGKey
+from mjx_dher.replay import Sample
+from mjx_dher.types import Array, Batch, PRNGKey
 
 CURRICULUM_GROUP = 8  # transitions that `curriculum` chooses together, of four times as many
 DIVERSE_WIDTH = 0.5  # m, of the kernel by which `dpp` compares goals, as in its authors' code
 MOST_PROXIMITY = 10.0  # exp of this is the weight of proximity in `curriculum` at the end of a run
 
 # pick(key, sample, batch of one group [C], number, view) -> indices [number] within the group
-GroupFn = Callable[[PRNGKey, Sample, Batch, int, View], Array]
+GroupFn = Callable[[PRNGKey, Sample, Batch, int, Context], Array]
 
 
 def in_groups(pick: GroupFn, size: int) -> ChooseFn:
@@ -28,12 +28,12 @@ def in_groups(pick: GroupFn, size: int) -> ChooseFn:
     Where `size` does not divide the number that is wanted, groups are smaller.
     """
 
-    def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: View) -> Array:
+    def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
         kept = math.gcd(number, size)
         groups, together = number // kept, kept * CANDIDATES
         parts = jax.tree.map(lambda x: x.reshape(groups, together, *x.shape[1:]), (sample, batch))
         keys = jax.random.split(key, groups)
-        indices = jax.vmap(lambda key, sample, batch: pick(key, sample, batch, kept, view))(keys, *parts)
+        indices = jax.vmap(lambda key, sample, batch: pick(key, sample, batch, kept, context))(keys, *parts)
         return (indices.astype(jnp.int32) + together * jnp.arange(groups, dtype=jnp.int32)[:, None]).reshape(number)
 
     return choose
@@ -44,7 +44,7 @@ def squared_distances(goals: Array) -> Array:
     return jnp.sum(jnp.square(goals[:, None] - goals[None]), axis=-1)
 
 
-def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: View) -> Array:
+def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
     """Chooses `number` of a group, one after another, for goals that stand for the others' and are near (Fang et al. 2019).
 
     Each is the one that adds most to F(A) = sum_i max_(j in A) sim(g_i, g_j) - lambda sum_(j in A) |g_j - a_j|, with sim =
@@ -58,7 +58,7 @@ def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, vie
     mean = jnp.mean(jnp.sqrt(squares))
     alike = jnp.exp(-squares / jnp.maximum(jnp.square(mean), 1e-12))
     far = jnp.sqrt(jnp.sum(jnp.square(goals - sample.episode_goals[members, sample.step]), axis=-1))
-    strength = jnp.exp(MOST_PROXIMITY * jnp.asarray(view.progress, jnp.float32))
+    strength = jnp.exp(MOST_PROXIMITY * jnp.asarray(context.progress, jnp.float32))
 
     def add(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
         covered, free = state  # [C] how well each goal is stood for, and which may still be chosen
@@ -70,13 +70,13 @@ def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, vie
     return chosen
 
 
-def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: View) -> Array:
+def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
     """Draws one or two of a group by a k-DPP of their goals (Kulesza & Taskar 2011; Dai, Liu & Bharath 2021).
 
     P(i, j) is in proportion to det(L_ij) = 1 - exp(-d^2 / w^2), for the kernel L = exp(-d^2 / 2 w^2): goals that lie
     together are seldom both drawn.
     """
-    del view
+    del context
     size = sample.step.shape[0]
     if number == 1:
         return jax.random.randint(key, (1,), 0, size)
@@ -90,37 +90,17 @@ def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, view: 
     return jnp.stack([pair // size, pair % size])
 
 
-def not_misled(sample: Sample, batch: Batch, view: View) -> Array:
+def not_misled(sample: Sample, batch: Batch, context: Context) -> Array:
     """Returns weights [B]: 0 for a transition whose hindsight goal was reached before the step, else 1 (Manela & Biess 2021).
 
     Such a transition is rewarded whatever its action was. Own goals stay.
     """
     before = sample.episode_goals[jnp.arange(sample.step.shape[0]), sample.step]
-    reached = view.compute_reward(before, batch.desired_goal) >= 0
+    reached = context.reached(before, batch.desired_goal)
     replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
     return 1.0 - (reached & replaced).astype(jnp.float32)
-
-
-def _error_size(sample: Sample, batch: Batch, view: View) -> Array:
-    del sample
-    return jnp.abs(view.td_error(batch))
-
-
-def mean_error(ring: ReplayState, view: View) -> Array:
-    """Returns weights [E]: the mean size of an episode's errors of one step, for the goal that it was played for."""
-
-    def of_episode(episode: Episode) -> Array:
-        goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal[1:].shape)
-        reward = view.compute_reward(episode.achieved_goal[1:], goals)
-        observation = episode.observation
-        batch = Batch(observation[:-1], observation[1:], goals, episode.action, reward)
-        return jnp.mean(jnp.abs(view.td_error(batch)))
-
-    return of_each_episode(of_episode, ring.episodes)
 
 
 dpp = Priority(weigh=diversity, choose=in_groups(pick_diverse, 2))
 curriculum = Priority(choose=in_groups(pick_curriculum, CURRICULUM_GROUP))
 not_misleading = Priority(choose=by_weight(not_misled))
-# Luu & Yoo 2021 ("HGR"): episodes by their mean error, then hindsight goals by theirs.
-td_error = Priority(renew=mean_error, choose=by_weight(_error_size), uses_values=True, by_part=True)

@@ -14,7 +14,7 @@ from mjx_dher import check, components, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Values
 from mjx_dher.networks import NetworksFn
-from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
+from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
 
 # What the loop and the log call theirs: a learner's metrics have other names.
 RESERVED = frozenset(
@@ -93,20 +93,20 @@ class Learner(Protocol):
 LearnerFn = Callable[[Config, Sizes, NetworksFn], Learner]
 
 
-def make(name: str | LearnerFn, config: Config, sizes: Sizes, network: str | NetworksFn = "mlp") -> Learner:
+def make(name: str | LearnerFn, config: Config, spec: EnvSpec | Sizes, network: str | NetworksFn = "mlp") -> Learner:
     """Makes the learner called `name`.
 
     Args:
       name: a built-in name, "module:attribute", or a function (config, sizes, networks) -> Learner.
       config: sizes of the networks, dtype and kernels.
-      sizes: of the environment.
+      spec: of the environment.
       network: what `networks.make` takes.
 
     Raises:
       ValueError: no such learner or networks, something that lacks a method of `Learner`, or parts that do not combine.
     """
     make_learner = components.load("learner", name, "config", "sizes", "networks")
-    learner = make_learner(config, sizes, networks.make(network))
+    learner = make_learner(config, spec.sizes if isinstance(spec, EnvSpec) else spec, networks.make(network))
     check_methods(name, learner)
     return learner
 

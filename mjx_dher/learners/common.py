@@ -139,5 +139,4 @@ def normalize_batch(state: Any, batch: Batch, hparams: HParams) -> Batch:
         observation=normalize(state.observation_norm, batch.observation, hparams),
         next_observation=normalize(state.observation_norm, batch.next_observation, hparams),
         desired_goal=normalize(state.goal_norm, batch.desired_goal, hparams),
-        discount=jnp.asarray(hparams.gamma) if batch.discount is None else batch.discount,
     )

@@ -1,7 +1,7 @@
 """Devices of a program: a mesh whose axis `lanes` shares out runs side by side, and whose axis `data` shares out each of them.
 
 Runs side by side exchange nothing. The parts of one run have equal shares of its environments, its ring and its batches; their
-learners are alike, because they average gradients (`split.Split`).
+learners are alike, because they average gradients (`split`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
 from mjx_dher.config import check_devices
-from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.parallel.split import AxisName
 
 LANES, DATA = "lanes", "data"
 
@@ -29,9 +29,9 @@ class Layout:
     parts: int = 1  # devices that share each of them
 
     @property
-    def split(self) -> Split:
-        """Axis over which the parts of one run lie."""
-        return Split(DATA, self.parts) if self.parts > 1 else ALONE
+    def axis_name(self) -> AxisName:
+        """Axis of the devices that share one run; None if each run has one device."""
+        return DATA if self.parts > 1 else None
 
     @property
     def sharers(self) -> int:

@@ -7,15 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import learners, replay
+from mjx_dher import context, learners, replay
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import Learner, LearnerFn
 from mjx_dher.networks import NetworksFn
 from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
+from mjx_dher.rollout import env_spec
 from mjx_dher.samplers import future
 from mjx_dher.testing.trial import EPISODES, PartError, attempt, expect_finite, random_episodes
-from mjx_dher.trainer import env_sizes
 from mjx_dher.types import Batch, Env, Episode
 
 BATCH = 8
@@ -53,7 +53,7 @@ def check_learner(
     """
     config, hparams = config or Config(), hparams or HParams()
     episodes = episodes or random_episodes(env)
-    made: Learner = attempt("learner", learners.make, learner, config, attempt("env", env_sizes, env), networks)
+    made: Learner = attempt("learner", learners.make, learner, config, attempt("env", env_spec, env), networks)
     numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
     state = attempt("learner.init", jax.jit(made.init), jax.random.key(0))
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
@@ -79,9 +79,9 @@ def check_learner(
 
 def _batch(env: Env, episodes: Episode, hparams: HParams) -> Batch:
     """Returns a batch [8] of random episodes, relabelled by `future`."""
-    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES), episodes)
+    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES, env_spec(env).ends), episodes)
     sample_key, relabel_key = jax.random.split(jax.random.key(1))
-    return relabel(ring, replay.sample(ring, sample_key, BATCH), future, env.compute_reward, hparams, relabel_key)
+    return relabel(replay.sample(ring, sample_key, BATCH), future, context.of_env(env, hparams), relabel_key).batch
 
 
 def _step(name: str, function: Any, state: Any, *args: Any) -> Any:

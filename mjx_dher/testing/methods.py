@@ -10,15 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import generators, learners, priorities, replay
+from mjx_dher import check, learners, priorities, replay
+from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.context import View
-from mjx_dher.generators import GenerateFn, Generator
+from mjx_dher.context import Context
+from mjx_dher.contrib import generators
+from mjx_dher.contrib.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
 from mjx_dher.priorities import CANDIDATES, Priority
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import env_sizes
+from mjx_dher.rollout import check_with_goal, env_spec
 from mjx_dher.samplers import future
 from mjx_dher.testing.trial import EPISODES, PartError, attempt, random_episodes
 from mjx_dher.types import Env, Episode, GoalObs
@@ -26,17 +28,17 @@ from mjx_dher.types import Env, Episode, GoalObs
 NUMBER = 8  # transitions that a priority is asked to choose
 
 
-def trial_view(env: Env, hparams: HParams | None = None, learner: Learner | None = None) -> View:
-    """Returns a view in the middle of a run of a learner that has learned nothing; `ddpg` where None."""
+def trial_context(env: Env, hparams: HParams | None = None, learner: Learner | None = None) -> Context:
+    """Context in the middle of a run of an untrained learner (None: `ddpg`)."""
     numbers = jax.tree.map(functools.partial(jnp.asarray, dtype=jnp.float32), hparams or HParams())
-    made = learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_sizes(env))
+    made = learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_spec(env))
     values = learners.values_of(made, made.init(jax.random.key(0)), numbers) if hasattr(made, "value") else None
-    return View(env.compute_reward, numbers, jnp.float32(0.5), values)
+    return context_lib.of_env(env, numbers, progress=jnp.float32(0.5), values=values)
 
 
-def ring_of(episodes: Episode) -> ReplayState:
-    """Returns a ring that holds `episodes`, half of its rows empty."""
-    empty = replay.init(jax.tree.map(lambda x: x[0], episodes), 2 * episodes.action.shape[0])
+def ring_of(episodes: Episode, ends: bool = False) -> ReplayState:
+    """A ring that holds `episodes`, half of its rows empty."""
+    empty = replay.init(jax.tree.map(lambda x: x[0], episodes), 2 * episodes.action.shape[0], ends)
     return replay.add(empty, episodes)
 
 
@@ -66,16 +68,17 @@ def check_generator(
       PartError: names the first violation.
     """
     made = attempt("generator", generators.make, generator)
-    attempt("generator", generators.check_env, made, env)
+    attempt("generator", check_with_goal, env)
     if made.uses_values and learner is not None:
         attempt("generator", learners.check_values, learner)
-    episodes, view = episodes or random_episodes(env), trial_view(env, hparams, learner)
+    episodes, context = episodes or random_episodes(env), trial_context(env, hparams, learner)
     first = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), EPISODES))
-    full, empty = ring_of(episodes), replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES)
+    ends = env_spec(env).ends
+    full, empty = ring_of(episodes, ends), replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES, ends)
 
     def ask(obs: GoalObs, ring: ReplayState) -> jax.Array:
-        generators.goals_of(made, jax.random.key(2), obs, ring, view)  # raises for the wrong shape
-        return made.generate(jax.random.key(2), obs, ring, view)
+        goals = made(jax.random.key(2), obs, ring, context)
+        return check.array("generator: goals [N, G]", goals, obs["desired_goal"].shape)
 
     goals, again = (np.asarray(attempt("generator", jax.jit(ask), first.obs, full)) for _ in range(2))
     attempt("generator, with an empty ring,", jax.jit(ask), first.obs, empty)
@@ -105,18 +108,18 @@ def check_choice(
     """
     if priority.uses_values and learner is not None:
         attempt("priority", learners.check_values, learner)
-    view, ring = trial_view(env, hparams, learner), ring_of(episodes)
+    context, ring = trial_context(env, hparams, learner), ring_of(episodes, env_spec(env).ends)
     told = []
     if (renew := priority.renew) is not None:
-        weights = np.asarray(attempt("priority: renew", jax.jit(lambda ring: renew(ring, view)), ring))
-        attempt("priority: renew", jax.jit(lambda ring: priorities.renewed(priority, ring, view)), ring)
+        weights = np.asarray(attempt("priority: renew", jax.jit(lambda ring: renew(ring, context)), ring))
+        attempt("priority: renew", jax.jit(lambda ring: priorities.renew(priority, ring, context)), ring)
         told.append(f"renewed weights {_range(weights[: episodes.action.shape[0]])}")
     if (choose := priority.choose) is not None:
         keys = jax.random.split(jax.random.key(3), 3)
         sample = replay.sample(ring, keys[0], CANDIDATES * NUMBER)
-        batch = relabel(ring, sample, future, env.compute_reward, view.hparams, keys[1])
-        pick = jax.jit(lambda key: choose(key, sample, batch, NUMBER, view))
-        attempt("priority: choose", lambda: priorities.chosen(priority, keys[2], sample, batch, NUMBER, view))
+        batch = relabel(sample, future, context, keys[1]).batch
+        pick = jax.jit(lambda key: choose(key, sample, batch, NUMBER, context))
+        attempt("priority: choose", lambda: priorities.choose(priority, keys[2], sample, batch, NUMBER, context))
         indices = np.asarray(attempt("priority: choose", pick, keys[2]))
         if indices.min() < 0 or indices.max() >= CANDIDATES * NUMBER:
             raise PartError(f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {indices.max()}")

@@ -11,20 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import components, learners, priorities, samplers, scores
+from mjx_dher import components, learners, priorities, samplers
 from mjx_dher.components import reads
 from mjx_dher.config import HParams
 from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
 from mjx_dher.lookup import is_import_path
 from mjx_dher.priorities import Priority, PriorityFn
-from mjx_dher.rollout import env_sizes
-from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, Sampler
-from mjx_dher.scores import LearnedMetric
+from mjx_dher.rollout import env_spec
+from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.methods import check_choice, check_generator, trial_view
+from mjx_dher.testing.methods import check_choice, check_generator, trial_context
 from mjx_dher.testing.trial import PartError, attempt, random_episodes
 from mjx_dher.types import Env, Episode
 
@@ -47,7 +46,7 @@ def check_parts(env: Env, spec: RunSpec) -> Iterator[str]:
     if not custom_components(spec).keys() - {"env"}:
         return
     episodes = random_episodes(env)
-    learner = attempt("learner", learners.make, spec.learner, spec.config, env_sizes(env), spec.networks)
+    learner = attempt("learner", learners.make, spec.learner, spec.config, env_spec(env), spec.networks)
     yield from _check_replayed(env, spec, episodes, learner)
     if is_import_path(spec.learner) or is_import_path(spec.networks):
         check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
@@ -101,7 +100,7 @@ def check_sampler(
     steps = jnp.arange(env.episode_length)
     score = jnp.zeros((episodes.action.shape[0], env.episode_length + 1))
     if made.score is not None:
-        score = attempt("sampler: score", scores.of_episodes, made.score, episodes, trial_view(env, hparams, learner))
+        score = attempt("sampler: score", samplers.score_episodes, made, episodes, trial_context(env, hparams, learner))
 
     def of_step(achieved: Any, desired: Any, score: Any, step: Any) -> Any:
         return samplers.weigh(made, achieved, desired, step, _as_arrays(hparams), score)
@@ -153,11 +152,11 @@ def check_metric(
     Raises:
       PartError: names the first violation.
     """
-    made = attempt("metric", scores.make_metric, metric)
+    made = attempt("metric", samplers.make_metric, metric)
     episodes = episodes or random_episodes(env)
     if isinstance(made, LearnedMetric):
-        view = trial_view(env, learner=learner)
-        distances = np.asarray(attempt("metric", scores.of_episodes, made.score, episodes, view))
+        sampler, context = samplers.make("closest", metric=made), trial_context(env, learner=learner)
+        distances = np.asarray(attempt("metric", samplers.score_episodes, sampler, episodes, context))
     else:
         compute = jax.jit(jax.vmap(functools.partial(samplers.measure, made)))
         distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
@@ -264,7 +263,7 @@ def check_priority(
         return f"priority as it should be: {'; '.join(more)}"
 
     def weigh(episode: Any) -> Any:
-        return jnp.asarray(of_episode(episode, env.compute_reward, _as_arrays(hparams)))
+        return jnp.asarray(of_episode(episode, trial_context(env, hparams, learner)))
 
     weights = np.asarray(attempt("priority", jax.jit(jax.vmap(weigh)), episodes))
     _check_weights(weights)

@@ -28,6 +28,7 @@ _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
 _CURSOR, _STEPS = ".replay.cursor", ".env_steps"
+_EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # arrays that checkpoints of 0.2.0 lack
 
 
 class CheckpointError(FolderError):
@@ -214,6 +215,9 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
         needed = [name, list(leaf.shape), str(leaf.dtype)]
         if name not in arrays and name.startswith(_HPARAMS):
             fitted.append(np.zeros(leaf.shape, leaf.dtype))
+        elif name not in arrays and name in _EARLIER:  # written before episodes could end early: all have T steps
+            steps = shapes[".replay.episodes.action"].shape[-2]
+            fitted.append(np.full(leaf.shape, steps if name.endswith("length") else 0, leaf.dtype))
         elif name not in arrays:
             raise CheckpointError(f"{path} does not fit this run: it has no {_say(needed)}")
         elif [name, list(arrays[name].shape), str(arrays[name].dtype)] != needed:

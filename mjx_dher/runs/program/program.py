@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
-import dataclasses
 import functools
 import math
 import time
@@ -16,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import config as config_lib
+from mjx_dher import context, learners, priorities, samplers, trainer
 from mjx_dher import evaluate as evaluate_lib
-from mjx_dher import generators, learners, priorities, samplers, trainer
 from mjx_dher.config import HParams
+from mjx_dher.contrib import generators
 from mjx_dher.learners import Learner
-from mjx_dher.parallel import mesh, sharded
+from mjx_dher.parallel import mesh, sharded, split
 from mjx_dher.parallel.mesh import ONE, Layout
-from mjx_dher.parallel.split import ALONE, Split
-from mjx_dher.rollout import Outcome, check_steps
+from mjx_dher.rollout import Outcome, check_steps, env_sizes, env_spec
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program.loop import Compiled
@@ -71,17 +70,20 @@ class Program(NamedTuple):
     evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
 
 
-def make_loop(env: Env, spec: RunSpec, choices: Choices, split: Split = ALONE) -> Train:
-    """Makes the training loop of runs that share a program, with the parts that they name; each run may be split itself."""
-    of_a_part = dataclasses.replace(spec.config, batch_size=split.share(spec.config.batch_size))
+def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -> Train:
+    """Makes the training loop of runs that share a program, with the components that they name."""
+    config_lib.check_parts(spec.config, env.episode_length, layout.parts)
+    config = config_lib.of_one_device(spec.config, layout.parts)
+    distance = context.of_env(env, spec.hparams).goal_distance
+    generator = generators.join([generators.make(name) for name in choices.generators])
     return trainer.make_train(
         env,
-        spec.config,
-        sampler=samplers.one_of([samplers.make(*choice) for choice in choices.samplers]),
-        priority=priorities.one_of([priorities.make(name) for name in choices.priorities]),
-        generator=generators.one_of([generators.make(name) for name in choices.generators]),
-        learner=learners.make(spec.learner, of_a_part, trainer.env_sizes(env), spec.networks),
-        split=split,
+        config,
+        sampler=samplers.join([samplers.make(*choice, goal_distance=distance) for choice in choices.samplers]),
+        priority=priorities.join([priorities.make(name) for name in choices.priorities]),
+        generator=None if generator is generators.reset else generator,
+        learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
+        axis_name=layout.axis_name,
     )
 
 
@@ -103,7 +105,7 @@ def compile_runs(
     spec, choices = specs[0], choices_of(specs)
     most = min(len(specs), max_lanes or len(specs))
     layout = mesh.arrange(devices, most)
-    train = make_loop(env, spec, choices, layout.split)
+    train = make_loop(env, spec, choices, layout)
     loop.check_memory(train, spec.config, layout.sharers)
     lanes = math.ceil(most / layout.lanes)  # of a device, as are the bytes
     available = memory.available_bytes()
@@ -120,7 +122,7 @@ def compile_runs(
             loop.check_program(compiled, spec.config, layout.sharers)
             beside = available is not None and compiled.nbytes <= available / 2
             evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside, layout)
-            return Program(lanes * layout.lanes, layout, choices, train.learner, trainer.env_sizes(env), compiled, evaluate)
+            return Program(lanes * layout.lanes, layout, choices, train.learner, env_sizes(env), compiled, evaluate)
         lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
 
 
@@ -162,10 +164,11 @@ def _compile_evaluation(
 
     Compiling takes memory, too, to try kernels in.
     """
-    episodes = min(final_episodes, evaluate_lib.CHUNK)
+    episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.parts)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
-        return trainer.evaluate_state(env, train.learner, state, key, episodes, train.split)
+        outcome = trainer.evaluate_state(env, train.learner, state, key, episodes, train.axis_name)
+        return split.gather(outcome, train.axis_name)
 
     init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
     arguments: tuple[Any, Any] = keys, hparams
