@@ -240,7 +240,7 @@ def mean_error(ring: ReplayState, context: Context) -> Array:
         if not ring.ends:
             return jnp.mean(size)
         played = step < episode.length
-        return jnp.sum(jnp.where(played, size, 0.0)) / jnp.maximum(episode.length, 1)
+        return jnp.sum(jnp.where(played, size, 0.0)) / jnp.maximum(episode.length, 1).astype(size.dtype)
 
     return of_each_episode(of_episode, ring.episodes)
 

@@ -81,7 +81,7 @@ def rollout(
             following = _where(playing.over, state, following)
             action, reward = (_where(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
         played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
-        length = playing.length + ~playing.over
+        length = playing.length + (~playing.over).astype(jnp.int32)
         return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
 
     start = _Playing(first, jnp.zeros(num_envs, bool), jnp.zeros(num_envs, jnp.int32))
@@ -125,7 +125,7 @@ def _bad_rewards(spec: EnvSpec, reward: Array, length: Array) -> Array:
     if not spec.ends:
         return jnp.mean(bad, axis=0, dtype=jnp.float32)
     played = jnp.arange(spec.episode_length)[:, None] < length[None]
-    return jnp.sum(bad & played, axis=0, dtype=jnp.float32) / length
+    return jnp.sum(bad & played, axis=0, dtype=jnp.float32) / length.astype(jnp.float32)
 
 
 def _has_ended(env: Any, spec: EnvSpec, state: Any) -> Array:

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import pytest
 from test_trainer import SMALL
 
-from mjx_dher import envs, generators, make_train, priorities, replay, samplers
+from mjx_dher import envs, make_train, priorities, replay, samplers
 from mjx_dher.components import COMPONENTS
+from mjx_dher.contrib import generators
 from mjx_dher.learners import common
 from mjx_dher.runs.program.loop import state_template
 from mjx_dher.runs.program.program import Lane
@@ -51,9 +52,10 @@ def test_an_epoch_in_which_physics_may_blow_up(sampler, dtype):
 
 
 def test_an_epoch_with_a_priority_of_one_s_own():
-    def by_hand(episode, compute_reward, hparams):
+    def by_hand(episode, context):
         distance = jnp.linalg.norm(episode.achieved_goal[-1] - episode.achieved_goal[0])
-        return jnp.where(compute_reward(episode.achieved_goal[-1], episode.desired_goal) < 0, distance, hparams.epsilon)
+        missed = context.compute_reward(episode.achieved_goal[-1], episode.desired_goal) < 0
+        return jnp.where(missed, distance, context.hparams.epsilon)
 
     program = make_train(PointMass(), SMALL, priority=by_hand)
     jax.eval_shape(program.epoch, state_template(program))

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int, Key, TypeCheckError, jaxtyped
 
 from mjx_dher import HParams, priorities, relabel, replay, samplers
 from mjx_dher.components import COMPONENTS
+from mjx_dher.context import Context
 from mjx_dher.learners import actors, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
 from mjx_dher.types import Batch, Episode, Sizes
@@ -30,22 +31,49 @@ def shape(*sizes, dtype=jnp.float32):
 
 
 KEY = jax.eval_shape(lambda: jax.random.key(0))
-EPISODES = Episode(shape(N, T + 1, D), shape(N, T + 1, G), shape(N, G), shape(N, T, A))
-RING = jax.eval_shape(lambda: replay.init(jax.tree.map(lambda x: shape(*x.shape[1:]), EPISODES), E))
+EPISODES = Episode(shape(N, T + 1, D), shape(N, T + 1, G), shape(N, G), shape(N, T, A)).filled()
+RING = jax.eval_shape(lambda: replay.init(jax.tree.map(lambda x: shape(*x.shape[1:], dtype=x.dtype), EPISODES), E))
 SAMPLE = jax.eval_shape(lambda ring, key: replay.sample(ring, key, B), RING, KEY)
-BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B))
+BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B), shape(B), shape(B, dtype=jnp.int32))
 typed = jaxtyped(typechecker=beartype)
 values = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.fields(tree))  # noqa: E731
-fields = lambda tree: tuple(value for value in values(tree) if value is not None)  # noqa: E731
+fields = lambda tree: tuple(value for value in values(tree) if value is not None and value is not False)  # noqa: E731
 
-NewEpisodes = tuple[Float[Array, "N T1 D"], Float[Array, "N T1 G"], Float[Array, "N G"], Float[Array, "N T A"]]
-Stored = tuple[Float[Array, "E T1 D"], Float[Array, "E T1 G"], Float[Array, "E G"], Float[Array, "E T A"]]
+Ends = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B A"]]
+NewEpisodes = tuple[
+    Float[Array, "N T1 D"],
+    Float[Array, "N T1 G"],
+    Float[Array, "N G"],
+    Float[Array, "N T A"],
+    Int[Array, "N"],
+    Bool[Array, "N"],
+]
+Stored = tuple[
+    Float[Array, "E T1 D"],
+    Float[Array, "E T1 G"],
+    Float[Array, "E G"],
+    Float[Array, "E T A"],
+    Int[Array, "E"],
+    Bool[Array, "E"],
+]
 Marks = tuple[Float[Array, "E"], Int[Array, ""], Int[Array, ""]]
 Ring = tuple[Stored, Marks]
-Ends = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B A"]]
-Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], Int[Array, "B"], Int[Array, "B"]]
-Drawn = tuple[Float[Array, "B D"], Float[Array, "B D"], Float[Array, "B G"], Float[Array, "B A"], Float[Array, "B"]]
-Batches = tuple[Float[Array, "T B D"], Float[Array, "T B D"], Float[Array, "T B G"], Float[Array, "T B A"], Float[Array, "T B"]]
+Sample = tuple[Ends, Float[Array, "B T1 G"], Float[Array, "B G"], *(Int[Array, "B"],) * 3, Bool[Array, "B"]]
+Drawn = tuple[
+    Float[Array, "B D"],
+    Float[Array, "B D"],
+    Float[Array, "B G"],
+    Float[Array, "B A"],
+    *(Float[Array, "B"],) * 2,
+    Int[Array, "B"],
+]
+Batches = tuple[
+    *(Float[Array, "T B D"],) * 2,
+    Float[Array, "T B G"],
+    Float[Array, "T B A"],
+    *(Float[Array, "T B"],) * 2,
+    Int[Array, "T B"],
+]
 Rows = tuple[Int[Array, "B"], Int[Array, "E"], Bool[Array, ""]]
 Noise = tuple[Float[Array, "T N A"], Bool[Array, "T N"], Float[Array, "T N A"]]
 
@@ -83,14 +111,14 @@ def test_replay():
     def rows(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Rows:
         state = to_ring(ring)
         cumulative = replay.cumulative(state)
-        return replay.draw_rows(state, key, B, 0.5, cumulative), cumulative, replay.can_sample(state)
+        return replay.draw_rows(state, key, B, 0.5, cumulative), cumulative.priority, replay.can_sample(state)
 
     @typed
-    def goals(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> Float[Array, "B T1 G"]:
-        return replay.sample_episode_goals(to_ring(ring), key, B)
+    def pool(ring: Ring, key: Key[Array, ""], like: Int[Array, "B"]) -> tuple[Float[Array, "B T1 G"], Int[Array, "B"]]:
+        return tuple(replay.sample_pool(to_ring(ring), key, B))
 
     jax.eval_shape(added, from_ring(RING), fields(EPISODES))
-    for function in (sampled, rows, goals):
+    for function in (sampled, rows, pool):
         jax.eval_shape(function, from_ring(RING), KEY, shape(B, dtype=jnp.int32))
 
 
@@ -115,25 +143,30 @@ def reward(achieved, desired):
     return -jnp.linalg.norm(achieved - desired, axis=-1)
 
 
+CONTEXT = Context(reward, HP)
+
+
 @pytest.mark.parametrize("name", ["random", "weighted"])
 def test_relabel(name):
     @typed
     def relabelled(ring: Ring, sample: Sample, key: Key[Array, ""]) -> tuple[Drawn, Float[Array, "B G"]]:
-        args = to_ring(ring), to_sample(sample), samplers.make(name)
-        return fields(relabel.relabel(*args, reward, HP, key)), relabel.hindsight_goals(*args, HP, key)
+        sampler = samplers.make(name)
+        drawn = relabel.add_choices(to_ring(ring), to_sample(sample), sampler, None, key)
+        goals = relabel.hindsight_goals(drawn, sampler, HP, key).goals
+        return fields(relabel.relabel(drawn, sampler, CONTEXT, key).batch), goals
 
     @typed
-    def weights(*episodes: Float[Array, "N ..."]) -> Float32[Array, "N"]:
-        return priorities.weights(priorities.eventful, Episode(*episodes), reward, HP)
+    def weights(episodes: NewEpisodes) -> Float32[Array, "N"]:
+        return priorities.weights(priorities.eventful, Episode(*episodes), CONTEXT)
 
     @typed
     def batches(ring: Ring, key: Key[Array, ""], like: Float[Array, "T B"]) -> Batches:
         state = to_ring(ring)
-        args = samplers.make(name), reward, HP, replay.cumulative(state)
+        args = samplers.make(name), CONTEXT, replay.cumulative(state)
         return fields(relabel.draw_batches(state, key, (T, B), *args))
 
     jax.eval_shape(relabelled, from_ring(RING), from_sample(SAMPLE), KEY)
-    jax.eval_shape(weights, *fields(EPISODES))
+    jax.eval_shape(weights, fields(EPISODES))
     jax.eval_shape(batches, from_ring(RING), KEY, shape(T, B))
 
 
@@ -182,8 +215,8 @@ def test_ddpg():
 
 def test_it_would_be_noticed():
     """Goals where observations belong, actions of another number of episodes, and a result of another size."""
-    observation, goal, desired, action = fields(EPISODES)
-    for wrong in ((goal, observation, desired, action), (observation, goal, desired, shape(N + 1, T, A))):
+    observation, goal, desired, action, *more = fields(EPISODES)
+    for wrong in ((goal, observation, desired, action, *more), (observation, goal, desired, shape(N + 1, T, A), *more)):
         with pytest.raises(TypeCheckError):
             jax.eval_shape(added, from_ring(RING), wrong)
 

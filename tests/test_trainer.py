@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_dher import Config, HParams, learners, make_train, relabel, replay, samplers, trainer
-from mjx_dher.rollout import rollout
+from mjx_dher.rollout import env_spec, rollout
 from mjx_dher.runs.program import loop
 from mjx_dher.system import memory
 from probes import Explodes, PointMass
@@ -87,9 +87,9 @@ def test_batches_are_drawn_up_to_so_many_at_once(program, monkeypatch, at_once, 
 
     monkeypatch.setattr(trainer, "draw_batches", draw_batches)
     monkeypatch.setattr(trainer, "MAX_TRANSITIONS_PER_DRAW", at_once)
-    state = jax.eval_shape(program[0].epoch, loop.state_template(program[0]))[0]
+    state = jax.eval_shape(lambda state: program[0].epoch(state), loop.state_template(program[0]))[0]
     assert set(shapes) == {(2 // draws, 2, 32)}
-    jaxpr = str(jax.make_jaxpr(program[0].epoch)(loop.state_template(program[0])))
+    jaxpr = str(jax.make_jaxpr(lambda state: program[0].epoch(state))(loop.state_template(program[0])))
     assert f"length={draws}" in jaxpr
     assert state.learner.num_updates.shape == ()
 
@@ -197,7 +197,7 @@ def learn():
     @functools.cache
     def compiled(dtype):
         config = dataclasses.replace(LEARNS, learner_dtype=dtype)
-        learner = learners.make("ddpg", config, rollout.env_spec(ENV))
+        learner = learners.make("ddpg", config, env_spec(ENV))
         train = make_train(ENV, config, sampler=samplers.make("weighted"), learner=learner)
         return config, loop.compile_program(train, jax.random.key(0), HParams())
 
