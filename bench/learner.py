@@ -21,6 +21,7 @@ from timing import median_seconds, print_table
 
 from mjx_dher import Config, HParams, learners, replay, samplers
 from mjx_dher.components import COMPONENTS
+from mjx_dher.context import Context
 from mjx_dher.relabel import draw_batches
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Episode, Sizes
@@ -75,7 +76,7 @@ class Timed:
         self.each = self.at_once * self.draws * seeds
 
     def draw(self, key: Any) -> Any:
-        return draw_batches(self.ring, key, self.shape, self.sampler, compute_reward, self.hparams, self.cumulative)
+        return draw_batches(self.ring, key, self.shape, self.sampler, Context(compute_reward, self.hparams), self.cumulative)
 
     def draw_all(self, key: Any) -> Any:
         """[draws] one number of each batch, so that none is left out."""

@@ -17,6 +17,7 @@ from timing import median_seconds, print_table
 
 from mjx_dher import HParams, replay, samplers
 from mjx_dher.components import COMPONENTS
+from mjx_dher.context import Context
 from mjx_dher.relabel import draw_batches
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
 from mjx_dher.types import Batch
@@ -53,6 +54,8 @@ def flashbax(ring, num_drawn):
         reward=jnp.zeros(len(desired)),
         next_observation=flat(episodes.observation[:, 1:]),
         desired_goal=desired,
+        discount=jnp.ones(len(desired)),
+        row=jnp.repeat(jnp.arange(len(episodes.action)), episodes.action.shape[1]),
     )
     buffer = fbx.make_item_buffer(max_length=len(desired), min_length=1, sample_batch_size=num_drawn, add_batches=True)
     state = buffer.add(buffer.init(jax.tree.map(lambda x: x[0], items)), items)
@@ -72,7 +75,7 @@ def main() -> None:
     for name in COMPONENTS["sampler"]:
 
         def draw(key, sampler=samplers.make(name)):  # noqa: B008
-            return draw_batches(ring, key, shape, sampler, compute_reward, hparams, cumulative)
+            return draw_batches(ring, key, shape, sampler, Context(compute_reward, hparams), cumulative)
 
         rates[name] = transitions_a_second(draw, num_drawn)
     if args.flashbax:

@@ -29,7 +29,9 @@ def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floatin
         result = jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(f"{expected}; got {describe(value)}") from None
-    fits = jnp.issubdtype(result.dtype, kind) or (kind is jnp.number and result.dtype == bool)
+    fits = jnp.issubdtype(result.dtype, kind)
+    if kind is jnp.number:  # booleans count, complex numbers do not
+        fits = (fits or result.dtype == bool) and not jnp.issubdtype(result.dtype, jnp.complexfloating)
     if result.shape != tuple(shape) or not fits:
         raise ValueError(f"{expected}; got {describe(result)}")
     return result

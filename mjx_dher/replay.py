@@ -152,10 +152,7 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
 
 def as_priority(weight: Array | float) -> Array:
     """Converts weights to float32; anything but a positive, finite number becomes 0. Raises ValueError for other types."""
-    weight = array("priority", weight, jnp.shape(weight), jnp.number)
-    if jnp.issubdtype(weight.dtype, jnp.complexfloating):
-        raise ValueError(f"priority must be a real number; got {describe(weight)}")
-    weight = weight.astype(jnp.float32)
+    weight = array("priority", weight, np.shape(weight), jnp.number).astype(jnp.float32)
     return jnp.where((weight > 0) & jnp.isfinite(weight), weight, 0.0)
 
 

@@ -46,9 +46,11 @@ class Episode:
     terminal: Array = None  # type: ignore[assignment]  # [] whether no future follows, for any goal; None stands for False
 
     def filled(self) -> Episode:
-        """Fills in `length` and `terminal` where they are None. Arrays may be `jax.ShapeDtypeStruct`s."""
-        *leading, num_steps, _ = self.action.shape
-        shape = tuple(leading)
+        """Fills in `length` and `terminal` if they are None. Arrays may be `jax.ShapeDtypeStruct`s."""
+        sizes = np.shape(self.action)
+        if len(sizes) < 2:
+            raise ValueError(f"action of an episode must be [T, A]; got shape {sizes}")
+        shape, num_steps = sizes[:-2], sizes[-2]
         length: Any = self.length
         terminal: Any = self.terminal
         if isinstance(self.action, jax.ShapeDtypeStruct):

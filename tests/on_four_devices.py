@@ -48,6 +48,8 @@ def make_batch(size=64):
         desired_goal=jax.random.normal(keys[2], (size, 2)),
         action=jax.random.uniform(keys[3], (size, 2), minval=-1, maxval=1),
         reward=-jax.random.bernoulli(keys[4], 0.5, (size,)).astype(jnp.float32),
+        discount=jnp.full(size, 0.98),
+        row=jnp.arange(size),
     )
 
 

@@ -184,15 +184,20 @@ def test_critics_learn_a_known_soft_value(name):
     np.testing.assert_allclose(learned(hparams._replace(entropy_weight=0.0)), -5.0, atol=0.1)
 
 
+def batch_of(action, reward, hparams):
+    """Transitions of a state that never changes."""
+    ones = jnp.ones((len(reward), 2))
+    return Batch(ones, ones, ones, action, reward, jnp.full(len(reward), hparams.gamma), jnp.arange(len(reward)))
+
+
 def learned_value(learner):
     """Returns a function of HParams: the value that the critics come to in the chain."""
-    ones = jnp.ones((32, 2))
 
     @jax.jit
     def value(hparams):
         def step(state, key):
             action = jax.random.uniform(key, (32, 2), minval=-1, maxval=1)
-            state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+            state, losses = learner.update(state, batch_of(action, -jnp.ones(32), hparams), hparams)
             return learner.update_target(state, hparams), losses["q_mean"]
 
         _, values = jax.lax.scan(step, learner.init(jax.random.key(0)), jax.random.split(jax.random.key(1), 1500))
@@ -206,16 +211,17 @@ def test_the_best_action_of_a_bandit_is_found(name):
     """The reward is -|a - 0.5| / 4 for each number of the action, and the next state is worth the same as all others."""
     learner, _ = made(name)
     hparams = HParams(gamma=0.0, action_l2=0.0, entropy_weight=0.01, critic_lr=0.003, actor_lr=0.003)
-    state, ones = jax.jit(learner.init)(jax.random.key(0)), jnp.ones((64, 2))
+    state = jax.jit(learner.init)(jax.random.key(0))
 
     def step(state, key):
         action = jax.random.uniform(key, (64, 2), minval=-1, maxval=1)
         reward = -jnp.sum(jnp.abs(action - 0.5), axis=-1) / 4
-        state, losses = learner.update(state, Batch(ones, ones, ones, action, reward), hparams)
+        state, losses = learner.update(state, batch_of(action, reward, hparams), hparams)
         return learner.update_target(state, hparams), losses
 
     state, _ = jax.jit(lambda *args: jax.lax.scan(step, *args))(state, jax.random.split(jax.random.key(1), 1500))
-    obs = {"observation": ones[:1], "desired_goal": ones[:1], "achieved_goal": ones[:1]}
+    one = jnp.ones((1, 2))
+    obs = {"observation": one, "desired_goal": one, "achieved_goal": one}
     np.testing.assert_allclose(jax.jit(learner.act)(state, obs, hparams)[0], [0.5, 0.5], atol=0.15)
 
 

@@ -215,7 +215,7 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     observation, following, goal, action = (
         jax.random.normal(jax.random.key(i), (512, size)) for i, size in enumerate((25, 25, 3, 4))
     )
-    batch = Batch(observation, following, goal, jnp.tanh(action), -jnp.ones(512), jnp.full(512, 0.98))
+    batch = Batch(observation, following, goal, jnp.tanh(action), -jnp.ones(512), jnp.full(512, 0.98), jnp.arange(512))
     hparams = HParams()
 
     def passes(networks):
@@ -242,7 +242,9 @@ def test_critic_learns_a_known_value():
     @jax.jit
     def step(state, key):
         action = jax.random.uniform(key, (32, 1), minval=-1, maxval=1)
-        state, losses = learner.update(state, Batch(ones, ones, ones, action, -jnp.ones(32)), hparams)
+        state, losses = learner.update(
+            state, Batch(ones, ones, ones, action, -jnp.ones(32), jnp.full(32, hparams.gamma), jnp.arange(32)), hparams
+        )
         return learner.update_target(state, hparams), losses
 
     state, losses = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1500))

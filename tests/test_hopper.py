@@ -48,6 +48,8 @@ def case(action_size, seed):
         desired_goal=jax.random.normal(keys[2], (SIZE, GOAL)),
         action=jax.random.uniform(keys[3], (SIZE, action_size), minval=-1.0),
         reward=-jax.random.bernoulli(keys[4], 0.7, (SIZE,)).astype(jnp.float32),
+        discount=jnp.full(SIZE, 0.98),
+        row=jnp.arange(SIZE),
     )
     return params(keys[5]), params(keys[6]), batch
 

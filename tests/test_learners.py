@@ -1,7 +1,6 @@
 """Learners and networks of one's own: what is taken, what is refused, how they train, and their policies as files."""
 
 import dataclasses
-import functools
 import sys
 import types
 
@@ -111,7 +110,7 @@ def test_networks_are_a_function_or_a_place(mine):
 @pytest.mark.parametrize(
     ("field", "make", "parameters"),
     [
-        ("learner", functools.partial(learners.make, config=SMALL, sizes=SIZES), "(config, sizes, networks)"),
+        ("learner", lambda name: learners.make(name, SMALL, SIZES), "(config, sizes, networks)"),
         ("networks", networks.make, "(action_size, hidden_sizes, dtype)"),
         ("networks", lambda name: learners.make("ddpg", SMALL, SIZES, name), "(action_size, hidden_sizes, dtype)"),
     ],

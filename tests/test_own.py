@@ -48,11 +48,11 @@ def metric(achieved, desired):
     traced.add("metric")
     return jnp.abs(achieved - desired[None]).max(axis=-1)
 
-def priority(episode, compute_reward, hparams):
+def priority(episode, context):
     traced.add("priority")
     return jnp.full((), 0.25)
 
-def generator(key, obs, ring, view):
+def generator(key, obs, ring, context):
     traced.add("generator")
     return obs["desired_goal"]
 
