@@ -12,7 +12,7 @@ from test_trainer import SMALL
 
 from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trainer
 from mjx_dher.parallel import mesh
-from mjx_dher.parallel.split import ALONE, Split
+from mjx_dher.parallel import split as split_lib
 from mjx_dher.rollout import env_spec
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import loggers
@@ -29,11 +29,11 @@ DEVICES = (1, 2, 4)
 
 
 def in_parts(number, function, in_specs, out_specs):
-    """`function` of a Split, on so many devices."""
+    """`function` of an axis name, on so many devices."""
     if number == 1:
-        return jax.jit(functools.partial(function, ALONE))
+        return jax.jit(functools.partial(function, None))
     layout = mesh.arrange(mesh.find(number), 1)
-    local = functools.partial(function, layout.split)
+    local = functools.partial(function, layout.axis_name)
     return jax.jit(jax.shard_map(local, mesh=layout.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False))
 
 
@@ -62,10 +62,10 @@ def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
     learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SIZES)
     state = learner.init(jax.random.key(0))
 
-    def update(split, state, batch):
-        own = learner if split.number == 1 else learners.over_axis(learner, split.axis)
+    def update(axis_name, state, batch):
+        own = learners.over_axis(learner, axis_name)
         state, metrics = own.update(state, batch, trainer.as_arrays(HParams()))
-        return state, split.mean(metrics)
+        return state, split_lib.mean(metrics, axis_name)
 
     states = [in_parts(n, update, (WHOLE, PARTED), (WHOLE, WHOLE))(state, make_batch()) for n in DEVICES]
     moments = [[getattr(s, field) for field in vars(s) if field.endswith(("moments", "opt_state"))] for s, _ in states]
@@ -79,7 +79,7 @@ def test_parts_that_do_not_average_learn_something_else():
     """So that the test above can fail."""
     learner = learners.make("ddpg", CONFIG, SIZES)
     state = learner.init(jax.random.key(0))
-    update = lambda split, state, batch: learner.update(state, batch, trainer.as_arrays(HParams()))[0]  # noqa: E731
+    update = lambda axis_name, state, batch: learner.update(state, batch, trainer.as_arrays(HParams()))[0]  # noqa: E731
     one, two = (in_parts(n, update, (WHOLE, PARTED), WHOLE)(state, make_batch()) for n in (1, 2))
     difference = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), one.opt_state, two.opt_state)
     assert max(jax.tree.leaves(difference)) > 1e-4
@@ -91,8 +91,8 @@ def test_moments_of_the_normalizers_are_those_of_all_parts():
     valid = (jnp.arange(16) % 3 > 0) & (jnp.arange(16) < 12)  # none in the last of four parts
     before = normalizer.update(normalizer.init(2), values[:3] - 1.0, 200.0)
 
-    def update(split, state, values, valid):
-        return normalizer.update(state, values, 200.0, valid[:, None], split.axis)
+    def update(axis_name, state, values, valid):
+        return normalizer.update(state, values, 200.0, valid[:, None], axis_name)
 
     kept = np.concatenate([np.asarray(values[:3] - 1.0).reshape(-1, 2), np.asarray(values[valid]).reshape(-1, 2)])
     for number in DEVICES:
@@ -104,22 +104,17 @@ def test_moments_of_the_normalizers_are_those_of_all_parts():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("devices", [2, 4])
-def test_the_first_episodes_and_evaluations_are_those_of_one_device(devices):
-    """First states and noise do not depend on the devices, nor do the episodes that are discarded."""
+def test_each_device_plays_episodes_of_its_own(devices):
+    """All episodes are counted, the discarded ones too, and no two are alike."""
     env, config = Explodes(jnp.nan), dataclasses.replace(CONFIG, cycles_per_epoch=1, eval_episodes=10)
-    hparams = HParams(actor_lr=0.0, random_eps=1.0)  # the policy, and so what is played, does not change
-    one, several = (next(loop.train(env, config, hparams, devices=n)) for n in (1, devices))
-    for name in ("train_success_rate", "train_return_mean", "success_rate", "reset_success_rate", "return_mean"):
-        assert one.metrics[name] == pytest.approx(several.metrics[name], rel=1e-6, nan_ok=True), name
-    assert one.metrics["discarded_episodes"] == several.metrics["discarded_episodes"] > 0
-    valid = 8 - one.metrics["discarded_episodes"]
-    sizes = np.asarray(several.state.replay.size)
+    progress = next(loop.train(env, config, HParams(random_eps=1.0), devices=devices))
+    sizes = np.asarray(progress.state.replay.size)
     assert sizes.shape == (devices,)
-    assert sizes.sum() == valid == one.state.replay.size
-    episodes = [np.asarray(x.state.replay.episodes.action).reshape(40, -1) for x in (one, several)]
-    held = [{row.tobytes() for row in rows if row.any()} for rows in episodes]
-    assert held[0] == held[1]
-    np.testing.assert_allclose(one.state.learner.observation_norm.mean, several.state.learner.observation_norm.mean, rtol=1e-5)
+    assert progress.metrics["discarded_episodes"] == 8 - sizes.sum() > 0
+    episodes = np.asarray(progress.state.replay.episodes.action).reshape(40, -1)
+    played = [row.tobytes() for row in episodes if row.any()]
+    assert len(set(played)) == len(played) == sizes.sum()
+    assert float(progress.state.learner.observation_norm.count) == sizes.sum() * (env.episode_length + 1)
 
 
 def specs_of(number):
@@ -262,8 +257,9 @@ def test_layouts():
         40: (4, 1),
     }
     assert mesh.arrange((), 3) is mesh.ONE
-    assert mesh.ONE.split is ALONE
-    assert found[1].split == Split("data", 4)
+    assert mesh.ONE.axis_name is None
+    assert found[1].axis_name == mesh.DATA
+    assert found[4].axis_name is None
     assert found[1].sharers == 4  # of the memory of one CPU
     assert mesh.find(1) == ()
     assert len(mesh.find("all")) == 4
@@ -275,12 +271,7 @@ def test_engines_on_several_devices(engine):
     """The callback of `native` is called by all devices at once, each with its share of the environments."""
     env = envs.make("reach", engine=engine)
     config = dataclasses.replace(CONFIG, replay_size=50 * 80, total_steps=2 * 3 * 8 * 50, eval_episodes=6)
-    one, several = ([jax.device_get(progress) for progress in loop.train(env, config, devices=n)] for n in (1, 4))
-    assert one[0].metrics["reset_success_rate"] == several[0].metrics["reset_success_rate"]
+    several = [jax.device_get(progress) for progress in loop.train(env, config, devices=4)]
     assert len(several) == 2
     assert several[-1].metrics["discarded_episodes"] == 0.0
     assert bool(several[-1].finite)
-    # The first cycle's episodes are the same ones: the policies that play them are.
-    np.testing.assert_allclose(
-        several[0].state.replay.episodes.observation[0, :5], one[0].state.replay.episodes.observation[0, :5], atol=1e-4
-    )

@@ -18,7 +18,6 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from mjx_dher.parallel.mesh import DATA, LANES, Layout
-from mjx_dher.replay import ReplayState
 from mjx_dher.trainer import TrainState
 from mjx_dher.types import Array, PRNGKey
 
@@ -138,8 +137,7 @@ def _lane(batched: bool) -> PartitionSpec:
 def _state_specs(batched: bool) -> TrainState:
     """Returns how a TrainState lies on the mesh, [L] runs if `batched`. Each device of a run has a cursor and a size."""
     whole, split = _lane(batched), PartitionSpec(*_lane(batched), DATA)
-    ring: Any = ReplayState(episodes=split, priority=split, cursor=split, size=split)  # type: ignore[arg-type]
-    return TrainState(learner=whole, replay=ring, hparams=whole, key=whole, env_steps=whole)  # type: ignore[arg-type]
+    return TrainState(learner=whole, replay=split, hparams=whole, key=whole, env_steps=whole)  # type: ignore[arg-type]
 
 
 def _named(layout: Layout, specs: Any) -> Any:
