@@ -1,7 +1,4 @@
-"""Goal-conditioned environments, made by name or as "module:attribute": `make` and `list_envs`.
-
-`Simulator` steps any MuJoCo model, whether it is a task or not.
-"""
+"""Goal-conditioned environments: `make`, `list_envs`, and `Simulator` for any MuJoCo model."""
 
 from __future__ import annotations
 
@@ -26,12 +23,12 @@ def list_envs() -> tuple[str, ...]:
 
 
 def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
-    """Makes the environment called `name`.
+    """Makes an environment.
 
     Args:
       name: one of `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
       engine: "native" (MuJoCo C on the host's cores), "warp" (a kernel for NVIDIA GPUs), "jax" (MJX) or "auto" (native on
-        a CPU, warp on an NVIDIA GPU, else jax). A constructor that takes no `engine` is called without it.
+        a CPU, warp on an NVIDIA GPU, else jax). It is passed on if the constructor has this argument.
       **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`.
 
     Raises:
@@ -66,12 +63,12 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
 
 
 def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict[str, Any]) -> None:
-    """Raises ValueError for an argument that the constructor does not take; it names those that it takes, and its engine's."""
+    """Raises ValueError for an argument that neither the constructor nor its engine takes, and lists those they take."""
     parameters = inspect.signature(constructor).parameters
     named = [
         key for key, parameter in parameters.items() if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
     ]
-    if len(named) < len(parameters):  # **options are the engine's, of which it alone knows
+    if len(named) < len(parameters):  # **options are the engine's
         if name not in COMPONENTS["env"]:
             return
         from mjx_dher.envs.engines import engine_options

@@ -110,13 +110,13 @@ class FetchEnv(GoalEnv):
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
 
     def reset(self, key: PRNGKey) -> State:
-        """Draws a start as in the original: arm as it settled, object on the table near the gripper, random goal."""
+        """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)
         object_qpos = self._sample_object(object_key) if self.has_object else None
         return self.init_state(object_qpos, self._sample_goal(goal_key))
 
     def init_state(self, object_qpos: Array | None, desired_goal: Array) -> State:
-        """Returns the state at a given start, such as that of a recorded episode; the arm starts as always.
+        """Returns the state at a given start, for example from a recorded episode. The arm starts as always.
 
         Args:
           object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
@@ -134,12 +134,12 @@ class FetchEnv(GoalEnv):
         )
 
     def with_goal(self, state: State, goal: Array) -> State:
-        """Returns the state of an episode that is played for another goal, [3] m."""
+        """Returns the state with another desired goal, [3] m."""
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
         return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
 
     def with_object(self, state: State, position: Array) -> State:
-        """Returns the state after a hand has put the object to `position`, [3] m, upright and at rest."""
+        """Returns the state with the object at `position`, [3] m, upright and at rest."""
         upright = jnp.concatenate([jnp.asarray(position, jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0])])
         qpos, qvel = (
             x.at[at].set(y)
@@ -147,19 +147,17 @@ class FetchEnv(GoalEnv):
         )
         physics = state.physics.replace(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
         obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
-        return dataclasses.replace(
-            state, physics=physics, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"])
-        )
+        return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
 
     def step(self, state: State, action: Array) -> State:
-        """Asks the gripper to move by 5 cm times `action[:3]` (x, y, z) and holds the request for one step of 40 ms.
+        """Moves the gripper's target by 5 cm times `action[:3]` (x, y, z) and holds it for one step of 40 ms.
 
         `action[3]` opens and closes the fingers if actuators drive them. If the physics blows up (a value is not finite, or a
         speed above its limit), the state goes back to a start, and `failed` stays True until `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
-        # As in the original, requests are relative to where gripper and fingers are, not to where they were asked to be; and
-        # the gripper is asked to turn half-way from where it points to straight down.
+        # As in the original, targets are relative to the present places of gripper and fingers, not to earlier targets, and the
+        # target's orientation lies half-way between the gripper's and straight down.
         pos, quat = self.arm.pose(self._at_observation(state.physics).qpos[self.arm.qpos])
         quat = quat + POINTING_DOWN
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
@@ -194,14 +192,14 @@ class FetchEnv(GoalEnv):
         return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv, jnp.float32), act=jnp.zeros(0, jnp.float32))
 
     def _resting_place(self) -> Array | None:
-        """Returns the object's qpos [7] after the physics has blown up: beside the gripper, as near as a reset would put it."""
+        """The object's qpos [7] after the physics blew up: next to the gripper, as near as a reset would put it."""
         if self.task.object_height is None:
             return None
         x, y, _ = self.task.initial_grip_pos
         return jnp.array([x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0])
 
     def _is_sound(self, physics: Physics) -> Array:
-        """Returns whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
+        """Whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
         qpos, qvel = physics.qpos, physics.qvel
         sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
         sound &= jnp.all(jnp.abs(qvel[self.arm.qvel]) < MAX_JOINT_SPEED)
@@ -272,7 +270,7 @@ class FetchEnv(GoalEnv):
 
 
 def _in_float32(observation: Array, achieved_goal: Array, desired_goal: Array) -> GoalObs:
-    """Returns what an agent sees in float32, where JAX computes in 64 bits, too."""
+    """Converts an observation to float32, also if JAX computes in 64 bits."""
     observation, achieved_goal, desired_goal = (x.astype(jnp.float32) for x in (observation, achieved_goal, desired_goal))
     return GoalObs(observation=observation, achieved_goal=achieved_goal, desired_goal=desired_goal)
 

@@ -60,18 +60,17 @@ def test_the_last_function_of_a_name_is_called_also_by_what_is_compiled():
     np.testing.assert_array_equal(call(ROWS[0]), -first)
 
 
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
+def test_an_error_ends_the_program_with_its_message():
+    cases = [
         (lambda rows: 1 / 0, "ZeroDivisionError: division by zero"),
         (lambda rows: rows[:2], r"must give \[4\]; it gives \(2,\)"),
         (lambda rows: None, r"must give \[4\]; it gives \(\)"),
-    ],
-)
-def test_an_error_ends_the_program_with_its_message(function, message):
-    host_call.register("test_error", function)
-    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match=message):
-        jax.block_until_ready(jax.jit(lambda row: host_call.call("test_error", (4,), row))(ROWS[0]))
+    ]
+    call = jax.jit(lambda row: host_call.call("test_error", (4,), row))
+    for function, message in cases:
+        host_call.register("test_error", function)
+        with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match=message):
+            jax.block_until_ready(call(ROWS[0]))
 
 
 PROGRAM = """

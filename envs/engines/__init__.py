@@ -17,7 +17,7 @@ __all__ = ["Controls", "Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
-    """Returns the engine that `name` stands for: `auto` is native on a CPU, warp on a GPU with warp-lang installed, else jax.
+    """Resolves `auto`: native on a CPU, warp on a GPU if warp-lang is installed, else jax.
 
     Raises:
       ValueError: there is no engine `name`.
@@ -59,7 +59,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
 
 
 def engine_options(name: str) -> list[str]:
-    """Returns the options of an engine by name.
+    """Names of an engine's options.
 
     Raises:
       ValueError: as for `make_engine`.

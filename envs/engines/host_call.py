@@ -1,8 +1,8 @@
-"""Functions of NumPy that compiled JAX programs on a CPU call by a name.
+"""NumPy functions that compiled JAX programs on a CPU look up by a name.
 
 `jax.pure_callback` puts a function's address into the program, which JAX therefore cannot keep for the next process. Here the
-program holds a name, by XLA's foreign function interface, of whose structs (xla/ffi/api/c_api.h, a stable binary interface)
-the ones that are needed are declared below.
+program holds a name, through XLA's foreign function interface. The structs below are declared in xla/ffi/api/c_api.h, a stable
+binary interface.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _pointer, _int, _int64 = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 
 
 class _Struct(ctypes.Structure):
-    """What most of XLA's structs begin with."""
+    """The first fields of most of XLA's structs."""
 
     _fields_: ClassVar[Any] = (("struct_size", ctypes.c_size_t), ("extension", _pointer))
 
@@ -41,7 +41,7 @@ class _Metadata(ctypes.Structure):
 
 
 class _Extension(ctypes.Structure):
-    """An extension of a frame; `metadata` is there where `type` says so."""
+    """Extension of a frame, with `metadata` if `type` is _METADATA."""
 
     _fields_ = (
         ("struct_size", ctypes.c_size_t),
@@ -85,7 +85,7 @@ _handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))
 
 
 def register(name: str, function: _Function) -> None:
-    """Makes `function` the one that programs call by `name`; it takes the place of an earlier one.
+    """Makes `function` the one that programs call under `name`, instead of an earlier one.
 
     It must use NumPy alone: calls of JAX in a callback could deadlock.
     """
@@ -96,7 +96,7 @@ def register(name: str, function: _Function) -> None:
 
 
 def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
-    """Calls the function that is registered by `name` with `inputs` [m]; returns its outputs, float32 of `shape`.
+    """Calls the function registered under `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
 
     Under `vmap` it is called once, with [..., m]. A program for another device than a CPU holds the function's address.
     """
@@ -108,7 +108,7 @@ def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
 
 
 def _handle(name: str, frame: Any) -> int | None:
-    """Answers XLA: which version this is, or with the outputs; returns None, or an error."""
+    """Answers a call of XLA with this version or the outputs. Returns None, or an error."""
     try:
         extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension))
         if extension and extension.contents.type == _METADATA:

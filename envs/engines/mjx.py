@@ -106,7 +106,7 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
     A contact with a margin acts from that distance on. MJX 3.17 finds box-box and sphere-box contacts only if the geoms
     overlap: their distance would jump from none to the whole margin, and a slightly tilted face would touch with fewer points.
     A geom that is larger by the margin gives the same distances and normals (except at a box's edges, which stay sharp). The
-    geom must have the same margin in all its contacts; a warning names the pairs of which neither geom does.
+    geom must have the same margin in all its contacts. If neither geom of a pair has, a warning names the pair.
     """
     sphere, box = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)
     ends = np.stack([model.pair_geom1, model.pair_geom2], axis=1)

@@ -70,7 +70,7 @@ class Simulator:
 
     `step` does what `mujoco.mj_step` does, in float64 on any number of threads; between calls everything is float32. However
     many `vmap`s are around it, a call is one call of the host, which steps all simulations on its threads. Gradients do not
-    pass through it. A copy, or a pickle, has threads and memory of its own.
+    pass through it. Copies and unpickled simulators have separate threads and memory.
 
     `step` and `forward` take the whole state, `Data`. `advance` takes the few arrays that an engine needs (`Physics` and
     `Controls`) and leaves the rest of the state at the model's defaults: this is the engine `native`.
@@ -118,7 +118,7 @@ class Simulator:
             host_call.register(f"{self._name}_{function}", functools.partial(self._on_host, function))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns what a copy is made from: neither locks nor batches can be copied."""
+        """The state of a copy or pickle, without locks and batches, which cannot be copied."""
         return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

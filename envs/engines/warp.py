@@ -27,7 +27,7 @@ class WarpEngine:
     in which threads finish.
 
     Args:
-      model: the compiled MJCF, with exactly one mocap body.
+      model: the compiled MJCF; `fused.simulation.unsupported` lists the features that it must not have.
       substeps: MuJoCo timesteps an environment step.
       iterations: maximum Newton iterations of the constraint solver; each environment stops by itself, most after one or two.
       ls_iterations: maximum steps of the solver's line search.
@@ -35,7 +35,7 @@ class WarpEngine:
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
-      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the model has what the kernel leaves out.
+      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the kernel does not support the model.
     """
 
     name = "warp"
@@ -53,7 +53,7 @@ class WarpEngine:
         if not allow_cpu:
             _check_gpu()
         if left_out := simulation.unsupported(model):
-            raise ValueError(f"engine warp leaves out what the model has: {', '.join(left_out)}; use engine native")
+            raise ValueError(f"engine warp does not support features of the model: {', '.join(left_out)}; use engine native")
         self.most_constraints = simulation.most_rows(model)
         self._constraints = self.most_constraints if constraints is None else constraints
         for name, count in {
@@ -71,16 +71,16 @@ class WarpEngine:
         self._call = self._jax_callable()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns what a copy, or a pickle, is made of: a lock, a thread and the device's memory cannot be copied."""
-        made_anew = ("_simulations", "_lock", "_loading", "_call")
-        return {name: value for name, value in vars(self).items() if name not in made_anew}
+        """The state of a copy or pickle, without locks, threads and device memory, which cannot be copied."""
+        left_out = ("_simulations", "_lock", "_loading", "_call")
+        return {name: value for name, value in vars(self).items() if name not in left_out}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _simulations={}, _lock=threading.Lock(), _loading=None)
         self._call = self._jax_callable()
 
     def _jax_callable(self) -> Any:
-        """Returns a function of JAX that advances a batch; it makes the batch's memory when it first runs."""
+        """Makes a JAX function that advances a batch and allocates the batch's memory on its first call."""
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]

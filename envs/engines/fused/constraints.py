@@ -23,13 +23,13 @@ _TINY = wp.constant(1e-15)  # MuJoCo's smallest number
 #endif
 """)
 def _to_the(x: float, exponent: float) -> float:
-    """Returns a power; its code is there once, because a GPU waits for instructions that do not fit into its cache."""
+    """x to the power of `exponent`. Its code is not inlined, because a GPU waits for instructions beyond its cache."""
     ...
 
 
 @wp.func
 def _impedance(soft: Softness, depth: float) -> float:
-    """Returns how much of a constraint is enforced, between 0 and 1, at a distance from where it begins."""
+    """Impedance, between 0 and 1, of a constraint at this depth."""
     least = soft[2]
     most = soft[3]
     width = soft[4]
@@ -51,7 +51,7 @@ def _impedance(soft: Softness, depth: float) -> float:
 
 @wp.func
 def _ask(memory: Memory, row: int, soft: Softness, residual: float, depth: float, inverse_inertia: float, velocity: float):
-    """Sets what a row asks for."""
+    """Sets a row's weight and reference acceleration."""
     imp = _impedance(soft, depth)
     memory.weight[row] = 1.0 / wp.max(inverse_inertia * (1.0 - imp) / imp, _TINY)
     memory.residual[row] = -soft[0] * imp * residual - soft[1] * velocity
@@ -59,13 +59,13 @@ def _ask(memory: Memory, row: int, soft: Softness, residual: float, depth: float
 
 @wp.func
 def _at(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
-    """Returns the velocity at a place of what moves so."""
+    """Velocity of a moving frame at an offset from its origin."""
     return wp.spatial_bottom(motion) + wp.cross(wp.spatial_top(motion), arm)
 
 
 @wp.func
 def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
-    """Sets the first six rows: the target's place less the body's, and the turn between them."""
+    """Sets the first six rows: the target's position less the body's, and the rotation between them."""
     body, target, nv = world.weld_body, world.weld_target, dofs.number
     arm = memory.pos[body] - memory.pos[bodies.root[body]]
     q = memory.quat[body]
@@ -106,7 +106,7 @@ def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, 
 def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: wp.array(dtype=int), thread: int, threads: int):
     """Gives a row to each joint at its limit, and a number of rows to each contact within its margin.
 
-    Contacts for which there is no room are left out, and counted in `lost`.
+    Contacts that do not fit are left out and counted in `lost`.
     """
     for s in range(thread, contacts.slots, threads):
         pair = contacts.pair[s]
@@ -136,13 +136,13 @@ def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: w
 
 @wp.func
 def _edges(dim: int) -> int:
-    """Returns how many edges a contact's friction pyramid has."""
+    """Number of edges of a contact's friction pyramid."""
     return wp.where(dim == 1, 1, 2 * dim - 2)
 
 
 @wp.func
 def _past_limit(dofs: Dofs, memory: Memory, k: int) -> float:
-    """Returns how far a joint is from its nearer limit, less the margin."""
+    """Distance of a joint from its nearer limit, less the margin."""
     at = memory.qpos[dofs.qpos[dofs.limit_dof[k]]]
     return wp.min(at - dofs.limit_range[k][0], dofs.limit_range[k][1] - at) - dofs.limit_margin[k]
 
@@ -206,7 +206,7 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, thread
 
 @wp.func
 def press(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
-    """Sets what the rows of contacts ask for."""
+    """Sets weights and reference accelerations of the rows of contacts."""
     nv = dofs.number
     for at in range(thread, _MOST * memory.counts[0], threads):
         s = memory.touching[at // _MOST]

@@ -68,8 +68,7 @@ def collide_boxes(contacts: Contacts, memory: Memory, thread: int, threads: int)
 def collide_cylinders(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of a cylinder and a box.
 
-    The first contact is that of the two as they lie; four more are looked for with both tilted by a little about the first one,
-    as MuJoCo C does.
+    As in MuJoCo C, the first contact is found with both in place, and up to four more with both slightly tilted about it.
     """
     for round in range(contacts.rounds):  # not twice in the code, which is long
         for at in range(thread, wp.where(round == 0, 1, 4) * contacts.pairs, threads):
@@ -82,7 +81,7 @@ def collide_cylinders(contacts: Contacts, memory: Memory, thread: int, threads: 
 
 @wp.func
 def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int):
-    """Sets a slot of a cylinder and a box: the first one, or one of those with both tilted in a direction."""
+    """Sets a slot of a cylinder and a box: the first, or one with both tilted in a direction."""
     geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
     pos1, mat1, size1 = _geom(contacts, memory, geom1)
     pos2, mat2, size2 = _geom(contacts, memory, geom2)
@@ -122,7 +121,7 @@ def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int
 
 @wp.func
 def _thin(contacts: Contacts, memory: Memory, thread: int, threads: int):
-    """Drops contacts of a cylinder and a box that are near others of them."""
+    """Drops contacts of a cylinder and a box that are close to another one."""
     for p in range(thread, contacts.pairs, threads):
         first = contacts.first[p]
         if contacts.kind[p] == _CYLINDER_BOX:
@@ -137,7 +136,7 @@ def _thin(contacts: Contacts, memory: Memory, thread: int, threads: int):
 
 @wp.func
 def tangent(normal: wp.vec3) -> wp.vec3:
-    """Returns the first tangent, which MuJoCo takes near y, or near z where the normal is."""
+    """First tangent, as in MuJoCo: near y, or near z if the normal is near y."""
     other = wp.vec3(0.0, 1.0, 0.0)
     if wp.abs(normal[1]) >= 0.5:
         other = wp.vec3(0.0, 0.0, 1.0)
@@ -157,7 +156,7 @@ def _pos(contacts: Contacts, memory: Memory, geom: int) -> wp.vec3:
 
 @wp.func
 def _geom(contacts: Contacts, memory: Memory, geom: int):
-    """Returns a geom's place, axes and size."""
+    """Position, axes and size of a geom."""
     return _pos(contacts, memory, geom), _mat(contacts, memory, geom), contacts.geom_size[geom]
 
 
@@ -195,7 +194,7 @@ def _side(bit: int) -> float:
 
 @wp.func
 def _near(pos: wp.vec3, reach: float, box_pos: wp.vec3, box_mat: wp.mat33, box_size: wp.vec3) -> bool:
-    """Returns whether a sphere may touch a box."""
+    """Whether a sphere may touch a box."""
     at = wp.transpose(box_mat) * (pos - box_pos)
     return (
         wp.abs(at[0]) <= box_size[0] + reach and wp.abs(at[1]) <= box_size[1] + reach and wp.abs(at[2]) <= box_size[2] + reach

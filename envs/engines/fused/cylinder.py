@@ -55,7 +55,7 @@ def _sign(x: wp.float64) -> wp.float64:
 
 @wp.func
 def _of_cylinder(s: _Shapes, direction: wp.vec3d) -> wp.vec3d:
-    """Returns the cylinder's furthest point in a direction."""
+    """The cylinder's furthest point in a direction."""
     local = wp.transpose(s.cylinder_mat) * direction
     across = wp.sqrt(local[0] * local[0] + local[1] * local[1])
     scale = wp.where(across > _LEAST, s.cylinder_size[0] / wp.max(across, _LEAST), _0)
@@ -65,7 +65,7 @@ def _of_cylinder(s: _Shapes, direction: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _of_box(s: _Shapes, direction: wp.vec3d) -> wp.vec3d:
-    """Returns the box's furthest point in a direction."""
+    """The box's furthest point in a direction."""
     local = wp.transpose(s.box_mat) * direction
     point = wp.vec3d(_sign(local[0]) * s.box_size[0], _sign(local[1]) * s.box_size[1], _sign(local[2]) * s.box_size[2])
     return s.box_pos + s.box_mat * (point + s.grow * local)
@@ -73,7 +73,7 @@ def _of_box(s: _Shapes, direction: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _outwards(p: _Portal) -> wp.vec3d:
-    """Returns the portal's normal, which points away from the inside."""
+    """The portal's normal, which points away from the inside."""
     return wp.normalize(wp.cross(p.v2 - p.v1, p.v3 - p.v1))
 
 
@@ -99,17 +99,17 @@ def _widen(p: _Portal, v: wp.vec3d, a: wp.vec3d) -> _Portal:
 
 @wp.func
 def _beyond(p: _Portal, v: wp.vec3d, direction: wp.vec3d) -> wp.float64:
-    """Returns how far a point lies outside the portal, at least, in m."""
+    """Least distance of a point outside the portal, m."""
     d = wp.dot(v, direction)
     return wp.min(d - wp.dot(p.v1, direction), wp.min(d - wp.dot(p.v2, direction), d - wp.dot(p.v3, direction)))
 
 
-_APART, _FOUND, _TOUCH, _ON_SEGMENT = (wp.constant(i) for i in range(4))  # what looking for a portal can end with
+_APART, _FOUND, _TOUCH, _ON_SEGMENT = (wp.constant(i) for i in range(4))  # outcomes of the search for a portal
 
 
 @wp.func
 def _discover(s: _Shapes):
-    """Looks for a portal; returns how that ended, and the portal."""
+    """Looks for a portal. Returns the outcome (one of the constants above) and the portal."""
     p = _Portal()
     p.a0 = s.cylinder_pos
     p.v0 = s.cylinder_pos - s.box_pos
@@ -157,7 +157,7 @@ def _discover(s: _Shapes):
 
 @wp.func
 def _refine(s: _Shapes, portal: _Portal):
-    """Moves a portal outwards until the origin is inside it; returns whether it comes to be."""
+    """Moves a portal outwards until the origin is inside. Returns True if it succeeds, and the portal."""
     p = portal
     for _ in range(_STEPS):
         direction = _outwards(p)

@@ -1,7 +1,7 @@
-"""Places, velocities, mass matrix and forces of a substep, from coordinates and velocities.
+"""Positions, velocities, mass matrix and forces of a substep, from qpos and qvel. The stages have MuJoCo's names.
 
-R. Featherstone, Rigid Body Dynamics Algorithms (2008): composite rigid bodies and recursive Newton-Euler, as sums over what
-is below a body instead of walks along the tree, which would leave all threads but one idle.
+R. Featherstone, Rigid Body Dynamics Algorithms (2008): composite rigid bodies and recursive Newton-Euler. Both are sums over
+the bodies of a subtree: a walk along the tree would leave all threads but one idle.
 """
 
 from mjx_dher.envs.engines.fused.model import FREE, HINGE, MOCAP, SLIDE, STILL, Bodies, Dofs, Memory, World
@@ -13,7 +13,7 @@ _FREE, _HINGE, _MOCAP, _SLIDE, _STILL = (wp.constant(kind) for kind in (FREE, HI
 
 @wp.func
 def times(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """Returns the product of quaternions (w, x, y, z)."""
+    """Product of two quaternions (w, x, y, z)."""
     return wp.vec4(
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -24,7 +24,7 @@ def times(a: wp.vec4, b: wp.vec4) -> wp.vec4:
 
 @wp.func
 def turned(quat: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """Returns a vector, turned by a quaternion."""
+    """Vector rotated by a quaternion."""
     axis = wp.vec3(quat[1], quat[2], quat[3])
     twice = 2.0 * wp.cross(axis, v)
     return v + quat[0] * twice + wp.cross(axis, twice)
@@ -32,7 +32,7 @@ def turned(quat: wp.vec4, v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def about(axis: wp.vec3, angle: float) -> wp.vec4:
-    """Returns the quaternion of a turn about an axis of length 1."""
+    """Quaternion of a rotation about a unit axis."""
     s = wp.sin(0.5 * angle)
     return wp.vec4(wp.cos(0.5 * angle), s * axis[0], s * axis[1], s * axis[2])
 
@@ -52,7 +52,7 @@ def kinematics(
     thread: int,
     threads: int,
 ):
-    """Computes the pose of every body: against its parent side by side, then along the tree."""
+    """Computes the pose of every body: relative to its parent in parallel, then along the tree."""
     for b in range(thread, bodies.number, threads):
         pos = bodies.pos[b]
         quat = bodies.quat[b]
@@ -75,7 +75,7 @@ def kinematics(
         memory.pos[b] = pos
         memory.quat[b] = quat
     sync(threads)
-    # One thread goes along the tree, twice, with as little to do as can be; the rest is done side by side.
+    # One thread walks along the tree, twice, with as little work as possible; the rest is done in parallel.
     if thread == 0:
         for b in range(1, bodies.number):
             parent = bodies.parent[b]
@@ -99,7 +99,7 @@ def kinematics(
 
 @wp.func
 def com_pos(bodies: Bodies, memory: Memory, thread: int, threads: int):
-    """Computes inertias, and the motion that each degree of freedom stands for."""
+    """Computes inertias, and `motion` of each degree of freedom (MuJoCo's cdof)."""
     for b in range(thread, bodies.number, threads):
         origin = memory.pos[bodies.root[b]]
         at = memory.pos[b] - origin
@@ -131,7 +131,7 @@ def com_pos(bodies: Bodies, memory: Memory, thread: int, threads: int):
 
 @wp.func
 def com_vel(bodies: Bodies, memory: Memory, thread: int, threads: int):
-    """Computes velocities, and how fast each degree of freedom's motion turns."""
+    """Computes velocities, and `turning` of each degree of freedom (MuJoCo's cdof_dot)."""
     for b in range(thread, bodies.number, threads):
         velocity = wp.spatial_vector()
         moved_by = bodies.moved_by[b]
@@ -152,7 +152,7 @@ def com_vel(bodies: Bodies, memory: Memory, thread: int, threads: int):
 
 @wp.func
 def _crossed(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spatial_vector:
-    """Returns how fast a motion turns that is fixed to a frame with this velocity."""
+    """Rate of change of a motion that is fixed to a frame with this velocity."""
     omega, axis = wp.spatial_top(velocity), wp.spatial_top(motion)
     return wp.spatial_vector(
         wp.cross(omega, axis), wp.cross(omega, wp.spatial_bottom(motion)) + wp.cross(wp.spatial_bottom(velocity), axis)
@@ -161,14 +161,14 @@ def _crossed(velocity: wp.spatial_vector, motion: wp.spatial_vector) -> wp.spati
 
 @wp.func
 def _momentum(inertia: wp.mat33, moment: wp.vec3, mass: float, motion: wp.spatial_vector) -> wp.spatial_vector:
-    """Returns inertia times motion: angular, then linear momentum."""
+    """Inertia times motion: angular, then linear momentum."""
     omega, v = wp.spatial_top(motion), wp.spatial_bottom(motion)
     return wp.spatial_vector(inertia * omega + wp.cross(moment, v), mass * v - wp.cross(moment, omega))
 
 
 @wp.func
 def rne(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
-    """Computes the force that each body needs to go on as it moves, and not to fall."""
+    """Computes the force of each body that keeps its velocity against inertia and gravity."""
     for b in range(thread, bodies.number, threads):
         bias = wp.spatial_vector()
         moved_by = bodies.moved_by[b]
@@ -192,7 +192,7 @@ def rne(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, t
 
 @wp.func
 def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
-    """Computes all forces except those of constraints, and the momentum that each degree of freedom stands for."""
+    """Computes `smooth`, all forces except constraint forces, and `momentum` of each degree of freedom."""
     for i in range(thread, dofs.number, threads):
         motion = memory.motion[i]
         body = dofs.body[i]
@@ -212,7 +212,7 @@ def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(d
 
 @wp.func
 def crb(bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
-    """Computes the mass matrix."""
+    """Computes the mass matrix from the momenta (composite rigid bodies)."""
     for at in range(thread, dofs.number * dofs.number, threads):
         i, j = at // dofs.number, at % dofs.number
         later, sooner = wp.max(i, j), wp.min(i, j)
@@ -227,13 +227,13 @@ def crb(bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
 
 @wp.func
 def _passive(dofs: Dofs, memory: Memory, i: int) -> float:
-    """Returns the force of a degree of freedom's spring and damper."""
+    """Force of the spring and damper of a degree of freedom."""
     return dofs.stiffness[i] * (dofs.rest[i] - memory.qpos[dofs.qpos[i]]) - dofs.damping[i] * memory.qvel[i]
 
 
 @wp.func
 def _actuation(dofs: Dofs, a: int, control: float, length: float, velocity: float) -> float:
-    """Returns an actuator's force on its joint."""
+    """Force of an actuator on its joint."""
     clip = dofs.actuator_clip[a]
     factors = dofs.actuator_force[a]
     force = factors[0] + factors[1] * length + factors[2] * velocity + factors[3] * wp.clamp(control, clip[0], clip[1])

@@ -22,7 +22,7 @@ def _begin(
     thread: int,
     threads: int,
 ):
-    """Takes an environment's state into its memory."""
+    """Copies an environment's state into its memory."""
     copy(qpos, memory.qpos, thread, threads)
     copy(qvel, memory.qvel, thread, threads)
     copy(guess, memory.qacc, thread, threads)
@@ -40,7 +40,7 @@ def _forces(
     thread: int,
     threads: int,
 ):
-    """Computes places, velocities, the mass matrix and all forces but those of constraints."""
+    """Computes positions, velocities, the mass matrix and all forces except constraint forces."""
     gather(warps)
     kinematics(bodies, memory, given, thread, threads)
     gather(warps)
@@ -99,7 +99,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
       floats: memory of an environment.
       threads_per_env: threads that share an environment.
       warps: of 32 threads in a block; 0 on a CPU.
-      kinds: of pairs of geoms that there are; the code for others is left out.
+      kinds: kinds of geom pairs in the model; code for other kinds is left out.
     """
     shared = warps * (32 // threads_per_env) * floats
 
@@ -121,10 +121,10 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
         qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
         guess: wp.array2d(dtype=float),  # type: ignore[valid-type]
     ):
-        """Computes coordinates, velocities and the solver's first guess `substeps` timesteps later.
+        """Advances coordinates, velocities and the solver's first guess by `substeps` timesteps.
 
         `spare` [num_envs, size of `layout`] is the memory on a CPU; `inputs` [num_envs, 7 + nu] has the mocap body's pose and
-        the controls. `lost` [1] counts contacts that there is no room for.
+        the controls. `lost` [1] counts contacts that do not fit.
         """
         env, thread = wp.tid()  # type: ignore[misc]
         threads = wp.static(threads_per_env)  # so that the compiler knows them

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type"
-"""What the fused substep knows of a model and of its environments: structs of Warp arrays, made from a MuJoCo model."""
+"""Structs of Warp arrays that hold a model and an environment's memory."""
 # Not `from __future__ import annotations`: Warp reads the annotations of structs as types.
 
 from mjx_dher.system.warp_setup import wp
@@ -16,7 +16,7 @@ _mat33s, _soft = wp.array(dtype=wp.mat33), wp.array(dtype=Softness)
 
 @wp.struct
 class Bodies:
-    """Bodies [nbody]; a parent comes before its children, and what is below a body follows it without a gap."""
+    """Bodies [nbody]. A parent comes before its children, and a body's subtree follows it without a gap."""
 
     number: int
     parent: _ints
@@ -108,7 +108,7 @@ _matrices, _spatial = wp.array(dtype=wp.mat33), wp.array(dtype=wp.spatial_vector
 
 @wp.struct
 class Memory:
-    """What a substep computes, for one environment.
+    """Intermediate results of a substep, for one environment.
 
     Spatial vectors have the angular part first and refer to the place of the tree's first body.
     """
@@ -150,7 +150,7 @@ class Memory:
 
 @wp.struct
 class Layout:
-    """Where the fields of `Memory` begin and how long they are, and the length of all of it, in floats."""
+    """Begin and length of each field of `Memory`, and the total size, in floats."""
 
     size: int
     begin: _ints  # by the number of the field

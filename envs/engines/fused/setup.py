@@ -1,4 +1,4 @@
-"""From a MuJoCo model to the structs of the fused substep."""
+"""Converts a MuJoCo model to the structs of the fused substep."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ _JOINTS = {
 
 
 def _fill(struct: Any, **values: Any) -> Any:
-    """Sets fields of a struct: arrays from what NumPy takes, the rest as it is."""
+    """Makes a struct: array fields are converted to Warp arrays."""
     made = struct()
     for name, value in values.items():
         field = struct.vars[name].type
@@ -58,7 +58,7 @@ def _softness(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> 
 
 
 def _joints_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Returns the fields of `Bodies` that say how each body moves."""
+    """The fields of `Bodies` that describe joints."""
     kind, qpos, dof, moved_by = (np.zeros(model.nbody, np.int32) for _ in range(4))
     axis, anchor, rest = np.zeros((model.nbody, 3)), np.zeros((model.nbody, 3)), np.zeros(model.nbody)
     for body in range(model.nbody):
@@ -76,7 +76,7 @@ def _joints_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _last_below(model: mujoco.MjModel) -> np.ndarray:
-    """Returns each body's last descendant [nbody] int32: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
+    """Last descendant [nbody] int32 of each body: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
     last = np.arange(model.nbody, dtype=np.int32)
     for body in range(model.nbody - 1, 0, -1):
         parent = model.body_parentid[body]

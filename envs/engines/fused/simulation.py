@@ -1,4 +1,4 @@
-"""The memory of a number of environments on a device, and the launch that advances them."""
+"""Environments on a device: their memory, and the launch that advances them."""
 
 from typing import Any
 
@@ -18,11 +18,10 @@ class Simulation:
     """Environments that the fused kernel advances, on Warp's current device.
 
     Args:
-      model: a model that `unsupported` finds nothing in; its options have the most iterations of Newton's method and of its
-        line search.
+      model: a model for which `unsupported` is empty; its options limit the iterations of Newton's method and its line search.
       num_envs: number of environments.
       substeps: timesteps an environment step.
-      rows: of constraints that there is room for, if so many can occur.
+      rows: constraint rows that fit into memory; more than can occur are not allocated.
 
     Raises:
       ValueError: the device's shared memory does not suffice.
@@ -58,7 +57,7 @@ class Simulation:
         )
 
     def overflow(self) -> int:
-        """Returns how many contacts were left out since the last call, because there was no room for their rows."""
+        """Number of contacts since the last call that were left out because their rows did not fit."""
         lost = int(self._lost.numpy()[0])
         if lost:
             self._lost.zero_()
@@ -66,10 +65,10 @@ class Simulation:
 
 
 def most_warps(size: int, shared: int) -> int:
-    """Returns how many warps a block has, whose environments take `size` floats each of `shared` bytes.
+    """Number of warps of a block, if an environment takes `size` floats and a block has `shared` bytes.
 
     Raises:
-      ValueError: there is not enough for one.
+      ValueError: not even one warp fits.
     """
     a_warp = 4 * size * (32 // THREADS)
     if a_warp > shared:
@@ -80,7 +79,7 @@ def most_warps(size: int, shared: int) -> int:
 
 
 def most_rows(model: mujoco.MjModel) -> int:
-    """Returns the most rows of constraints that an environment can have."""
+    """The most constraint rows that an environment can have."""
     return int(setup.world_of(model, setup.contacts_of(model), 10**6).rows)
 
 
@@ -91,7 +90,7 @@ _KNOWN_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoc
 
 
 def unsupported(model: mujoco.MjModel) -> list[str]:
-    """Returns the names of the features of the model that the fused kernel leaves out."""
+    """Names of the model's features that the fused kernel does not support."""
     opt, scalar = model.opt, np.isin(model.jnt_type, [int(joint) for joint in _KNOWN_JOINTS[:2]])
     features = {
         "an integrator other than Euler": opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
@@ -121,7 +120,7 @@ def unsupported(model: mujoco.MjModel) -> list[str]:
 
 
 def _has_plain_weld(model: mujoco.MjModel) -> bool:
-    """Returns whether the one equality constraint is a weld of the one mocap body to another body, their frames together."""
+    """Whether the only equality constraint welds the only mocap body to another body with the same frame."""
     if model.neq != 1 or model.nmocap != 1 or model.eq_type[0] != mujoco.mjtEq.mjEQ_WELD or not model.eq_active0[0]:
         return False
     bodies = model.eq_objtype[0] == mujoco.mjtObj.mjOBJ_BODY and model.body_mocapid[model.eq_obj1id[0]] == 0

@@ -19,13 +19,13 @@ _WHOLE = wp.constant(1e-3)  # how near to 1 a step counts as Newton's own
 
 @wp.func
 def _pull(row: int, residual: float, weight: float) -> float:
-    """Returns a row's weight if it acts, else 0."""
+    """Weight of a row if it acts, else 0."""
     return wp.where(row < _EQUALITIES or residual < 0.0, weight, 0.0)
 
 
 @wp.func
 def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size: int) -> float:
-    """Returns a row of a matrix [.., size] times a vector [size]."""
+    """Row of a matrix [.., size] times a vector [size]."""
     sum = float(0.0)
     for i in range(size):
         sum += matrix[row * size + i] * x[i]
@@ -34,7 +34,7 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 @wp.func
 def _slopes(memory: Memory, rows: int, at: float, slope: float, curve: float, thread: int, threads: int) -> wp.vec2:
-    """Returns the first and second derivative of the cost, so far along the search direction."""
+    """First and second derivative of the cost at a step along the search direction."""
     d1 = float(0.0)
     d2 = float(0.0)
     for row in range(thread, rows, threads):
@@ -75,7 +75,7 @@ def _how_far(
 
 @wp.func
 def _take(memory: Memory, far: float, rows: int, size: int, thread: int, threads: int) -> float:
-    """Goes so far along the search direction; returns how many rows begin or cease to act."""
+    """Takes a step along the search direction. Returns the number of rows that begin or cease to act."""
     changed = float(0.0)
     for i in range(thread, size, threads):
         memory.qacc[i] = memory.qacc[i] + far * memory.search[i]
@@ -93,9 +93,9 @@ def _take(memory: Memory, far: float, rows: int, size: int, thread: int, threads
 
 @wp.func
 def _begin(memory: Memory, rows: int, nv: int, thread: int, threads: int) -> float:
-    """Computes what the solver keeps up to date, at the first guess; returns the energy that single precision leaves unsure.
+    """Initializes the solver at the first guess. Returns the energy that single precision leaves uncertain.
 
-    It is that of rounding J a - aref: at the minimum, the sum of D times the square of its error is what a step can gain.
+    Rounding J a - aref causes it: at the minimum, a step cannot gain more than the sum of D times the squared error.
     """
     for i in range(thread, nv, threads):
         memory.inert[i] = _dot(memory.mass, i, memory.qacc, nv)
@@ -114,7 +114,7 @@ def _begin(memory: Memory, rows: int, nv: int, thread: int, threads: int) -> flo
 
 @wp.func
 def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
-    """Computes `qacc`, from what it holds on."""
+    """Computes `qacc`, starting from its present value."""
     rows = memory.counts[1]
     unsure = _begin(memory, rows, nv, thread, threads)
     for _ in range(world.iterations):

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="empty-body"
 """The GPU threads, neighbours in one warp, that share the work on one environment.
 
-There are `threads` of them, a power of 2 up to 32, and 1 on a CPU. `thread` is the number of one of them. Each part of a
-substep is a loop that begins at `thread` and advances by `threads`.
+`threads` is their number, a power of 2 up to 32, and 1 on a CPU; `thread` is the index of one. Each part of a substep is a
+loop that begins at `thread` and advances by `threads`.
 """
 
 from mjx_dher.system.warp_setup import wp
@@ -17,7 +17,7 @@ _GROUP = "const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) <<
 #endif
 """)
 def sync(threads: int):  # type: ignore[no-untyped-def]
-    """Waits for the environment's other threads, and sees what they have written."""
+    """Waits for the environment's other threads; their writes are visible afterwards."""
     ...
 
 
@@ -29,7 +29,7 @@ def sync(threads: int):  # type: ignore[no-untyped-def]
 def gather(warps: int):  # type: ignore[no-untyped-def]
     """Waits for the other warps of the block.
 
-    They need not wait for one another. But the kernel's instructions do not fit into the cache for them, and so the warps of a
+    Correctness does not need it. But the kernel's instructions do not fit into the instruction cache, and the warps of a
     multiprocessor get them two to four times as fast if all need the same ones at the same time.
     """
     ...
@@ -43,7 +43,7 @@ def gather(warps: int):  # type: ignore[no-untyped-def]
     return x;
 """)
 def total(x: float, threads: int) -> float:
-    """Returns the sum of the threads' numbers, the same to the bit in each of them."""
+    """Sum of the threads' numbers, with the same bits in each thread."""
     ...
 
 
