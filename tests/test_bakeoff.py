@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names
 
 from mjx_dher.components import COMPONENTS
 from mjx_dher.runs.folder import fingerprint
@@ -194,22 +194,15 @@ def test_forests_are_drawn(report, arms, tmp_path):
     assert (tmp_path / "forest.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["--seeds", "0"], "--seeds must lie between 1 and 1000"),
-        (["--seeds", str(10**20)], "--seeds must lie between"),
-        (["--first-seed", "-1"], "--first-seed must lie"),
-        (["--minutes", "nan"], "--minutes must be more than 0"),
-        (["--arms", "energi"], "invalid choice"),
-        (["--out", "/proc/x"], "cannot be written to"),
-    ],
-)
-def test_wrong_arguments_are_refused(bakeoff, capsys, argv, message):
-    with pytest.raises(SystemExit) as ended:
-        bakeoff.parse(["--out", "x", *argv])
-    assert ended.value.code == 2
-    assert message in capsys.readouterr().err
+def test_wrong_arguments_are_refused(bakeoff, capsys):
+    for argv in (
+        *(["--seeds", "0"], ["--seeds", str(10**20)], ["--first-seed", "-1"], ["--minutes", "nan"], ["--arms", "energi"]),
+        ["--out", "/proc/x"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            bakeoff.parse(["--out", "x", *argv])
+        assert ended.value.code == 2
+        names(capsys.readouterr().err, argv[0] if argv[0] != "--out" else "/proc")
 
 
 def test_a_plan_trains_nothing(bakeoff, tmp_path, capsys):
@@ -265,43 +258,39 @@ def test_runs_that_have_ended_elsewhere_are_not_trained_again(bakeoff, ablation,
         ]
 
 
-@pytest.mark.parametrize(
-    ("column", "value", "message"),
-    [
-        ("name", "slide-future-s0-0123456789", "has other settings than preset has today (slide-future-s0-"),
-        ("seed", 3, "has other settings than preset has today"),
-        ("arm", "no_such", "arm must be one of preset, no_quantiles"),
-        ("task", "push", "task must be one of pick_and_place, slide; got 'push'"),
-        ("final", 1.5, "success must lie between 0 and 1"),
-        ("mean_success", math.nan, "success must lie between 0 and 1"),
-        ("steps", "many", "could not convert string to float: 'many'"),
-        ("failed", 2, "failed be 0 or 1"),
-    ],
-)
-def test_runs_that_are_none_of_the_experiment_are_refused(bakeoff, ablation, ended, tmp_path, capsys, column, value, message):
+BAD_RUNS = [  # column, value, and what the message must name
+    ("name", "slide-future-s0-0123456789", ["settings", "slide-future-s0-0123456789"]),
+    ("seed", 3, ["settings"]),
+    ("arm", "no_such", ["arm", "no_such"]),
+    ("task", "push", ["task", "push"]),
+    ("final", 1.5, ["success"]),
+    ("mean_success", math.nan, ["success"]),
+    ("steps", "many", ["many"]),
+    ("failed", 2, ["failed"]),
+]
+
+
+def test_runs_that_are_none_of_the_experiment_are_refused(bakeoff, ablation, ended, tmp_path, capsys):
     import bakeoff_runs
 
-    bakeoff_runs.save(tmp_path / "runs.csv", [ended[0]._replace(**{column: value})])
-    with pytest.raises(SystemExit) as stopped:
-        bakeoff.main(["--out", str(tmp_path / "a"), "--plan", "--runs", str(tmp_path / "runs.csv")], ablation.ABLATION)
-    assert stopped.value.code == 2
-    assert message in capsys.readouterr().err.replace("\n", " ")
+    for column, value, parts in BAD_RUNS:
+        bakeoff_runs.save(tmp_path / "runs.csv", [ended[0]._replace(**{column: value})])
+        with pytest.raises(SystemExit) as stopped:
+            bakeoff.main(["--out", str(tmp_path / "a"), "--plan", "--runs", str(tmp_path / "runs.csv")], ablation.ABLATION)
+        assert stopped.value.code == 2
+        names(capsys.readouterr().err, *parts)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [(None, "cannot be read"), ("a,b\n1,2\n", "has not the columns learner, task"), (b"\xff\x00", "cannot be read")],
-)
-def test_a_file_without_runs_is_refused(bakeoff, ablation, tmp_path, capsys, text, message):
+def test_a_file_without_runs_is_refused(bakeoff, ablation, tmp_path, capsys):
     path = tmp_path / "runs.csv"
-    if text is not None:
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(SystemExit):
-        bakeoff.main(["--out", str(tmp_path / "a"), "--report", "--runs", str(path)], ablation.ABLATION)
-    assert message in capsys.readouterr().err.replace("\n", " ")
+    for content in (None, b"a,b\n1,2\n", b"\xff\x00"):
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(SystemExit):
+            bakeoff.main(["--out", str(tmp_path / "a"), "--report", "--runs", str(path)], ablation.ABLATION)
+        names(capsys.readouterr().err, "runs.csv")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("which", ["bakeoff", "ablation"])
 def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
     experiment = bakeoff.BAKEOFF if which == "bakeoff" else ablation.ABLATION

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 from configs import SHORT, flags
-from conftest import EXAMPLES
+from conftest import EXAMPLES, names, refuses
 from test_driver import result_of, rows_of
 
 import mjx_dher
@@ -82,12 +82,12 @@ def test_a_run_that_stop_at_has_ended_goes_on_when_asked(tmp_path, capsys, monke
 
 
 def test_runs_of_a_sweep_keep_no_end(tmp_path, capsys):
-    for option, told in (("--keep-end", "keep_end is for one run alone"), ("--stop-at=0.9", "stop_at ends one run alone")):
+    for option, name in (("--keep-end", "keep_end"), ("--stop-at=0.9", "stop_at")):
         assert cli.main(["sweep", "--out", str(tmp_path / "sweep"), option]) == 2
-        assert told in capsys.readouterr().err
+        names(capsys.readouterr().err, name)
     specs = [RunSpec(env="point_mass:PointMass", seed=seed) for seed in (0, 1)]
-    with pytest.raises(ValueError, match="keep_end is for one run alone"):
+    with refuses("keep_end"):
         mjx_dher.train_runs(PointMass(), specs, [tmp_path / "a", tmp_path / "b"], options=Options(keep_end=True))
-    with pytest.raises(ValueError, match="keep_end must be true or false; got 3"):
+    with refuses("keep_end", 3):
         Options(keep_end=3).check()
     assert not any(tmp_path.iterdir())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import RunSpec, cli, policy
 from mjx_dher.runs.folder import run_folder
@@ -40,7 +41,7 @@ def test_a_python_without_the_originals_is_refused(run, capsys):
 
 
 def test_a_task_without_an_original_is_refused():
-    with pytest.raises(ValueError, match="point_mass has no original to transfer to; the tasks that have: push, "):
+    with refuses("point_mass", "push"):
         transfer.check_original("point_mass", Path(sys.executable))
 
 

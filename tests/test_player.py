@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import envs
 from mjx_dher.viewer import panel
@@ -135,12 +136,12 @@ def test_things_are_kept_where_resets_put_them():
     np.testing.assert_allclose(player.obs["desired_goal"], [1, 0, 0])
 
 
-@pytest.mark.parametrize("position", [[np.nan, 0, 0], [np.inf, 0, 0], [0.0, 0.0], 1.0])
-def test_a_position_that_is_none_is_refused(position):
+def test_a_position_that_is_none_is_refused():
     player = Player(GAME, follow)
-    with pytest.raises(ValueError, match="the goal cannot be moved to"):
-        player.move_goal(np.array(position))
-    with pytest.raises(ValueError, match="the object cannot be moved to"):
+    for position in ([np.nan, 0, 0], [np.inf, 0, 0], [0.0, 0.0], 1.0):
+        with refuses("goal"):
+            player.move_goal(np.array(position))
+    with refuses("object"):
         Player(GAME._replace(move_object=None), follow).move_object(np.zeros(3))
 
 
