@@ -1,4 +1,4 @@
-"""Kinematics: pose and velocity of the gripper at given joint angles, and how a free joint moves."""
+"""Kinematics: pose and velocity of the gripper at given joint angles, free joints and rotations."""
 
 from __future__ import annotations
 
@@ -132,6 +132,31 @@ def quat_multiply(a: Array, b: Array) -> Array:
     # A sum, not a dot product, whose precision on a GPU would be the learner's.
     w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
+
+
+def quat_to_matrix(quat: Array) -> Array:
+    """Rotation matrix [3, 3] of a quaternion [4] (w, x, y, z) of any length except 0."""
+    w, x, y, z = quat / jnp.linalg.norm(quat)
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def matrix_to_euler(matrix: Array) -> Array:
+    """Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
+
+    If b is a right angle, a and c turn about the same axis; then a is 0, as in the original.
+    """
+    cos_b = jnp.hypot(matrix[2, 2], matrix[1, 2])
+    regular = cos_b > 4 * np.finfo(np.float32).eps
+    a = jnp.where(regular, jnp.arctan2(-matrix[1, 2], matrix[2, 2]), 0.0)
+    b = jnp.arctan2(matrix[0, 2], cos_b)
+    c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
+    return jnp.stack([a, b, c])
 
 
 def integrate(qpos: Array, qvel: Array, dt: float) -> Array:

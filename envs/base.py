@@ -1,4 +1,4 @@
-"""The environment interface: unbatched, pure functions with a fixed horizon."""
+"""The environment interface: unbatched, pure functions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class GoalEnv(abc.ABC):
     """A goal-conditioned environment.
 
     `reset` and `step` are pure functions of their arguments and take no batch: use `jax.vmap`. An episode has
-    `episode_length` steps and never ends early, so nothing resets itself and no last observation is lost.
+    `episode_length` steps, and nothing resets itself, so no last observation is lost. If episodes can end early or rewards lie
+    outside [-1, 0], give the environment a `spec` (`types.EnvSpec`).
     """
 
     name: str

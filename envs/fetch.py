@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 
 from mjx_dher.config import check_count, check_number
-from mjx_dher.envs.arm_kinematics import Chain, integrate
+from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Controls, Physics, make_engine
-from mjx_dher.types import Array, GoalObs, PRNGKey
+from mjx_dher.types import Array, EnvSpec, GoalObs, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
 # Beyond either speed the physics has blown up.
@@ -109,6 +109,12 @@ class FetchEnv(GoalEnv):
         if self.has_object:
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
 
+    @property
+    def spec(self) -> EnvSpec:
+        """The task's contract. Dense rewards count from -1, so distances must not exceed 1 m."""
+        observation = jax.ShapeDtypeStruct((self.observation_size,), jnp.float32)
+        return EnvSpec(observation, self.goal_size, self.action_size, self.episode_length, reward_range=(-1.0, 0.0))
+
     def reset(self, key: PRNGKey) -> State:
         """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)
@@ -141,11 +147,9 @@ class FetchEnv(GoalEnv):
     def with_object(self, state: State, position: Array) -> State:
         """Returns the state with the object at `position`, [3] m, upright and at rest."""
         upright = jnp.concatenate([jnp.asarray(position, jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0])])
-        qpos, qvel = (
-            x.at[at].set(y)
-            for x, at, y in ((state.physics.qpos, self._object_qpos, upright), (state.physics.qvel, self._object_qvel, 0.0))
-        )
-        physics = state.physics.replace(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(state.physics.warmstart))
+        before = state.physics
+        qpos, qvel = before.qpos.at[self._object_qpos].set(upright), before.qvel.at[self._object_qvel].set(0.0)
+        physics = before.replace(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(before.warmstart))
         obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
         return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
 
@@ -314,31 +318,6 @@ def fetch_observation(
             finger_vel * DT,
         ]
     )
-
-
-def quat_to_matrix(quat: Array) -> Array:
-    """Returns the rotation matrix [3, 3] of a quaternion [4] (w, x, y, z) of any length except 0."""
-    w, x, y, z = quat / jnp.linalg.norm(quat)
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def matrix_to_euler(matrix: Array) -> Array:
-    """Returns Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
-
-    If b is a right angle, a and c turn about the same axis; then a is 0, as in the original.
-    """
-    cos_b = jnp.hypot(matrix[2, 2], matrix[1, 2])
-    regular = cos_b > 4 * np.finfo(np.float32).eps
-    a = jnp.where(regular, jnp.arctan2(-matrix[1, 2], matrix[2, 2]), 0.0)
-    b = jnp.arctan2(matrix[0, 2], cos_b)
-    c = jnp.where(regular, jnp.arctan2(-matrix[0, 1], matrix[0, 0]), jnp.arctan2(matrix[1, 0], matrix[1, 1]))
-    return jnp.stack([a, b, c])
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:

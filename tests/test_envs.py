@@ -7,6 +7,7 @@ from conftest import load_recorded
 from mjx_dher import envs
 from mjx_dher.envs import arm_kinematics, fetch
 from mjx_dher.envs.engines import Physics, resolve_engine
+from mjx_dher.rollout import env_spec
 
 ENGINES = ("native", "jax")
 RECORDED = ("push", "pick_and_place", "slide")
@@ -24,7 +25,8 @@ def test_the_interface(name, task):
     assert state.reward.shape == state.success.shape == ()
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves((state.obs, state.reward, state.success)))
     assert state.reward == env.compute_reward(state.obs["achieved_goal"], state.obs["desired_goal"])
-    assert env.episode_length == 50
+    assert env_spec(env) == env.spec
+    assert env.spec.episode_length == 50
 
 
 @pytest.mark.parametrize("task", RECORDED)
