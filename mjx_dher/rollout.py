@@ -69,21 +69,7 @@ def rollout(
     if goals is not None:
         first = _with_goals(env, first, goals(first.obs))
 
-    def step(playing: _Playing, step_inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:
-        state = playing.state
-        action = policy(step_inputs, state.obs)
-        if np.shape(action) != (num_envs, env.action_size):
-            raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
-        following = jax.vmap(env.step)(state, action)
-        _check_same_shapes(state, following)
-        reward = following.reward
-        if spec.ends:
-            following = _where(playing.over, state, following)
-            action, reward = (_where(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
-        played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
-        length = playing.length + (~playing.over).astype(jnp.int32)
-        return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
-
+    step = functools.partial(_step, env, spec, policy)
     start = _Playing(first, jnp.zeros(num_envs, bool), jnp.zeros(num_envs, jnp.int32))
     end, (observation, achieved_goal, action, reward) = jax.lax.scan(step, start, inputs, length=spec.episode_length)
     last = end.state
@@ -105,6 +91,23 @@ def rollout(
         bad_rewards=_bad_rewards(spec, reward, end.length),
         length=end.length,
     )
+
+
+def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:
+    """One step of all episodes, and what was played: observation, achieved goal, action and reward, each [N, ...]."""
+    state, num_envs = playing.state, playing.over.shape[0]
+    action = policy(inputs, state.obs)
+    if np.shape(action) != (num_envs, env.action_size):
+        raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
+    following = jax.vmap(env.step)(state, action)
+    _check_same_shapes(state, following)
+    reward = following.reward
+    if spec.ends:
+        following = _where(playing.over, state, following)
+        action, reward = (_where(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
+    played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
+    length = playing.length + (~playing.over).astype(jnp.int32)
+    return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
 
 
 def _whole(steps: Array, end: Array) -> Array:

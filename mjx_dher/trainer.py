@@ -145,8 +145,7 @@ def make_train(
     if not isinstance(config, Config):
         raise ValueError(f"config must be a Config; got {config!r}")
     config_lib.validate(config, HParams(), spec.episode_length)
-    if learner is None:
-        learner = learners.make("ddpg", config, spec)
+    learner = learners.make("ddpg", config, spec) if learner is None else learner
     learners.check_methods(learner, learner)
     loop = Loop(
         env=env,
