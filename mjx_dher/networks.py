@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from mjx_dher import components
-from mjx_dher.types import Array, PRNGKey, Sizes
+from mjx_dher.types import Array, EnvSpec, PRNGKey, PyTree
 
 
 def _mlp(
@@ -85,10 +85,33 @@ class Critic(nn.Module):
 
 
 class Networks(NamedTuple):
-    """The modules of actor and critic, as flax modules with `init` and `apply`; static."""
+    """Modules of actor and critic, as flax modules with `init` and `apply`; static. Their inputs are normalized."""
 
-    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1]; what `Heads` says otherwise
-    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...]; what `Heads` says otherwise
+    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1], or what `Heads` says
+    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...], or what `Heads` says
+    # Maps an observation tree to a vector [..., D], as a flax module or a function; actor and critic train one each.
+    # Without it, an observation is one float vector, or a tree of float vectors, which are concatenated.
+    encoder: Any = None
+
+
+class Encoded(nn.Module):
+    """A network behind an encoder of its observations."""
+
+    encoder: Any
+    network: Any
+
+    @nn.compact
+    def __call__(self, observation: PyTree, *inputs: Array) -> Any:
+        """Output of the network for the encoded observation."""
+        return self.network(self.encoder(observation), *inputs)
+
+
+def with_encoder(networks: Networks) -> Networks:
+    """Networks whose actor and critic take observation trees, if there is an encoder."""
+    if networks.encoder is None:
+        return networks
+    actor, critic = (Encoded(networks.encoder, network) for network in (networks.actor, networks.critic))
+    return Networks(actor, critic, networks.encoder)
 
 
 class Heads(NamedTuple):
@@ -156,14 +179,34 @@ def check_heads(make_networks: NetworksFn, learner: str) -> None:
         ) from None
 
 
-def check_outputs(learner: str, networks: Networks, sizes: Sizes, heads: Heads = PLAIN) -> None:
-    """Refuses networks whose outputs have other shapes than `heads` says.
+def check_inputs(networks: Networks, spec: EnvSpec) -> None:
+    """Raises ValueError, which names the observation's leaf, if these networks cannot take the observations of `spec`."""
+    leaves = jax.tree_util.tree_leaves_with_path(spec.observation) if networks.encoder is None else []
+    for path, leaf in leaves:
+        if len(leaf.shape) != 1 or not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(
+                f"networks: observation{jax.tree_util.keystr(path)} must be a vector of floats for networks without an encoder;"
+                f" it is {leaf.dtype}{list(leaf.shape)} (see `encoder` of mjx_dher.networks.Networks)"
+            )
 
-    Raises:
-      ValueError: names the network, the shapes and what it gives.
-    """
-    key, (obs, goal, action) = jax.random.key(0), (jax.ShapeDtypeStruct((2, size), jnp.float32) for size in sizes)
-    numbers: Any = (2, sizes.action)
+
+def zeros(spec: EnvSpec, networks: Networks, *leading: int) -> tuple[PyTree, Array, Array]:
+    """Inputs of the networks, all zero: observation, goal and action, with leading axes."""
+    observation = jax.tree.map(lambda x: jnp.zeros((*leading, *x.shape), x.dtype), spec.observation)
+    goal, action = (jnp.zeros((*leading, size)) for size in (spec.goal_size, spec.action_size))
+    return concatenated(observation) if networks.encoder is None else observation, goal, action
+
+
+def concatenated(observation: PyTree) -> Array:
+    """One vector [..., D] of a tree of vectors, in the tree's order."""
+    leaves = jax.tree.leaves(observation)
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=-1)
+
+
+def check_outputs(learner: str, networks: Networks, spec: EnvSpec, heads: Heads = PLAIN) -> None:
+    """Raises ValueError, which names the network, unless its output has the shape that `heads` says."""
+    key, (obs, goal, action) = jax.random.key(0), jax.eval_shape(lambda: zeros(spec, networks, 2))
+    numbers: Any = (2, spec.action_size)
     for part, inputs, expected in (
         ("actor", (obs, goal), (numbers, numbers) if heads.gaussian else numbers),
         ("critic", (obs, goal, action), (2,) if heads.critic_size is None else (2, heads.critic_size)),

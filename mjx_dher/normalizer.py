@@ -1,4 +1,8 @@
-"""Running mean and standard deviation, merged batch by batch (Chan, Golub & LeVeque 1983)."""
+"""Running mean and standard deviation, merged batch by batch (Chan, Golub & LeVeque 1983).
+
+Values are one array or a tree of arrays, such as a dict observation. The moments of a tree are a tree of `NormalizerState`s.
+Leaves that are not floats, such as uint8 images, have none (None) and are not normalized.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher.types import Array
+from mjx_dher.types import Array, PyTree
 
 
 @struct.dataclass
@@ -14,34 +18,49 @@ class NormalizerState:
     """Moments of all values so far. Kept as mean and variance: float32 sums of squares would cancel."""
 
     count: Array  # []
-    mean: Array  # [D]
+    mean: Array  # [D], or the shape of the leaf
     var: Array  # [D] biased (divided by count)
 
 
-def init(size: int) -> NormalizerState:
-    """State before any value: mean 0, variance 1."""
-    return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(size), var=jnp.ones(size))
+def init(like: PyTree) -> PyTree:
+    """Moments before any value (mean 0, variance 1) for a tree of arrays or `jax.ShapeDtypeStruct`s, without batch axes."""
+
+    def of(x: Array) -> NormalizerState | None:
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return None
+        return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(x.shape), var=jnp.ones(x.shape))
+
+    return jax.tree.map(of, like)
 
 
 def update(
-    state: NormalizerState, values: Array, clip: Array | float, valid: Array | None = None, axis_name: str | None = None
-) -> NormalizerState:
-    """Returns the moments with `values` [..., D] added, after clipping them to +- `clip`.
+    state: PyTree, values: PyTree, clip: Array | float, valid: Array | None = None, axis_name: str | None = None
+) -> PyTree:
+    """Returns the moments with `values` added, after clipping them to +- `clip`.
 
     Args:
       state: moments so far.
-      values: what to add.
+      values: what to add; leaves are [..., D], with any batch axes.
       clip: bound of the values' magnitudes.
-      valid: mask that broadcasts against [...]; the other values are left out, even NaN. All are valid if None.
+      valid: bool mask over the first batch axes, at most all of them; the other values are left out, even NaN. None: all count.
       axis_name: mapped axis of the devices, if each has a part of the values; all devices get the moments of all values.
     """
+    return jax.tree.map(lambda x, moments: _update(moments, x, clip, valid, axis_name), values, state)
 
+
+def _update(
+    state: NormalizerState | None, values: Array, clip: Array | float, valid: Array | None, axis_name: str | None
+) -> NormalizerState | None:
     def total(x: Array) -> Array:
         return x if axis_name is None else jax.lax.psum(x, axis_name)
 
-    mask = jnp.ones(values.shape[:-1], bool) if valid is None else jnp.broadcast_to(valid, values.shape[:-1])
-    mask = mask.reshape(-1, 1)
-    values = jnp.clip(values, -clip, clip).reshape(-1, values.shape[-1])
+    if state is None:
+        return None
+    shape, ndim = state.mean.shape, values.ndim - state.mean.ndim
+    valid = jnp.ones((), bool) if valid is None else valid
+    mask = jnp.broadcast_to(jnp.expand_dims(valid, range(valid.ndim, ndim)), values.shape[:ndim])
+    mask = mask.reshape(-1, *(1,) * len(shape))
+    values = jnp.clip(values, -clip, clip).reshape(-1, *shape)
     number = total(jnp.sum(mask)).astype(jnp.float32)
     batch_mean = total(jnp.sum(jnp.where(mask, values, 0.0), axis=0)) / jnp.maximum(number, 1.0)
     squares = jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0)
@@ -56,10 +75,15 @@ def update(
     )
 
 
-def normalize(
-    state: NormalizerState, values: Array, eps: Array | float, clip: Array | float, input_clip: Array | float
-) -> Array:
-    """Returns `values` [..., D] clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`."""
-    values = jnp.clip(values, -input_clip, input_clip)
-    mean, std = (jnp.expand_dims(x, range(values.ndim - 1)) for x in (state.mean, jnp.maximum(jnp.sqrt(state.var), eps)))
-    return jnp.clip((values - mean) / std, -clip, clip)
+def normalize(state: PyTree, values: PyTree, eps: Array | float, clip: Array | float, input_clip: Array | float) -> PyTree:
+    """`values` clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`; leaves are [..., D]."""
+
+    def of(values: Array, state: NormalizerState | None) -> Array:
+        if state is None:
+            return values
+        values = jnp.clip(values, -input_clip, input_clip)
+        leading = range(values.ndim - state.mean.ndim)
+        mean, std = (jnp.expand_dims(x, leading) for x in (state.mean, jnp.maximum(jnp.sqrt(state.var), eps)))
+        return jnp.clip((values - mean) / std, -clip, clip)
+
+    return jax.tree.map(of, values, state)

@@ -192,12 +192,12 @@ PRIORITY = {
     "other_arguments": r"priority must be a function \(episode, compute_reward, hparams\)",
 }
 
-# Learners: make(config, sizes, networks) -> Learner. Each is DDPG but for one method.
+# Learners: make(config, spec, networks) -> Learner. Each is DDPG but for one method.
 
 
 def _but(**methods):
-    def make(config, sizes, networks):
-        learner = ddpg.make(config, sizes, networks)
+    def make(config, spec, networks):
+        learner = ddpg.make(config, spec, networks)
         kind = type("Own", (ddpg.DDPG,), methods)
         return kind(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
 
@@ -241,7 +241,7 @@ exports_another = _but(
 )
 
 
-def methodless(config, sizes, networks):
+def methodless(config, spec, networks):
     return object()
 
 

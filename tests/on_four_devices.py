@@ -89,7 +89,7 @@ def test_moments_of_the_normalizers_are_those_of_all_parts():
     """Also where valid values lie in some parts only."""
     values = 3.0 + jax.random.normal(jax.random.key(0), (16, 5, 2))
     valid = (jnp.arange(16) % 3 > 0) & (jnp.arange(16) < 12)  # none in the last of four parts
-    before = normalizer.update(normalizer.init(2), values[:3] - 1.0, 200.0)
+    before = normalizer.update(normalizer.init(jnp.zeros(2)), values[:3] - 1.0, 200.0)
 
     def update(axis_name, state, values, valid):
         return normalizer.update(state, values, 200.0, valid[:, None], axis_name)

@@ -10,8 +10,14 @@ import jax.numpy as jnp
 from filelock import FileLock
 from flax import struct
 
-from mjx_dher.types import Array, Batch
+from mjx_dher.types import Array, Batch, EnvSpec
 from point_mass import PointMass, PointState
+
+
+def spec_of(observation: int, goal: int, action: int, **fields) -> EnvSpec:
+    """Spec of an environment with observations, goals and actions of these sizes."""
+    fields = {"episode_length": 1, **fields}
+    return EnvSpec(jax.ShapeDtypeStruct((observation,), jnp.float32), goal, action, **fields)
 
 
 @contextlib.contextmanager

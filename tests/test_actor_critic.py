@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from mjx_dher import Config, HParams, learners, make_train, networks
-from mjx_dher.learners import common, critics
+from mjx_dher.learners import critics
 from mjx_dher.learners.actor_critic import ActorCritic
 from mjx_dher.learners.actors import Deterministic, Gaussian
 from mjx_dher.learners.critics import Critics
 from mjx_dher.networks import Networks
 from mjx_dher.policy import Policy
-from mjx_dher.types import Batch, Sizes
+from mjx_dher.types import Batch
 from point_mass import PointMass
-from probes import BATCH, LinearActor
+from probes import BATCH, LinearActor, spec_of
 
 NAMES = ("td3", "sac", "redq", "tqc", "dtqc")
 
@@ -28,7 +28,7 @@ def at_night(*names):
     return [pytest.param(name, marks=() if name in names else pytest.mark.slow) for name in NAMES]
 
 
-SIZES = Sizes(2, 2, 2)
+SPEC = spec_of(2, 2, 2)
 SMALL = Config(
     num_envs=16,
     cycles_per_epoch=5,
@@ -73,7 +73,7 @@ Q = np.array([-0.25, -2 + 0.5 * np.tanh(2)])  # of the next states, where the po
 def linear(actor, parts):
     """A learner of these networks; its second critic thinks less of everything by 1/2, by a goal's weight of 1/2 and 3/8."""
     module = Networks(LinearActor() if isinstance(actor, Deterministic) else Moments(), LinearCritic(parts.size))
-    learner = ActorCritic(Sizes(1, 1, 1), module, module, actor, critics=parts)
+    learner = ActorCritic(spec_of(1, 1, 1), module, module, actor, critics=parts)
     state = jax.jit(learner.init)(jax.random.key(0))
     lower = {"params": {"abcd": state.target.critic["params"]["abcd"].at[1, 1].add(0.125)}}
     return learner, dataclasses.replace(state, target=dataclasses.replace(state.target, critic=lower))
@@ -149,7 +149,7 @@ def test_an_update_of_the_critics_leaves_the_actor_and_a_whole_one_judges_by_the
 
 def made(name, **changes):
     config = dataclasses.replace(SMALL, **changes)
-    return learners.make(name, config, SIZES, "layer_norm"), config
+    return learners.make(name, config, SPEC, "layer_norm"), config
 
 
 @pytest.mark.slow  # the soft value is the same way
@@ -172,7 +172,7 @@ def test_critics_learn_a_known_soft_value(name):
 
     @jax.jit
     def costs(state, key):
-        inputs = common.normalize_obs(state, obs, hparams)
+        inputs = learner.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         normal = jax.random.normal(key, (20_000, 2))
         return learner.actor.next_action(learner.networks.actor, state.params.actor, *inputs, normal, hparams)[1]
 
@@ -270,7 +270,7 @@ def test_delays_move_targets_and_actor_when_they_are_due(delay, period, expected
 
 def calls(config):
     """Returns the updates of a cycle: u (whole) or c (of critics), with T where the targets move after it."""
-    learner = learners.make("td3", config, SIZES, "mlp")
+    learner = learners.make("td3", config, SPEC, "mlp")
 
     class Noting(ActorCritic):
         """Notes in the first numbers of `key` that a step was made; nothing is learned."""
@@ -316,11 +316,11 @@ def test_what_does_not_combine_is_refused_by_name():
     hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
     for name in NAMES:
         with pytest.raises(ValueError, match=f"learner_kernels hopper computes learner ddpg; it is {name}"):
-            learners.make(name, hopper, SIZES)
+            learners.make(name, hopper, SPEC)
         with pytest.raises(ValueError, match=rf"learner {name} needs networks that are a function .*heads"):
-            learners.make(name, SMALL, SIZES, lambda action_size, hidden_sizes, dtype: networks.mlp(2, (8,)))
+            learners.make(name, SMALL, SPEC, lambda action_size, hidden_sizes, dtype: networks.mlp(2, (8,)))
         with pytest.raises(ValueError, match=f"for learner {name} the critic must give"):
-            learners.make(name, SMALL, SIZES, seven)
+            learners.make(name, SMALL, SPEC, seven)
     with pytest.raises(ValueError, match=r"dropped_quantiles must be less than num_quantiles \(5\); got 5"):
         made("tqc", dropped_quantiles=5)
     with pytest.raises(ValueError, match=r"subset_critics must be at most num_critics \(3\); got 4"):

@@ -14,10 +14,11 @@ from mjx_dher.learners.actors import Deterministic
 from mjx_dher.learners.common import Params
 from mjx_dher.learners.ddpg import DDPG
 from mjx_dher.networks import Actor, Critic, Networks, fan_in, mlp
-from mjx_dher.types import Batch, Sizes
-from probes import BATCH, LinearActor
+from mjx_dher.types import Batch
+from probes import BATCH, LinearActor, spec_of
 
 HP = HParams(gamma=0.5, action_l2=0.25)
+BOUNDS = (-2.0, 0.0)
 
 
 class LinearCritic(nn.Module):
@@ -30,7 +31,7 @@ class LinearCritic(nn.Module):
 
 
 NETWORKS = Networks(actor=LinearActor(), critic=LinearCritic())
-LEARNER = DDPG(Sizes(1, 1, 1), NETWORKS, NETWORKS)
+LEARNER = DDPG(spec_of(1, 1, 1), NETWORKS, NETWORKS)
 update = jax.jit(LEARNER.update)
 
 
@@ -40,7 +41,7 @@ def state():
 
 
 def losses_of(batch, state, hparams=HP):
-    return ddpg.compute_gradients(NETWORKS, state.params, state.target, batch, hparams)[1]
+    return ddpg.compute_gradients(NETWORKS, state.params, state.target, batch, BOUNDS, hparams)[1]
 
 
 Q = np.array([-0.25, -1.5])  # of the batch: -0.5 - 0.25 + 0.5 and 0 - 1 - 0.5
@@ -64,7 +65,7 @@ def test_targets_are_clipped_to_what_returns_can_be(state, reward, clipped):
 
 def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
     updated, losses = update(state, BATCH, HP._replace(critic_lr=0.1, actor_lr=0.01))
-    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, HP)
+    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, BOUNDS, HP)
     # Adam's first step moves each parameter by the step size, against the sign of its gradient.
     for name, lr in (("critic", 0.1), ("actor", 0.01)):
         step = lambda new, old, g, lr=lr: np.testing.assert_allclose(new, old - lr * np.sign(g), rtol=1e-4)  # noqa: E731
@@ -77,7 +78,7 @@ def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
 
 def test_gradients_are_those_of_each_loss_by_its_own_network(state):
     """By differences: a step along one network's parameters changes the loss by its gradient, and the other does not count."""
-    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, HP)
+    gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, BOUNDS, HP)
     for name, loss in (("critic", "critic_loss"), ("actor", "actor_loss")):
         moved = [jax.tree.map(lambda x, d=d: x + d, getattr(state.params, name)) for d in (0.01, -0.01)]
         up, down = (losses_of(BATCH, state.replace(params=state.params.replace(**{name: params}))) for params in moved)
@@ -211,7 +212,7 @@ def test_fan_in_begins_as_pytorch_s_linear_layers_do():
 def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     """8 bits of mantissa: values to half a per cent, and directions of gradients within five degrees."""
     exact, rounded = (mlp(4, (256, 256, 256), dtype) for dtype in ("float32", "bfloat16"))
-    params = DDPG(Sizes(25, 3, 4), exact, rounded).init(jax.random.key(0)).params
+    params = DDPG(spec_of(25, 3, 4), exact, rounded).init(jax.random.key(0)).params
     observation, following, goal, action = (
         jax.random.normal(jax.random.key(i), (512, size)) for i, size in enumerate((25, 25, 3, 4))
     )
@@ -221,7 +222,7 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     def passes(networks):
         action = networks.actor.apply(params.actor, observation, goal)
         assert action.dtype == networks.critic.apply(params.critic, observation, goal, action).dtype == jnp.float32
-        gradients, losses = ddpg.compute_gradients(networks, params, params, batch, hparams)
+        gradients, losses = ddpg.compute_gradients(networks, params, params, batch, (-50.0, 0.0), hparams)
         return losses.critic_loss, ravel_pytree(gradients.critic)[0], ravel_pytree(gradients.actor)[0]
 
     (loss, *gradients), (near, *others) = passes(exact), passes(rounded)
@@ -234,7 +235,7 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
 def test_critic_learns_a_known_value():
     """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma), whatever the action."""
     networks = mlp(1, (16,))
-    learner = DDPG(Sizes(1, 1, 1), networks, networks)
+    learner = DDPG(spec_of(1, 1, 1), networks, networks)
     state = learner.init(jax.random.key(0))
     hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.01)
     ones = jnp.ones((32, 1))

@@ -19,10 +19,12 @@ from mjx_dher.learners import ddpg
 from mjx_dher.networks import Networks, mlp
 from mjx_dher.runs.program.loop import state_template
 from mjx_dher.trainer import make_train
-from mjx_dher.types import Batch, Sizes
+from mjx_dher.types import Batch
+from probes import spec_of
 
 OBSERVATION, GOAL, SIZE = 25, 3, 256
 HPARAMS = HParams(action_l2=0.7)
+BOUNDS = (-1.0 / (1.0 - HPARAMS.gamma), 0.0)
 HOPPER = getattr(jax.devices()[0], "compute_capability", None) == "9.0"
 
 
@@ -36,7 +38,7 @@ def case(action_size, seed):
     keys = jax.random.split(jax.random.key(seed), 7)
 
     default = networks(jnp.float32, action_size)
-    learner = ddpg.DDPG(Sizes(OBSERVATION, GOAL, action_size), default, default)
+    learner = ddpg.DDPG(spec_of(OBSERVATION, GOAL, action_size), default, default)
 
     def params(key):
         fresh = learner.init(key).params
@@ -48,7 +50,7 @@ def case(action_size, seed):
         desired_goal=jax.random.normal(keys[2], (SIZE, GOAL)),
         action=jax.random.uniform(keys[3], (SIZE, action_size), minval=-1.0),
         reward=-jax.random.bernoulli(keys[4], 0.7, (SIZE,)).astype(jnp.float32),
-        discount=jnp.full(SIZE, 0.98),
+        discount=jnp.full(SIZE, HPARAMS.gamma),
         row=jnp.arange(SIZE),
     )
     return params(keys[5]), params(keys[6]), batch
@@ -155,7 +157,7 @@ def of_xla(action_size, dtype, precision=None):
     @jax.jit
     def gradients(*case):
         with jax.default_matmul_precision(precision):
-            return ddpg.compute_gradients(networks(dtype, action_size), *case, HPARAMS)
+            return ddpg.compute_gradients(networks(dtype, action_size), *case, BOUNDS, HPARAMS)
 
     return gradients
 
@@ -180,7 +182,7 @@ def assert_as_good_as_xla(found, action_size, cases):
 def test_gradients_are_put_together(action_size, monkeypatch):
     monkeypatch.setattr(hopper, "_calls", lambda: (critic_pass, actor_pass))
     cases = [case(action_size, seed) for seed in range(3)]
-    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, BOUNDS, HPARAMS)  # noqa: E731
     assert_as_good_as_xla([jax.jit(gradients)(*one) for one in cases], action_size, cases)
 
 
@@ -189,7 +191,7 @@ def test_gradients_are_put_together(action_size, monkeypatch):
 def test_kernels_compute_gradients(action_size):
     cases = [case(action_size, seed) for seed in range(3)]
     together = jax.tree.map(lambda *x: jnp.stack(x), *cases)
-    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, HPARAMS)  # noqa: E731
+    gradients = lambda *x: hopper.compute_gradients(networks(jnp.bfloat16, action_size), *x, BOUNDS, HPARAMS)  # noqa: E731
     found = jax.jit(jax.vmap(gradients))(*together)
     lanes = [jax.tree.map(lambda x, lane=lane: x[lane], found) for lane in range(len(cases))]
     assert_as_good_as_xla(lanes, action_size, cases)
@@ -223,26 +225,28 @@ class Device:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sizes", "capability", "parts"),
+    ("changes", "spec", "capability", "parts"),
     [
-        ({"learner_dtype": "float32"}, (28, 4), "9.0", ["learner_dtype bfloat16", "is float32"]),
-        ({"hidden_sizes": (256, 256)}, (28, 4), "9.0", ["hidden_sizes (256, 256, 256)", "are (256, 256)"]),
-        ({"batch_size": 1000}, (28, 4), "9.0", ["batch_size", "256 divides", "is 1000"]),
-        ({}, (57, 4), "9.0", ["56", "observation and goal", "4 of an action", "has 57 and 4"]),
-        ({}, (28, 5), "9.0", ["56", "observation and goal", "4 of an action", "has 28 and 5"]),
-        ({}, (28, 4), "8.0", ["H100 or H200", "NVIDIA of 8.0"]),
+        ({"learner_dtype": "float32"}, spec_of(25, 3, 4), "9.0", ["learner_dtype bfloat16", "is float32"]),
+        ({"hidden_sizes": (256, 256)}, spec_of(25, 3, 4), "9.0", ["hidden_sizes (256, 256, 256)", "are (256, 256)"]),
+        ({"batch_size": 1000}, spec_of(25, 3, 4), "9.0", ["batch_size", "256 divides", "is 1000"]),
+        ({}, spec_of(54, 3, 4), "9.0", ["56", "observation and goal", "4 of an action", "has 57 and 4"]),
+        ({}, spec_of(25, 3, 5), "9.0", ["56", "observation and goal", "4 of an action", "has 28 and 5"]),
+        ({}, spec_of(25, 3, 4, reward_range=(0.0, 1.0)), "9.0", ["reward_range", "(0.0, 1.0)"]),
+        ({}, spec_of(25, 3, 4, ends=True), "9.0", ["ends"]),
+        ({}, spec_of(25, 3, 4), "8.0", ["H100 or H200", "NVIDIA of 8.0"]),
     ],
 )
-def test_what_they_lack_is_named(changes, sizes, capability, parts, monkeypatch):
+def test_what_they_lack_is_named(changes, spec, capability, parts, monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [Device(capability)])
-    reason = hopper.unsupported_reason(dataclasses.replace(STATIC, **changes), *sizes)
+    reason = hopper.unsupported_reason(dataclasses.replace(STATIC, **changes), spec)
     assert all(part in reason for part in parts), reason
 
 
 @pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="needs warp-lang")
 def test_they_lack_nothing_on_such_a_gpu(monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [Device("9.0")])
-    assert hopper.unsupported_reason(STATIC, 28, 4) is None
+    assert hopper.unsupported_reason(STATIC, spec_of(25, 3, 4)) is None
 
 
 @pytest.mark.skipif(HOPPER, reason="can use them")
@@ -273,7 +277,7 @@ def own_networks(action_size, hidden_sizes, dtype):
 def test_networks_of_one_s_own_are_refused_and_auto_takes_xla_for_them(monkeypatch):
     """They know the default networks alone."""
     monkeypatch.setattr(hopper, "unsupported_reason", lambda *args: None)
-    sizes = Sizes(OBSERVATION, GOAL, 4)
+    sizes = spec_of(OBSERVATION, GOAL, 4)
     with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
         learners.make("ddpg", STATIC, sizes, own_networks)
     auto = dataclasses.replace(STATIC, learner_kernels="auto")

@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 
 import mjx_dher
-from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
+from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, trainer
 from mjx_dher.learners import common, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
 from mjx_dher.policy import Policy, learner_policy
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.types import Sizes
+from mjx_dher.types import Batch
 from point_mass import PointMass
+from probes import spec_of
 
-SIZES = Sizes(2, 2, 2)
+TASK = spec_of(2, 2, 2)
 SMALL = Config(
     num_envs=16,
     cycles_per_epoch=5,
@@ -61,7 +62,7 @@ def own_networks(action_size, hidden_sizes, dtype):
     return Networks(Straight(), Distance(hidden_sizes[0], dtype))
 
 
-def own_learner(config, sizes, make_networks):
+def own_learner(config, spec, make_networks):
     """DDPG with a step size of its own and a metric more."""
 
     @dataclasses.dataclass(frozen=True)
@@ -70,8 +71,8 @@ def own_learner(config, sizes, make_networks):
             state, losses = super().update(state, batch, hparams._replace(actor_lr=0.01))
             return state, losses | {"reward_mean": jnp.mean(batch.reward)}
 
-    both = make_networks(sizes.action, config.hidden_sizes, "float32")
-    return Quick(sizes, both, both)
+    both = make_networks(spec.action_size, config.hidden_sizes, "float32")
+    return Quick(spec, both, both)
 
 
 @pytest.fixture
@@ -84,9 +85,9 @@ def mine(monkeypatch):
 
 
 def test_the_default_is_ddpg_with_the_paper_s_networks():
-    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="xla"), SIZES)
+    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="xla"), TASK)
     assert isinstance(learner, ddpg.DDPG)
-    assert learner.sizes == SIZES
+    assert learner.spec == TASK
     assert learner.networks == networks.mlp(2, (32, 32), "float32") == Networks(Actor(2, (32, 32)), Critic((32, 32)))
     assert learner.learning == networks.mlp(2, (32, 32), "bfloat16")
     assert learner.compute_gradients is ddpg.compute_gradients
@@ -94,7 +95,7 @@ def test_the_default_is_ddpg_with_the_paper_s_networks():
 
 def test_a_learner_is_a_function_or_a_place(mine):
     for name in ("mine:learner", own_learner):
-        learner = learners.make(name, SMALL, SIZES, "mine:networks")
+        learner = learners.make(name, SMALL, TASK, "mine:networks")
         assert type(learner).__name__ == "Quick"
         assert learner.networks == own_networks(2, (32, 32), "float32")
 
@@ -102,7 +103,7 @@ def test_a_learner_is_a_function_or_a_place(mine):
 def test_networks_are_a_function_or_a_place(mine):
     assert networks.make("mlp") is networks.mlp
     assert networks.make("mine:networks") is networks.make(own_networks) is own_networks
-    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16"), SIZES, "mine:networks")
+    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16"), TASK, "mine:networks")
     assert learner.networks.critic == Distance(32, "float32")
     assert learner.learning.critic == Distance(32, "bfloat16")
 
@@ -110,9 +111,9 @@ def test_networks_are_a_function_or_a_place(mine):
 @pytest.mark.parametrize(
     ("field", "make", "parameters"),
     [
-        ("learner", lambda name: learners.make(name, SMALL, SIZES), "(config, sizes, networks)"),
+        ("learner", lambda name: learners.make(name, SMALL, TASK), "(config, spec, networks)"),
         ("networks", networks.make, "(action_size, hidden_sizes, dtype)"),
-        ("networks", lambda name: learners.make("ddpg", SMALL, SIZES, name), "(action_size, hidden_sizes, dtype)"),
+        ("networks", lambda name: learners.make("ddpg", SMALL, TASK, name), "(action_size, hidden_sizes, dtype)"),
     ],
 )
 def test_names_and_functions_that_cannot_be_used_are_refused(mine, field, make, parameters):
@@ -133,12 +134,12 @@ def test_names_and_functions_that_cannot_be_used_are_refused(mine, field, make, 
 
 def test_a_learner_without_methods_is_rejected_by_their_names(mine):
     with pytest.raises(ValueError, match=f"it has no {', '.join(METHODS)} "):
-        learners.make(lambda config, sizes, networks: object(), SMALL, SIZES)
+        learners.make(lambda config, sizes, networks: object(), SMALL, TASK)
     methods = {name: (lambda *args: None) for name in METHODS} | {"act": 3}
     mine.part = lambda config, sizes, networks: types.SimpleNamespace(**methods)
     for name in ("mine:part", mine.part):
         with pytest.raises(ValueError, match="it has no act ") as error:
-            learners.make(name, SMALL, SIZES)
+            learners.make(name, SMALL, TASK)
         assert repr(name) in str(error.value)
 
 
@@ -159,7 +160,7 @@ class Walk(learners.Learner):
 
 
 def test_four_methods_make_a_learner():
-    learner = learners.make(lambda config, sizes, networks: Walk(), SMALL, SIZES)
+    learner = learners.make(lambda config, sizes, networks: Walk(), SMALL, TASK)
     program = make_train(PointMass(), SMALL, learner=learner)
     state, metrics = jax.jit(program.epoch)(jax.jit(program.init)(jax.random.key(0), HP))
     assert float(state.learner) == SMALL.cycles_per_epoch * SMALL.updates_per_cycle
@@ -175,7 +176,7 @@ def test_a_delay_needs_updates_without_the_actor():
     for delay in (3, 0, 2.0):
         made = types.SimpleNamespace(**methods, policy_delay=delay)
         with pytest.raises(ValueError, match="policy_delay"):
-            learners.make(lambda config, sizes, networks, made=made: made, SMALL, SIZES)
+            learners.make(lambda config, sizes, networks, made=made: made, SMALL, TASK)
 
 
 class Wide(nn.Module):
@@ -198,22 +199,100 @@ class Wide(nn.Module):
 )
 def test_networks_of_the_wrong_output_shape_are_refused(made, parts):
     with pytest.raises(ValueError, match="networks") as error:
-        learners.make("ddpg", SMALL, SIZES, lambda action_size, hidden_sizes, dtype: made)
+        learners.make("ddpg", SMALL, TASK, lambda action_size, hidden_sizes, dtype: made)
     assert all(part in str(error.value).replace("float32[2,3]", "(2, 3)") for part in parts), error.value
 
 
 def test_kernels_know_the_default_networks_alone():
     hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
     with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
-        learners.make("ddpg", hopper, SIZES, own_networks)
+        learners.make("ddpg", hopper, TASK, own_networks)
     auto = dataclasses.replace(hopper, learner_kernels="auto")
-    assert learners.make("ddpg", auto, SIZES, own_networks).compute_gradients is ddpg.compute_gradients
+    assert learners.make("ddpg", auto, TASK, own_networks).compute_gradients is ddpg.compute_gradients
+
+
+IMAGES = dataclasses.replace(
+    TASK,
+    observation={
+        "image": jax.ShapeDtypeStruct((4, 4, 1), jnp.uint8),
+        "vector": jax.ShapeDtypeStruct((3,), jnp.float32),
+    },
+)
+
+
+class Pixels(nn.Module):
+    """Encodes an image and a vector, with parameters of its own."""
+
+    @nn.compact
+    def __call__(self, observation):
+        image = observation["image"].astype(jnp.float32) / 255.0
+        pixels = nn.Dense(5)(image.reshape(*image.shape[:-3], -1))
+        return jnp.concatenate([pixels, observation["vector"]], axis=-1)
+
+
+def seeing(action_size, hidden_sizes, dtype="float32", heads=networks.PLAIN):
+    return networks.mlp(action_size, hidden_sizes, dtype, heads)._replace(encoder=Pixels())
+
+
+def random_tree(key, *leading):
+    image = jax.random.randint(key, (*leading, 4, 4, 1), 0, 256).astype(jnp.uint8)
+    return {"image": image, "vector": 3.0 + jax.random.normal(key, (*leading, 3))}
+
+
+@pytest.mark.parametrize("name", ["ddpg", "tqc", pytest.param("sac", marks=pytest.mark.slow)])
+def test_an_encoder_takes_a_tree_of_observations(name):
+    """Both networks learn their own encoder; float leaves are normalized and images are not."""
+    config = dataclasses.replace(SMALL, num_quantiles=5, dropped_quantiles=1)
+    learner = learners.make(name, config, IMAGES, seeing)
+    key, ones = jax.random.key(0), jnp.ones((8, 2))
+    hparams = trainer.as_arrays(HP)
+    state = learner.update_normalizers(learner.init(key), random_tree(key, 4, 6), ones, hparams, jnp.arange(4) > 0)
+    assert state.observation_norm["image"] is None
+    np.testing.assert_allclose(state.observation_norm["vector"].mean, 3.0, atol=1.0)
+    reward = -jnp.ones(8)
+    batch = Batch(random_tree(key, 8), random_tree(key, 8), ones, ones, reward, discount=0.9 * jnp.ones(8))
+    after, _ = jax.jit(learner.update)(state, batch, hparams)
+    for network in ("actor", "critic"):
+        before_and_after = [jax.tree.leaves(getattr(x.params, network)) for x in (state, after)]
+        assert all(bool(jnp.any(a != b)) for a, b in zip(*before_and_after) if a.ndim > 1), network
+    obs = {"observation": random_tree(key, 8), "achieved_goal": ones, "desired_goal": ones}
+    actions = learner.act(after, obs, hparams)
+    assert actions.shape == (8, 2)
+    one = learner.act(after, jax.tree.map(lambda x: x[3], obs), hparams)
+    np.testing.assert_allclose(one, actions[3], rtol=1e-5, atol=1e-6)
+    darker = obs | {"observation": obs["observation"] | {"image": obs["observation"]["image"] // 2}}
+    assert float(jnp.abs(learner.act(after, darker, hparams) - actions).max()) > 1e-4
+    pairs = jax.tree.map(lambda x: jnp.stack([x, x]), obs)
+    assert learner.value(after, pairs, jnp.ones((2, 8, 2)), hparams).shape == (2, 8)
+    assert learner.export(after, hparams) is None
+
+
+def test_a_tree_of_vectors_needs_no_encoder():
+    """It is learned from as the vector that its leaves make, in the tree's order."""
+    tree = dataclasses.replace(TASK, observation={"b": TASK.observation, "a": jax.ShapeDtypeStruct((1,), jnp.float32)})
+    vector = dataclasses.replace(TASK, observation=jax.ShapeDtypeStruct((3,), jnp.float32))
+    of_tree, of_vector = (learners.make("ddpg", SMALL, spec) for spec in (tree, vector))
+    key, goal, hparams = jax.random.key(0), jnp.ones((8, 2)), trainer.as_arrays(HP)
+    x = jax.random.normal(key, (8, 3)) + 1.0
+
+    def learned(learner, observation):
+        state = learner.update_normalizers(learner.init(key), observation, goal, hparams)
+        batch = Batch(observation, observation, goal, goal, -jnp.ones(8), discount=0.9 * jnp.ones(8))
+        return learner.update(state, batch, hparams)[0].params
+
+    jax.tree.map(np.testing.assert_array_equal, learned(of_tree, {"a": x[:, :1], "b": x[:, 1:]}), learned(of_vector, x))
+
+
+def test_images_need_an_encoder():
+    for name in ("ddpg", "td3"):
+        with pytest.raises(ValueError, match=r"observation\['image'\] .* uint8\[4, 4, 1\] .*encoder"):
+            learners.make(name, SMALL, IMAGES)
 
 
 @pytest.fixture(scope="module")
 def trained():
     """(the learner with own actor and critic, its states before and after training, metrics of each epoch)."""
-    learner = learners.make(own_learner, SMALL, SIZES, own_networks)
+    learner = learners.make(own_learner, SMALL, TASK, own_networks)
     program = make_train(PointMass(), SMALL, learner=learner)
     assert program.learner is learner
     state = jax.jit(program.init)(jax.random.key(0), HP)
@@ -242,7 +321,7 @@ def test_what_the_learner_reports_is_logged(trained):
 def test_networks_of_one_s_own_are_not_exported_and_the_default_ones_are(trained):
     learner, _, state, _ = trained
     assert learner.export(state, HP) is None
-    default = learners.make("ddpg", SMALL, SIZES)
+    default = learners.make("ddpg", SMALL, TASK)
     assert isinstance(default.export(default.init(jax.random.key(0)), HP), Policy)
 
 
@@ -258,7 +337,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
     run_folder.write_config(tmp_path / "run", SPEC, "none", {})
-    learner_policy.LearnerPolicy(learner, state, HP, SIZES).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    learner_policy.LearnerPolicy(learner, state, HP, TASK.sizes).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
 
@@ -279,7 +358,7 @@ def test_a_stored_policy_acts_as_the_learner_does(folder, trained):
 def test_its_numbers_come_back_to_the_bit(folder, trained):
     policy = mjx_dher.load_policy(folder)
     jax.tree.map(np.testing.assert_array_equal, policy.state, trained[2])
-    assert (policy.sizes, policy.hparams) == (SIZES, HP)
+    assert (policy.sizes, policy.hparams) == (TASK.sizes, HP)
     assert isinstance(policy.state.params, common.Params)
 
 

@@ -18,12 +18,13 @@ from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
 from mjx_dher.learners import actors, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
-from mjx_dher.types import Batch, Episode, Sizes
+from mjx_dher.types import Batch, Episode
+from probes import spec_of
 
 E, N, B, T, D, G, A = 11, 3, 5, 7, 13, 2, 4
 HP = HParams()
 NETWORKS = Networks(Actor(A, (8,)), Critic((8,)))
-LEARNER = ddpg.DDPG(Sizes(D, G, A), NETWORKS, NETWORKS)
+LEARNER = ddpg.DDPG(spec_of(D, G, A), NETWORKS, NETWORKS)
 
 
 def shape(*sizes, dtype=jnp.float32):

@@ -18,7 +18,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.hopper.layout import ACTION, BLOCKS, INPUTS, MAX_ACTION, ROWS, THREADS, WIDTH
 from mjx_dher.learners.common import Losses, Params
 from mjx_dher.networks import Networks
-from mjx_dher.types import Array, Batch, PyTree
+from mjx_dher.types import Array, Batch, EnvSpec, PyTree
 
 _CAPABILITY = "9.0"  # of Hopper GPUs
 
@@ -26,16 +26,18 @@ _BF16, _F32 = jnp.bfloat16, jnp.float32
 _UNIT_DIGITS = (8, 4, 4, 2)  # q, t, i, b of a unit's number: see `to_kernel_order`
 
 
-def unsupported_reason(config: Config, num_inputs: int, action_size: int) -> str | None:
+def unsupported_reason(config: Config, spec: EnvSpec) -> str | None:
     """Returns the first requirement of these kernels that a run does not meet, or None.
 
     Args:
       config: of the run.
-      num_inputs: numbers of observation and goal, D + G.
-      action_size: A.
+      spec: of the environment.
     """
+    num_inputs = sum(leaf.shape[-1] for leaf in jax.tree.leaves(spec.observation)) + spec.goal_size
     device = jax.devices()[0]
     requirements = (
+        (spec.reward_range == (-1.0, 0.0), f"a reward_range of (-1, 0); it is {spec.reward_range}"),
+        (not spec.ends, "episodes that do not end early; ends is True"),
         (config.n_step == 1, f"n_step 1; it is {config.n_step}"),
         (config.learner_dtype == "bfloat16", f"learner_dtype bfloat16; it is {config.learner_dtype}"),
         (config.hidden_sizes == (WIDTH,) * 3, f"hidden_sizes {(WIDTH,) * 3}; they are {config.hidden_sizes}"),
@@ -44,9 +46,9 @@ def unsupported_reason(config: Config, num_inputs: int, action_size: int) -> str
             f"a batch_size that {ROWS * BLOCKS} divides; it is {config.batch_size}",
         ),
         (
-            num_inputs <= ACTION and action_size <= MAX_ACTION,
+            num_inputs <= ACTION and spec.action_size <= MAX_ACTION,
             f"at most {ACTION} numbers of observation and goal and {MAX_ACTION} of an action; this environment has {num_inputs}"
-            f" and {action_size}",
+            f" and {spec.action_size}",
         ),
         (
             getattr(device, "compute_capability", None) == _CAPABILITY,
@@ -151,13 +153,13 @@ def devices() -> list[Any]:
 
 
 def compute_gradients(
-    networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams
+    networks: Networks, params: Params, target: Params, batch: Batch, bounds: Any, hparams: HParams
 ) -> tuple[Params, Losses]:
     """Computes `ddpg.compute_gradients`, hidden layers in bfloat16, for runs of which `unsupported_reason` says None.
 
     Rounds less often than XLA does: a layer's bias is added in float32.
     """
-    del networks  # known: see `unsupported_reason`
+    del networks, bounds  # known: see `unsupported_reason`
     size, action_size = batch.action.shape
     num_inputs = batch.observation.shape[1] + batch.desired_goal.shape[1]
     x = _input_columns(batch, batch.observation, batch.action)

@@ -89,24 +89,27 @@ class Learner(Protocol):
         return None
 
 
-# make(config, sizes, networks) -> Learner
-LearnerFn = Callable[[Config, Sizes, NetworksFn], Learner]
+# make(config, spec, networks) -> Learner
+LearnerFn = Callable[[Config, EnvSpec, NetworksFn], Learner]
 
 
 def make(name: str | LearnerFn, config: Config, spec: EnvSpec | Sizes, network: str | NetworksFn = "mlp") -> Learner:
     """Makes the learner called `name`.
 
     Args:
-      name: a built-in name, "module:attribute", or a function (config, sizes, networks) -> Learner.
+      name: a built-in name, "module:attribute", or a function (config, spec, networks) -> Learner.
       config: sizes of the networks, dtype and kernels.
-      spec: of the environment.
+      spec: of the environment (`rollout.env_spec`).
       network: what `networks.make` takes.
 
     Raises:
       ValueError: no such learner or networks, something that lacks a method of `Learner`, or parts that do not combine.
     """
-    make_learner = components.load("learner", name, "config", "sizes", "networks")
-    learner = make_learner(config, spec.sizes if isinstance(spec, EnvSpec) else spec, networks.make(network))
+    if isinstance(spec, Sizes):
+        observation = jax.ShapeDtypeStruct((spec.observation,), jnp.float32)
+        spec = EnvSpec(observation, spec.goal, spec.action, episode_length=1)
+    make_learner = components.load("learner", name, "config", "spec", "networks")
+    learner = make_learner(config, spec, networks.make(network))
     check_methods(name, learner)
     return learner
 

@@ -16,15 +16,14 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from mjx_dher import normalizer
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common, critics
 from mjx_dher.learners.actors import ActorKind, Deterministic, Gaussian
 from mjx_dher.learners.common import ActorCriticBase, Params
 from mjx_dher.learners.critics import Critics
-from mjx_dher.networks import Heads, NetworksFn, check_heads, check_outputs
+from mjx_dher.networks import Heads, NetworksFn, check_heads, zeros
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
 
 @struct.dataclass
@@ -35,7 +34,7 @@ class ActorCriticState:
     target: Params  # its actor is () if targets take their actions from the actor itself
     actor_moments: PyTree  # Adam's
     critic_moments: PyTree
-    observation_norm: NormalizerState  # [D]
+    observation_norm: PyTree  # NormalizerState [D], or a tree of them
     goal_norm: NormalizerState  # [G]
     key: Array  # data of the key that updates draw from, with their number
     num_updates: Array  # [] int32
@@ -51,7 +50,7 @@ class ActorCritic(ActorCriticBase):
     def init(self, key: PRNGKey) -> ActorCriticState:
         """Makes fresh networks, targets equal to them, and empty normalizers."""
         actor_key, critic_key, update_key = jax.random.split(key, 3)
-        observation, goal, action = (jnp.zeros(size) for size in self.sizes)
+        observation, goal, action = zeros(self.spec, self.networks)
         params = Params(
             actor=self.actor.init(self.networks.actor, actor_key, observation, goal),
             critic=self.critics.init(self.networks.critic, critic_key, observation, goal, action),
@@ -61,16 +60,15 @@ class ActorCritic(ActorCriticBase):
             target=jax.tree.map(jnp.copy, self.lagging(params)),
             actor_moments=common.adam(0.0).init(params.actor),
             critic_moments=common.adam(0.0).init(params.critic),
-            observation_norm=normalizer.init(self.sizes.observation),
-            goal_norm=normalizer.init(self.sizes.goal),
             key=jax.random.key_data(update_key),
             num_updates=jnp.zeros((), jnp.int32),
+            **self.normalizers(),
         )
 
     def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
         """The critics' judgement [...] of actions [..., A]."""
-        observation, goal = common.normalize_obs(state, obs, hparams)
-        flat = [x.reshape(-1, x.shape[-1]) for x in (observation, goal, action)]
+        inputs = *self.normalize(state, obs["observation"], obs["desired_goal"], hparams), action
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[action.ndim - 1 :]), inputs)
         judges = self.critics.judges(state.params.critic)
         return self.critics.judge(critics.values(self.networks.critic, judges, *flat)).reshape(action.shape[:-1])
 
@@ -78,7 +76,7 @@ class ActorCritic(ActorCriticBase):
         self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool = True
     ) -> tuple[ActorCriticState, Metrics]:
         """Takes one step of Adam for the critics and then, `with_actor`, for the actor, which these critics judge."""
-        batch = common.normalize_batch(state, batch, hparams)
+        batch = self.normalize_batch(state, batch, hparams)
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates)
         target_key, actor_key = jax.random.split(key)
         atoms = self.target(state, batch, hparams, target_key)
@@ -112,7 +110,7 @@ class ActorCritic(ActorCriticBase):
         following = critics.values(self.learning.critic, state.target.critic, *inputs, action)
         future = (self.critics.combine(following, combine_key) - cost[:, None]).T  # [K, B]
         assert batch.discount is not None
-        return jnp.clip(batch.reward + batch.discount * future, -1.0 / (1.0 - hparams.gamma), 0.0).T
+        return jnp.clip(batch.reward + batch.discount * future, *self.return_bounds(hparams)).T
 
     def _update_actor(
         self, state: ActorCriticState, batch: Batch, hparams: HParams, key: PRNGKey
@@ -134,39 +132,36 @@ class ActorCritic(ActorCriticBase):
         return state, {"actor_loss": loss, **metrics}
 
 
-def _make(name: str, config: Config, sizes: Sizes, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
+def _make(name: str, config: Config, spec: EnvSpec, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
     if config.learner_kernels == "hopper":
         raise ValueError(f"learner_kernels hopper computes learner ddpg; it is {name}")
     check_heads(networks, name)
     heads = Heads(gaussian=actor.is_gaussian, critic_size=parts.size)
-    acting, learning = (
-        networks(sizes.action, config.hidden_sizes, dtype, heads) for dtype in ("float32", config.learner_dtype)
-    )
-    check_outputs(name, acting, sizes, heads)
-    return ActorCritic(sizes, acting, learning, actor, critics=parts, policy_delay=config.policy_delay)
+    acting, learning = common.make_networks(name, config, spec, networks, heads)
+    return ActorCritic(spec, acting, learning, actor, critics=parts, policy_delay=config.policy_delay)
 
 
-def td3(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+def td3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """TD3 (Fujimoto et al. 2018): two critics whose smaller value is the target, smoothed targets, a delayed actor.
 
     y = r + gamma min_i Q'_i(s', clip(pi'(s') + clip(eps, -c, c)))  (equations 10 and 14)
     critics: mean (Q_i(s, a) - y)^2;  actor: -mean Q_1(s, pi(s))
     """
     parts = Critics(config.num_critics, 1, critics.smallest, critics.squared_error, critics.lowest, num_judges=1)
-    return _make("td3", config, sizes, networks, Deterministic(), parts)
+    return _make("td3", config, spec, networks, Deterministic(), parts)
 
 
-def sac(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+def sac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """SAC (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications"): entropy is paid, with a learned weight.
 
     y = r + gamma (min_i Q'_i(s', a') - alpha log pi(a'|s')),  a' ~ pi(s')  (equations 2, 3 and 5)
     critics: mean (Q_i(s, a) - y)^2;  actor: mean(alpha log pi(a|s) - min_i Q_i(s, a))
     """
     parts = Critics(config.num_critics, 1, critics.smallest, critics.squared_error, critics.lowest)
-    return _make("sac", config, sizes, networks, Gaussian(), parts)
+    return _make("sac", config, spec, networks, Gaussian(), parts)
 
 
-def redq(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+def redq(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """REDQ (Chen et al. 2021): SAC with many critics, of which `subset_critics` drawn at random make the target.
 
     y = r + gamma (min_{i in M} Q'_i(s', a') - alpha log pi(a'|s'))  (algorithm 1)
@@ -177,22 +172,22 @@ def redq(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
         raise ValueError(f"subset_critics must be at most num_critics ({config.num_critics}); got {config.subset_critics}")
     combine = critics.smallest_of(config.subset_critics)
     parts = Critics(config.num_critics, 1, combine, critics.squared_error, critics.mean)
-    return _make("redq", config, sizes, networks, Gaussian(), parts)
+    return _make("redq", config, spec, networks, Gaussian(), parts)
 
 
-def tqc(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+def tqc(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """TQC (Kuznetsov et al. 2020): SAC whose critics give quantiles of the return; the largest are left out of the target.
 
     y_k = r + gamma (z_k(s', a') - alpha log pi(a'|s')),  z_1 <= z_2 <= ... the pooled quantiles without the largest
     critics: the quantile Huber loss (equation 12);  actor: mean(alpha log pi(a|s) - the mean of all quantiles)
     The paper has 5 critics of 25 quantiles each, and drops 2 of each.
     """
-    return _make("tqc", config, sizes, networks, Gaussian(), _quantiles(config))
+    return _make("tqc", config, spec, networks, Gaussian(), _quantiles(config))
 
 
-def dtqc(config: Config, sizes: Sizes, networks: NetworksFn) -> ActorCritic:
+def dtqc(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """The critics of TQC with TD3's actor, which is deterministic and explores under noise."""
-    return _make("dtqc", config, sizes, networks, Deterministic(), _quantiles(config))
+    return _make("dtqc", config, spec, networks, Deterministic(), _quantiles(config))
 
 
 def _quantiles(config: Config) -> Critics:

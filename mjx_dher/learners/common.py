@@ -11,13 +11,13 @@ import optax
 from flax import struct
 
 from mjx_dher import normalizer
-from mjx_dher.config import HParams
+from mjx_dher.config import Config, HParams
+from mjx_dher.context import return_bounds
 from mjx_dher.learners import Learner
 from mjx_dher.learners.actors import ActorKind, Deterministic, Noise
-from mjx_dher.networks import Networks
-from mjx_dher.normalizer import NormalizerState
+from mjx_dher.networks import Heads, Networks, NetworksFn, check_inputs, check_outputs, concatenated, with_encoder
 from mjx_dher.policy import Policy, from_mlp
-from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
 State = TypeVar("State", bound=Any)  # has params, target, observation_norm and goal_norm
 Tree = TypeVar("Tree", bound=Any)
@@ -58,37 +58,59 @@ def adam(learning_rate: Any, eps: Any = 1e-8) -> optax.GradientTransformation:
 class ActorCriticBase(Learner):
     """A learner with an actor, a critic, their targets and normalizers. Subclasses add `init`, `update` and `value`."""
 
-    sizes: Sizes
+    spec: EnvSpec
     networks: Networks  # float32; used to act
     learning: Networks  # in the learner's dtype, with the same parameters; used in updates
     actor: ActorKind = dataclasses.field(default_factory=Deterministic)
     axis_name: str | None = None  # mapped axis of the devices that one run is split over
 
+    def normalizers(self) -> dict[str, PyTree]:
+        """Empty normalizers of observations and goals, by their names in the state."""
+        goal = jax.ShapeDtypeStruct((self.spec.goal_size,), jnp.float32)
+        return {"observation_norm": normalizer.init(self.spec.observation), "goal_norm": normalizer.init(goal)}
+
     def update_normalizers(
-        self, state: State, observation: Array, goal: Array, hparams: HParams, valid: Array | None = None
+        self, state: State, observation: PyTree, goal: Array, hparams: HParams, valid: Array | None = None
     ) -> State:
         """Adds observations [N, T+1, D], where `valid` [N] or [N, T+1] is true, and goals [B, G] to the normalizers."""
-        if valid is not None:
-            valid = valid.reshape(*valid.shape, *(1,) * (observation.ndim - 1 - valid.ndim))
-        any_valid = None if valid is None else jnp.any(valid)
-        clip, axis = hparams.obs_clip, self.axis_name
+        clip, any_valid = hparams.obs_clip, None if valid is None else jnp.any(valid)
         return dataclasses.replace(
             state,
-            observation_norm=normalizer.update(state.observation_norm, observation, clip, valid, axis),
-            goal_norm=normalizer.update(state.goal_norm, goal, clip, any_valid, axis),
+            observation_norm=normalizer.update(state.observation_norm, observation, clip, valid, self.axis_name),
+            goal_norm=normalizer.update(state.goal_norm, goal, clip, any_valid, self.axis_name),
         )
+
+    def normalize(self, state: State, observation: PyTree, goal: Array, hparams: HParams) -> tuple[PyTree, Array]:
+        """Normalized observations [..., D], or trees of them for an encoder, and goals [..., G]: the networks' inputs."""
+        numbers = hparams.norm_eps, hparams.norm_clip, hparams.obs_clip
+        observation = normalizer.normalize(state.observation_norm, observation, *numbers)
+        goal = normalizer.normalize(state.goal_norm, goal, *numbers)
+        return concatenated(observation) if self.networks.encoder is None else observation, goal
+
+    def normalize_batch(self, state: State, batch: Batch, hparams: HParams) -> Batch:
+        """`batch` with normalized observations and goals."""
+        observation, goal = self.normalize(state, batch.observation, batch.desired_goal, hparams)
+        next_observation, _ = self.normalize(state, batch.next_observation, batch.desired_goal, hparams)
+        discount = jnp.asarray(hparams.gamma) if batch.discount is None else batch.discount
+        changes = {"observation": observation, "next_observation": next_observation, "desired_goal": goal}
+        return dataclasses.replace(batch, discount=discount, **changes)
+
+    def return_bounds(self, hparams: HParams) -> tuple[Array | float, Array | float]:
+        """Lowest and highest return of the task: targets are clipped to them."""
+        return return_bounds(self.spec.reward_range, hparams.gamma)
 
     def act(self, state: State, obs: GoalObs, hparams: HParams) -> Array:
         """Deterministic policy's actions [..., A]."""
-        return self.actor.act(self.networks.actor, state.params.actor, *normalize_obs(state, obs, hparams))
+        inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
+        return self.actor.act(self.networks.actor, state.params.actor, *inputs)
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> Noise:
         """Exploration noise of `num_envs` episodes; leaves lead with [T, N]."""
-        return self.actor.noise(key, num_steps, num_envs, self.sizes.action, hparams)
+        return self.actor.noise(key, num_steps, num_envs, self.spec.action_size, hparams)
 
     def explore(self, state: State, obs: GoalObs, noise: Noise, hparams: HParams) -> Array:
         """Exploring policy's actions [N, A]."""
-        inputs = normalize_obs(state, obs, hparams)
+        inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return self.actor.explore(self.networks.actor, state.params.actor, *inputs, noise)
 
     def lagging(self, params: Params) -> Params:
@@ -105,9 +127,10 @@ class ActorCriticBase(Learner):
         return {"actor_norm": optax.tree.norm(state.params.actor), "critic_norm": optax.tree.norm(state.params.critic)}
 
     def export(self, state: State, hparams: HParams) -> Policy | None:
-        """Deterministic policy as NumPy arrays, or None for custom networks."""
+        """Deterministic policy as NumPy arrays, or None for custom networks and for observations that are not one vector."""
         dense = self.actor.dense(self.networks.actor, state.params.actor)
-        return None if dense is None else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
+        one_vector = isinstance(self.spec.observation, jax.ShapeDtypeStruct)
+        return None if dense is None or not one_vector else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
 
     def mean(self, gradients: Tree) -> Tree:
         """Mean of the gradients over the devices of a split run."""
@@ -121,22 +144,18 @@ class ActorCriticBase(Learner):
         return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(self.axis_name) * shape[0], shape[0])
 
 
-def normalize(state: NormalizerState, values: Array, hparams: HParams) -> Array:
-    """Normalized, clipped `values` [..., D]."""
-    return normalizer.normalize(state, values, hparams.norm_eps, hparams.norm_clip, hparams.obs_clip)
+def make_networks(
+    learner: str, config: Config, spec: EnvSpec, networks: NetworksFn, *heads: Heads
+) -> tuple[Networks, Networks]:
+    """Makes the networks for acting, in float32, and for updates, in the learner's dtype.
 
-
-def normalize_obs(state: Any, obs: GoalObs, hparams: HParams) -> tuple[Array, Array]:
-    """Normalized observation [..., D] and desired goal [..., G] of `obs`."""
-    observation = normalize(state.observation_norm, obs["observation"], hparams)
-    return observation, normalize(state.goal_norm, obs["desired_goal"], hparams)
-
-
-def normalize_batch(state: Any, batch: Batch, hparams: HParams) -> Batch:
-    """`batch` with normalized observations and goals."""
-    return dataclasses.replace(
-        batch,
-        observation=normalize(state.observation_norm, batch.observation, hparams),
-        next_observation=normalize(state.observation_norm, batch.next_observation, hparams),
-        desired_goal=normalize(state.goal_norm, batch.desired_goal, hparams),
+    Raises:
+      ValueError: the networks cannot take the observations of `spec`, or their outputs have the wrong shapes.
+    """
+    acting, learning = (
+        with_encoder(networks(spec.action_size, config.hidden_sizes, dtype, *heads))
+        for dtype in ("float32", config.learner_dtype)
     )
+    check_inputs(acting, spec)
+    check_outputs(learner, acting, spec, *heads)
+    return acting, learning

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
 
-from mjx_dher import normalizer
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
 from mjx_dher.learners.common import ActorCriticBase, Losses, Params
-from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, check_outputs
+from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, zeros
 from mjx_dher.normalizer import NormalizerState
-from mjx_dher.types import Array, Batch, GoalObs, Metrics, PRNGKey, PyTree, Sizes
+from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
 
 @struct.dataclass
@@ -26,17 +26,18 @@ class DDPGState:
     params: Params
     target: Params
     opt_state: PyTree  # Adam's moments, of both networks
-    observation_norm: NormalizerState  # [D]
+    observation_norm: PyTree  # NormalizerState [D], or a tree of them
     goal_norm: NormalizerState  # [G]
     num_updates: Array  # [] int32
 
 
-# compute_gradients(networks, params, target params, normalized batch, hparams) -> gradients, losses
-GradientFn = Callable[[Networks, Params, Params, Batch, HParams], tuple[Params, Losses]]
+Bounds = tuple[Array | float, Array | float]  # of returns
+# compute_gradients(networks, params, target params, normalized batch, bounds, hparams) -> gradients, losses
+GradientFn = Callable[[Networks, Params, Params, Batch, Bounds, HParams], tuple[Params, Losses]]
 
 
 def compute_gradients(
-    networks: Networks, params: Params, target: Params, batch: Batch, hparams: HParams
+    networks: Networks, params: Params, target: Params, batch: Batch, bounds: Bounds, hparams: HParams
 ) -> tuple[Params, Losses]:
     """Computes the gradients of both losses, each by its own network's parameters, on a normalized batch.
 
@@ -46,7 +47,7 @@ def compute_gradients(
     pi, q = networks.actor.apply, networks.critic.apply
     observation, next_observation, goal = batch.observation, batch.next_observation, batch.desired_goal
     next_q = q(target.critic, next_observation, goal, pi(target.actor, next_observation, goal))
-    y = jnp.clip(batch.reward + batch.discount * next_q, -1.0 / (1.0 - hparams.gamma), 0.0)
+    y = jnp.clip(batch.reward + batch.discount * next_q, *bounds)
 
     def critic_loss(critic: PyTree) -> tuple[Array, Array]:
         value = q(critic, observation, goal, batch.action)
@@ -71,7 +72,7 @@ class DDPG(ActorCriticBase):
     def init(self, key: PRNGKey) -> DDPGState:
         """Makes fresh networks, targets equal to them, and empty normalizers."""
         actor_key, critic_key = jax.random.split(key)
-        observation, goal, action = (jnp.zeros(size) for size in self.sizes)
+        observation, goal, action = zeros(self.spec, self.networks)
         params = Params(
             actor=self.networks.actor.init(actor_key, observation, goal),
             critic=self.networks.critic.init(critic_key, observation, goal, action),
@@ -80,20 +81,19 @@ class DDPG(ActorCriticBase):
             params=params,
             target=jax.tree.map(jnp.copy, params),
             opt_state=common.adam(0.0).init(params),
-            observation_norm=normalizer.init(self.sizes.observation),
-            goal_norm=normalizer.init(self.sizes.goal),
             num_updates=jnp.zeros((), jnp.int32),
+            **self.normalizers(),
         )
 
     def value(self, state: DDPGState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
         """Q [...] of actions [..., A]."""
-        value: Array = self.networks.critic.apply(state.params.critic, *common.normalize_obs(state, obs, hparams), action)
-        return value
+        inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
+        return cast(Array, self.networks.critic.apply(state.params.critic, *inputs, action))
 
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
         """Takes one step of Adam for critic and actor, both from the parameters before it."""
-        batch = common.normalize_batch(state, batch, hparams)
-        gradients, losses = self.compute_gradients(self.learning, state.params, state.target, batch, hparams)
+        batch, bounds = self.normalize_batch(state, batch, hparams), self.return_bounds(hparams)
+        gradients, losses = self.compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
         updates, opt_state = adam.update(self.mean(gradients), state.opt_state)
         params = optax.apply_updates(state.params, updates)
@@ -101,24 +101,23 @@ class DDPG(ActorCriticBase):
         return state, losses._asdict()
 
 
-def make(config: Config, sizes: Sizes, networks: NetworksFn) -> DDPG:
+def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> DDPG:
     """Makes the learner, with the gradients that `config.learner_kernels` selects.
 
     Raises:
       ValueError: kernels that cannot compute this run's gradients, or networks that give the wrong shapes.
     """
-    acting, learning = (networks(sizes.action, config.hidden_sizes, dtype) for dtype in ("float32", config.learner_dtype))
-    check_outputs("ddpg", acting, sizes)
-    return DDPG(sizes, acting, learning, compute_gradients=_choose_gradients(config, sizes, acting))
+    acting, learning = common.make_networks("ddpg", config, spec, networks)
+    return DDPG(spec, acting, learning, compute_gradients=_choose_gradients(config, spec, acting))
 
 
-def _choose_gradients(config: Config, sizes: Sizes, networks: Networks) -> GradientFn:
+def _choose_gradients(config: Config, spec: EnvSpec, networks: Networks) -> GradientFn:
     if config.learner_kernels == "xla" or (config.learner_kernels == "auto" and config.learner_dtype != "bfloat16"):
         return compute_gradients
     from mjx_dher.hopper import gradients as hopper
 
     stock = isinstance(networks.actor, Actor) and isinstance(networks.critic, Critic)
-    reason = hopper.unsupported_reason(config, sizes.observation + sizes.goal, sizes.action) if stock else "networks mlp"
+    reason = hopper.unsupported_reason(config, spec) if stock else "networks mlp"
     if config.learner_kernels == "hopper" and reason is not None:
         raise ValueError(f"learner_kernels hopper needs {reason}")
     return compute_gradients if reason is not None else hopper.compute_gradients
