@@ -179,17 +179,6 @@ def check_heads(make_networks: NetworksFn, learner: str) -> None:
         ) from None
 
 
-def check_inputs(networks: Networks, spec: EnvSpec) -> None:
-    """Raises ValueError, which names the observation's leaf, if these networks cannot take the observations of `spec`."""
-    leaves = jax.tree_util.tree_leaves_with_path(spec.observation) if networks.encoder is None else []
-    for path, leaf in leaves:
-        if len(leaf.shape) != 1 or not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise ValueError(
-                f"networks: observation{jax.tree_util.keystr(path)} must be a vector of floats for networks without an encoder;"
-                f" it is {leaf.dtype}{list(leaf.shape)} (see `encoder` of mjx_dher.networks.Networks)"
-            )
-
-
 def zeros(spec: EnvSpec, networks: Networks, *leading: int) -> tuple[PyTree, Array, Array]:
     """Inputs of the networks, all zero: observation, goal and action, with leading axes."""
     observation = jax.tree.map(lambda x: jnp.zeros((*leading, *x.shape), x.dtype), spec.observation)
@@ -204,7 +193,13 @@ def concatenated(observation: PyTree) -> Array:
 
 
 def check_outputs(learner: str, networks: Networks, spec: EnvSpec, heads: Heads = PLAIN) -> None:
-    """Raises ValueError, which names the network, unless its output has the shape that `heads` says."""
+    """Raises ValueError unless networks `with_encoder` take the observations of `spec` and give what `heads` says."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(spec.observation) if networks.encoder is None else ():
+        if len(leaf.shape) != 1 or not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(
+                f"networks: observation{jax.tree_util.keystr(path)} must be a vector of floats for networks without an encoder;"
+                f" it is {leaf.dtype}{list(leaf.shape)} (see `encoder` of mjx_dher.networks.Networks)"
+            )
     key, (obs, goal, action) = jax.random.key(0), jax.eval_shape(lambda: zeros(spec, networks, 2))
     numbers: Any = (2, spec.action_size)
     for part, inputs, expected in (

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 import mjx_dher
-from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, trainer
+from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
 from mjx_dher.learners import common, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
 from mjx_dher.policy import Policy, learner_policy
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.types import Batch
 from point_mass import PointMass
 from probes import spec_of
 
@@ -209,84 +208,6 @@ def test_kernels_know_the_default_networks_alone():
         learners.make("ddpg", hopper, TASK, own_networks)
     auto = dataclasses.replace(hopper, learner_kernels="auto")
     assert learners.make("ddpg", auto, TASK, own_networks).compute_gradients is ddpg.compute_gradients
-
-
-IMAGES = dataclasses.replace(
-    TASK,
-    observation={
-        "image": jax.ShapeDtypeStruct((4, 4, 1), jnp.uint8),
-        "vector": jax.ShapeDtypeStruct((3,), jnp.float32),
-    },
-)
-
-
-class Pixels(nn.Module):
-    """Encodes an image and a vector, with parameters of its own."""
-
-    @nn.compact
-    def __call__(self, observation):
-        image = observation["image"].astype(jnp.float32) / 255.0
-        pixels = nn.Dense(5)(image.reshape(*image.shape[:-3], -1))
-        return jnp.concatenate([pixels, observation["vector"]], axis=-1)
-
-
-def seeing(action_size, hidden_sizes, dtype="float32", heads=networks.PLAIN):
-    return networks.mlp(action_size, hidden_sizes, dtype, heads)._replace(encoder=Pixels())
-
-
-def random_tree(key, *leading):
-    image = jax.random.randint(key, (*leading, 4, 4, 1), 0, 256).astype(jnp.uint8)
-    return {"image": image, "vector": 3.0 + jax.random.normal(key, (*leading, 3))}
-
-
-@pytest.mark.parametrize("name", ["ddpg", "tqc", pytest.param("sac", marks=pytest.mark.slow)])
-def test_an_encoder_takes_a_tree_of_observations(name):
-    """Both networks learn their own encoder; float leaves are normalized and images are not."""
-    config = dataclasses.replace(SMALL, num_quantiles=5, dropped_quantiles=1)
-    learner = learners.make(name, config, IMAGES, seeing)
-    key, ones = jax.random.key(0), jnp.ones((8, 2))
-    hparams = trainer.as_arrays(HP)
-    state = learner.update_normalizers(learner.init(key), random_tree(key, 4, 6), ones, hparams, jnp.arange(4) > 0)
-    assert state.observation_norm["image"] is None
-    np.testing.assert_allclose(state.observation_norm["vector"].mean, 3.0, atol=1.0)
-    reward = -jnp.ones(8)
-    batch = Batch(random_tree(key, 8), random_tree(key, 8), ones, ones, reward, discount=0.9 * jnp.ones(8))
-    after, _ = jax.jit(learner.update)(state, batch, hparams)
-    for network in ("actor", "critic"):
-        before_and_after = [jax.tree.leaves(getattr(x.params, network)) for x in (state, after)]
-        assert all(bool(jnp.any(a != b)) for a, b in zip(*before_and_after) if a.ndim > 1), network
-    obs = {"observation": random_tree(key, 8), "achieved_goal": ones, "desired_goal": ones}
-    actions = learner.act(after, obs, hparams)
-    assert actions.shape == (8, 2)
-    one = learner.act(after, jax.tree.map(lambda x: x[3], obs), hparams)
-    np.testing.assert_allclose(one, actions[3], rtol=1e-5, atol=1e-6)
-    darker = obs | {"observation": obs["observation"] | {"image": obs["observation"]["image"] // 2}}
-    assert float(jnp.abs(learner.act(after, darker, hparams) - actions).max()) > 1e-4
-    pairs = jax.tree.map(lambda x: jnp.stack([x, x]), obs)
-    assert learner.value(after, pairs, jnp.ones((2, 8, 2)), hparams).shape == (2, 8)
-    assert learner.export(after, hparams) is None
-
-
-def test_a_tree_of_vectors_needs_no_encoder():
-    """It is learned from as the vector that its leaves make, in the tree's order."""
-    tree = dataclasses.replace(TASK, observation={"b": TASK.observation, "a": jax.ShapeDtypeStruct((1,), jnp.float32)})
-    vector = dataclasses.replace(TASK, observation=jax.ShapeDtypeStruct((3,), jnp.float32))
-    of_tree, of_vector = (learners.make("ddpg", SMALL, spec) for spec in (tree, vector))
-    key, goal, hparams = jax.random.key(0), jnp.ones((8, 2)), trainer.as_arrays(HP)
-    x = jax.random.normal(key, (8, 3)) + 1.0
-
-    def learned(learner, observation):
-        state = learner.update_normalizers(learner.init(key), observation, goal, hparams)
-        batch = Batch(observation, observation, goal, goal, -jnp.ones(8), discount=0.9 * jnp.ones(8))
-        return learner.update(state, batch, hparams)[0].params
-
-    jax.tree.map(np.testing.assert_array_equal, learned(of_tree, {"a": x[:, :1], "b": x[:, 1:]}), learned(of_vector, x))
-
-
-def test_images_need_an_encoder():
-    for name in ("ddpg", "td3"):
-        with pytest.raises(ValueError, match=r"observation\['image'\] .* uint8\[4, 4, 1\] .*encoder"):
-            learners.make(name, SMALL, IMAGES)
 
 
 @pytest.fixture(scope="module")

@@ -76,9 +76,9 @@ class Learner(DDPG):
         traced.add("learner")
         return {"updates_made": state.num_updates.astype(jnp.float32)}
 
-def learner(config, sizes, networks):
-    both = networks(sizes.action, config.hidden_sizes, "float32")
-    return Learner(sizes, both, both)
+def learner(config, spec, networks):
+    both = networks(spec.action_size, config.hidden_sizes, "float32")
+    return Learner(spec, both, both)
 """
 
 

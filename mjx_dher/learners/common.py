@@ -15,7 +15,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.context import return_bounds
 from mjx_dher.learners import Learner
 from mjx_dher.learners.actors import ActorKind, Deterministic, Noise
-from mjx_dher.networks import Heads, Networks, NetworksFn, check_inputs, check_outputs, concatenated, with_encoder
+from mjx_dher.networks import Heads, Networks, NetworksFn, check_outputs, concatenated, with_encoder
 from mjx_dher.policy import Policy, from_mlp
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
@@ -156,6 +156,5 @@ def make_networks(
         with_encoder(networks(spec.action_size, config.hidden_sizes, dtype, *heads))
         for dtype in ("float32", config.learner_dtype)
     )
-    check_inputs(acting, spec)
     check_outputs(learner, acting, spec, *heads)
     return acting, learning
