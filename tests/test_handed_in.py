@@ -279,13 +279,13 @@ LEARNERS = {
 
 @pytest.mark.parametrize("message", LEARNERS)
 def test_what_a_learner_gives_is_checked(message):
-    made = ddpg.make(SMALL, env_spec(ENV).sizes, trainer.learners.networks.mlp)
+    made = ddpg.make(SMALL, env_spec(ENV), trainer.learners.networks.mlp)
     own = type("Own", (DDPG,), LEARNERS[message])(*(getattr(made, field.name) for field in dataclasses.fields(made)))
     train = make_train(ENV, SMALL, learner=own)
     with pytest.raises(ValueError, match=message):
         trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
     with pytest.raises(ValueError, match=message.replace("10, 4", "10, 16")):
-        testing.check_learner(lambda config, sizes, networks: own, ENV, SMALL)
+        testing.check_learner(lambda config, spec, networks: own, ENV, SMALL)
 
 
 def test_a_learner_without_floating_point_numbers_is_finite():
@@ -322,8 +322,8 @@ def test_a_kernel_s_weights_and_a_priority_of_0_are_told():
 def test_what_is_to_be_left_out_is_left_out():
     takes_all = lambda self, state, obs, goal, hparams, valid: DDPG.update_normalizers(self, state, obs, goal, hparams)  # noqa: E731
 
-    def make(config, sizes, networks):
-        made = ddpg.make(config, sizes, networks)
+    def make(config, spec, networks):
+        made = ddpg.make(config, spec, networks)
         kind = type("Own", (DDPG,), {"update_normalizers": takes_all})
         return kind(*(getattr(made, field.name) for field in dataclasses.fields(made)))
 
