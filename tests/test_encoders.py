@@ -53,7 +53,7 @@ def test_an_encoder_takes_a_tree_of_observations(name):
     assert state.observation_norm["image"] is None
     np.testing.assert_allclose(state.observation_norm["vector"].mean, 3.0, atol=1.0)
     reward = -jnp.ones(8)
-    batch = Batch(random_tree(key, 8), random_tree(key, 8), ones, ones, reward, discount=0.9 * jnp.ones(8))
+    batch = Batch(random_tree(key, 8), random_tree(key, 8), ones, ones, reward, discount=0.9 * jnp.ones(8), row=jnp.arange(8))
     after, _ = jax.jit(learner.update)(state, batch, hparams)
     for network in ("actor", "critic"):
         before_and_after = [jax.tree.leaves(getattr(x.params, network)) for x in (state, after)]
@@ -80,7 +80,7 @@ def test_a_tree_of_vectors_needs_no_encoder():
 
     def learned(learner, observation):
         state = learner.update_normalizers(learner.init(key), observation, goal, hparams)
-        batch = Batch(observation, observation, goal, goal, -jnp.ones(8), discount=0.9 * jnp.ones(8))
+        batch = Batch(observation, observation, goal, goal, -jnp.ones(8), discount=0.9 * jnp.ones(8), row=jnp.arange(8))
         return learner.update(state, batch, hparams)[0].params
 
     jax.tree.map(np.testing.assert_array_equal, learned(of_tree, {"a": x[:, :1], "b": x[:, 1:]}), learned(of_vector, x))

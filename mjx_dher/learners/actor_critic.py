@@ -109,7 +109,6 @@ class ActorCritic(ActorCriticBase):
         action, cost = self.actor.next_action(self.learning.actor, params, *inputs, normal, hparams)
         following = critics.values(self.learning.critic, state.target.critic, *inputs, action)
         future = (self.critics.combine(following, combine_key) - cost[:, None]).T  # [K, B]
-        assert batch.discount is not None
         return jnp.clip(batch.reward + batch.discount * future, *self.return_bounds(hparams)).T
 
     def _update_actor(

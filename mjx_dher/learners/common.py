@@ -91,9 +91,7 @@ class ActorCriticBase(Learner):
         """`batch` with normalized observations and goals."""
         observation, goal = self.normalize(state, batch.observation, batch.desired_goal, hparams)
         next_observation, _ = self.normalize(state, batch.next_observation, batch.desired_goal, hparams)
-        discount = jnp.asarray(hparams.gamma) if batch.discount is None else batch.discount
-        changes = {"observation": observation, "next_observation": next_observation, "desired_goal": goal}
-        return dataclasses.replace(batch, discount=discount, **changes)
+        return dataclasses.replace(batch, observation=observation, next_observation=next_observation, desired_goal=goal)
 
     def return_bounds(self, hparams: HParams) -> tuple[Array | float, Array | float]:
         """Lowest and highest return of the task: targets are clipped to them."""
