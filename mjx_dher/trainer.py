@@ -124,8 +124,7 @@ def make_train(
     """Makes the training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
-    and returns the next TrainState with metrics, each [] (docs/logs.md): those of `evaluate.summary`, of the exploring policy,
-    of relabelling, faults that ought to be 0, and what the learner reports.
+    and returns the next TrainState with metrics, [] each; docs/logs.md lists them.
 
     Args:
       env: the environment.

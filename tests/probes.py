@@ -95,3 +95,69 @@ BATCH = Batch(
     discount=jnp.array([0.5, 0.5]),
     row=jnp.arange(2),
 )
+
+
+@struct.dataclass
+class WalkState(PointState):
+    done: Array
+    terminal: Array
+
+
+class Walk(PointMass):
+    """A point that moves by exactly its action from the origin. Its episodes end beyond x = 1, and fatally below y = -1.
+
+    Both depend on where it goes, not on its goal; with `ends_at_goal` a goal that is reached ends an episode, too.
+    """
+
+    name = "walk"
+
+    def __init__(self, episode_length: int = 12, ends_at_goal: bool = False):
+        super().__init__(episode_length)
+        one = jax.ShapeDtypeStruct((2,), jnp.float32)
+        self.spec = EnvSpec(one, 2, 2, episode_length, ends=True, ends_at_goal=ends_at_goal)
+
+    def reset(self, key) -> WalkState:
+        return self._walk(jnp.zeros(2), jax.random.uniform(key, (2,), jnp.float32, minval=-1.0, maxval=1.0))
+
+    def step(self, state: WalkState, action: Array) -> WalkState:
+        return self._walk(state.obs["achieved_goal"] + action, state.obs["desired_goal"])
+
+    def with_goal(self, state: WalkState, goal: Array) -> WalkState:
+        return self._walk(state.obs["achieved_goal"], goal)
+
+    def _walk(self, position: Array, goal: Array) -> WalkState:
+        state = self._state(position, goal)
+        return WalkState(state.obs, state.reward, state.success, position[0] > 1.0, position[1] < -1.0)
+
+
+class Corridor(PointMass):
+    """A state that walks 0, 1, 2, ... whatever the action, towards a goal at `goal`, and a trap at 3.
+
+    Rewards are -1, or 0 at the goal. `kind` says what ends an episode: "trap" (terminal, for every goal), "goal" (reaching it)
+    or "clock" (the time alone, while the state stays 0).
+    """
+
+    def __init__(self, kind: str, goal: float = 9.0, episode_length: int = 5):
+        super().__init__(episode_length)
+        self.kind, self.goal = kind, goal
+        self.observation_size, self.goal_size, self.action_size = 1, 1, 1
+        one = jax.ShapeDtypeStruct((1,), jnp.float32)
+        self.spec = EnvSpec(one, 1, 1, episode_length, ends=kind != "clock", ends_at_goal=kind == "goal")
+
+    def reset(self, key):
+        return self._at(jnp.zeros(1), jnp.full((1,), self.goal) + 0.0 * jax.random.uniform(key, (1,)))
+
+    def step(self, state, action):
+        speed = 0.0 if self.kind == "clock" else 1.0
+        return self._at(state.obs["achieved_goal"] + speed + 0.0 * action, state.obs["desired_goal"])
+
+    def compute_reward(self, achieved_goal, desired_goal):
+        return -(jnp.abs(achieved_goal - desired_goal)[..., 0] > 0.5).astype(jnp.float32)
+
+    def _at(self, place, goal):
+        reward = self.compute_reward(place, goal)
+        obs = {"observation": place, "achieved_goal": place, "desired_goal": goal}
+        if self.kind == "clock":
+            return PointState(obs, reward, (reward == 0).astype(jnp.float32))
+        trapped = (place[0] > 2.5) & (self.kind == "trap")
+        return WalkState(obs, reward, (reward == 0).astype(jnp.float32), trapped, trapped)

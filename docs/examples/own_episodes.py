@@ -23,7 +23,7 @@ def play(key: jax.Array) -> Episode:
     last, obs = jax.lax.scan(lambda state, action: (jax.vmap(env.step)(state, action), state.obs), first, actions)
     whole = jax.tree.map(lambda steps, end: jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1), obs, last.obs)
     observation, achieved_goal = whole["observation"], whole["achieved_goal"]
-    return Episode(observation, achieved_goal, first.obs["desired_goal"], jnp.moveaxis(actions, 0, 1))
+    return Episode(observation, achieved_goal, first.obs["desired_goal"], jnp.moveaxis(actions, 0, 1)).filled()
 
 
 def main() -> None:

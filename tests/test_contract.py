@@ -1,0 +1,239 @@
+"""Episodes that end early, terminal states, reward ranges and specs, against a plain Python loop and known values."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_dher import Config, HParams, learners, make_train, priorities, relabel, replay, samplers
+from mjx_dher import context as context_lib
+from mjx_dher.components import COMPONENTS
+from mjx_dher.rollout import env_spec, episode_template, rollout
+from mjx_dher.types import Batch, EnvSpec
+from probes import Corridor, Walk
+
+HP = HParams(gamma=0.9)
+T = 12
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["ends", "ends_at_goal"])
+def walk(request):
+    """An environment, and a ring of 300 episodes of it."""
+    env = Walk(T, request.param)
+    steps = 0.4 * jax.random.normal(jax.random.key(0), (T, 300, 2))
+    episodes, outcome = jax.jit(lambda: rollout(env, lambda step, obs: step, jax.random.key(1), 300, steps))()
+    ring = replay.add(replay.init(episode_template(env), 400, ends=True), episodes)
+    return env, ring, jax.device_get(episodes), jax.device_get(outcome), np.asarray(steps)
+
+
+def reached(achieved, desired):
+    return np.float32(np.linalg.norm(achieved - desired)) <= np.float32(0.1)
+
+
+def test_episodes_end_as_a_plain_loop_says(walk):
+    env, _, episodes, outcome, steps = walk
+    for n in range(300):
+        position, total = np.zeros(2, np.float32), 0.0
+        for t in range(T):
+            position = position + steps[t, n]
+            hit = reached(position, episodes.desired_goal[n])
+            total -= not hit
+            if position[0] > 1 or position[1] < -1 or (env.spec.ends_at_goal and hit):
+                break
+        assert episodes.length[n] == outcome.length[n] == t + 1
+        assert episodes.terminal[n] == (position[1] < -1)
+        assert outcome.ret[n] == total
+        assert outcome.success[n] == hit
+        np.testing.assert_allclose(episodes.achieved_goal[n, t + 1 :], np.tile(position, (T - t, 1)), atol=1e-5)
+        np.testing.assert_array_equal(episodes.action[n, t + 1 :], 0)
+    assert set(episodes.length) == set(range(1, T + 1)) - ({1} - set(episodes.length))
+    assert 0 < episodes.terminal.mean() < 1
+
+
+def expected(env, episodes, row, step, goal, n_step):
+    """Reward, discount and last step of a return, by a loop."""
+    reward, length = 0.0, int(episodes.length[row])
+    for i in range(n_step):
+        hit = reached(episodes.achieved_goal[row, step + i + 1], goal)
+        reward += HP.gamma**i * -(not hit)
+        end = step + i + 1
+        if hit or end == length:
+            break
+    terminal = (end == length and episodes.terminal[row]) or (env.spec.ends_at_goal and hit)
+    return reward, 0.0 if terminal else HP.gamma ** (i + 1), end
+
+
+@pytest.mark.parametrize("n_step", [1, 3])
+@pytest.mark.parametrize("name", [*COMPONENTS["sampler"], "custom"])
+def test_transitions_are_those_of_a_plain_loop(walk, name, n_step):
+    env, ring, episodes, _, _ = walk
+    sampler = (
+        samplers.make(name)
+        if name != "custom"
+        else samplers.make(lambda a, d, s, h: jnp.where(jnp.arange(T + 1) > s, 0.0, -jnp.inf))
+    )
+    context = context_lib.of_env(env, HP)
+    draw = jax.jit(lambda key: relabel.draw_batches(ring, key, (1000,), sampler, context, replay.cumulative(ring), n_step))
+    batch = jax.device_get(draw(jax.random.key(2)))
+    hindsight = 0
+    for b in range(1000):
+        row = batch.row[b]
+        goals, length = episodes.achieved_goal[row], int(episodes.length[row])
+        (step,) = np.flatnonzero((goals[:length] == batch.observation[b]).all(-1))  # never a padded one
+        reward, discount, end = expected(env, episodes, row, step, batch.desired_goal[b], n_step)
+        near = min(abs(np.linalg.norm(goals[t] - batch.desired_goal[b]) - 0.1) for t in range(step + 1, end + 1)) < 1e-6
+        if not near:  # rounding decides at the threshold itself
+            np.testing.assert_allclose((batch.reward[b], batch.discount[b]), (reward, discount), rtol=1e-5)
+            np.testing.assert_array_equal(batch.next_observation[b], goals[end])
+        if name != "random" and not np.array_equal(batch.desired_goal[b], episodes.desired_goal[row]):
+            places = np.flatnonzero((goals[: length + 1] == batch.desired_goal[b]).all(-1))
+            hindsight += 1
+            assert name == "episode" or places[0] > step
+            assert name != "final" or places[0] == length
+    assert name == "random" or hindsight > 700
+
+
+def test_weights_of_weighted_are_over_the_played_goals_alone():
+    """Distances 1, 2, 3 after the step, then padding: the mean is 2, weights 2 - r = 1.5, 1, 0.5."""
+    achieved = jnp.array([0.0, 1.0, 2.0, 3.0, 3.0, 3.0])[:, None]
+    weigh = lambda name, length: samplers.weigh(samplers.make(name), achieved, jnp.zeros(1), jnp.int32(0), HP, None, length)  # noqa: E731
+    found = samplers.probabilities(weigh("weighted", jnp.int32(3)))
+    np.testing.assert_allclose(found, [0, 1.5 / 3, 1 / 3, 0.5 / 3, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(samplers.probabilities(weigh("final", jnp.int32(3))), [0, 0, 0, 1, 0, 0])
+    np.testing.assert_allclose(samplers.probabilities(weigh("future", jnp.int32(2))), [0, 0.5, 0.5, 0, 0, 0])
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0])
+def test_transitions_are_drawn_alike_or_in_proportion_to_priority(walk, fraction):
+    """Not episodes: one of twelve steps is drawn twelve times as often as one of a single step."""
+    _, ring, episodes, _, _ = walk
+    weight = np.arange(300) % 3
+    ring = dataclasses.replace(ring, priority=jnp.zeros(400).at[:300].set(weight))
+    rows = np.asarray(replay.draw_rows(ring, jax.random.key(0), 200_000, fraction, replay.cumulative(ring)))
+    share = episodes.length * (weight if fraction else 1)
+    counts, expected_counts = np.bincount(rows, minlength=400)[:300], 200_000 * share / share.sum()
+    assert counts.sum() == 200_000
+    used = expected_counts > 0
+    assert counts[~used].sum() == 0
+    chi2 = np.sum((counts[used] - expected_counts[used]) ** 2 / expected_counts[used])
+    assert chi2 < used.sum() + 5 * math.sqrt(2 * used.sum())
+    steps = np.asarray(replay.sample(ring, jax.random.key(1), 200_000, jnp.asarray(rows)).step)
+    assert (steps < episodes.length[rows]).all()
+
+
+@pytest.mark.parametrize("name", COMPONENTS["priority"])
+def test_a_priority_does_not_see_the_padding(walk, name):
+    """The weight of an episode that ended early is that of the same episode in a ring of its length."""
+    env, _, episodes, _, _ = walk
+    config = Config(hidden_sizes=(8,))
+    learner = learners.make("ddpg", config, env_spec(env))
+    values = learners.values_of(learner, learner.init(jax.random.key(0)), HP)
+    context = context_lib.of_env(env, HP, values=values)
+    priority = priorities.whole(priorities.make(name))
+    row = int(np.flatnonzero(episodes.length == 5)[0])
+    whole = jax.tree.map(lambda x: jnp.asarray(x[row])[None], episodes)
+    cut = whole.replace(
+        observation=whole.observation[:, :6], achieved_goal=whole.achieved_goal[:, :6], action=whole.action[:, :5]
+    )
+
+    def weight(episode):
+        one = replay.add(replay.init(jax.tree.map(lambda x: x[0], episode), 1, ends=True), episode)
+        one = dataclasses.replace(one, priority=priorities.weights(priority, episode, context))
+        return float(priorities.renew(priority, one, context).priority[0])
+
+    np.testing.assert_allclose(weight(whole), weight(cut), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", COMPONENTS["learner"])
+def test_nothing_follows_a_terminal_transition(name):
+    """With a discount of 0, an update does not depend on the next observation; with any other, it does."""
+    config = Config(hidden_sizes=(8,), num_quantiles=3, dropped_quantiles=1)
+    learner = learners.make(name, config, EnvSpec(jax.ShapeDtypeStruct((2,), jnp.float32), 2, 2, 5))
+    state = learner.init(jax.random.key(0))
+    ones = jnp.ones((4, 2))
+    numbers = jax.tree.map(jnp.float32, HP)
+
+    @jax.jit
+    def update(following, discount):
+        batch = Batch(ones, following * ones, ones, 0.1 * ones, -jnp.ones(4), jnp.full(4, discount), jnp.arange(4))
+        return learner.update(state, batch, numbers)[0].params
+
+    def differ(discount):
+        pairs = zip(jax.tree.leaves(update(0.0, discount)), jax.tree.leaves(update(2.0, discount)))
+        return any((np.asarray(a) != np.asarray(b)).any() for a, b in pairs)
+
+    assert not differ(0.0)
+    assert differ(0.9)
+
+
+# Values at place 0 with gamma 0.5: -1 - 0.5 - 0.25 in three steps to the trap; -1 - 0.5 and then 0 at a goal that ends the
+# episode; and -2 where the clock alone ends it, however short the episodes are.
+KNOWN = {"trap": (9.0, -1.75), "goal": (3.0, -1.5), "clock": (9.0, -2.0)}
+
+
+@pytest.mark.parametrize("n_step", [1, 2])
+@pytest.mark.parametrize("kind", KNOWN)
+def test_values_are_known(kind, n_step):
+    """Truncated is not terminal; a trap is, for every goal; a goal that is reached is, for itself."""
+    goal, value = KNOWN[kind]
+    env = Corridor(kind, goal)
+    config = Config(
+        num_envs=8,
+        cycles_per_epoch=1,
+        updates_per_cycle=400,
+        target_period=1,
+        batch_size=64,
+        replay_size=200,
+        hidden_sizes=(32,),
+        eval_episodes=2,
+        total_steps=40,
+        n_step=n_step,
+    )
+    hparams = HParams(gamma=0.5, polyak=0.9, critic_lr=3e-3, her_k=1.0)
+    train = make_train(env, config, sampler=samplers.make("future"))
+    state, metrics = jax.jit(train.epoch)(train.init(jax.random.key(0), hparams))
+    state, _ = jax.jit(train.epoch)(state)
+    obs = {"observation": jnp.zeros((1, 1)), "achieved_goal": jnp.zeros((1, 1)), "desired_goal": jnp.full((1, 1), goal)}
+    found = train.learner.value(state.learner, obs, jnp.zeros((1, 1)), hparams)
+    np.testing.assert_allclose(found, [value], atol=0.08)
+    assert metrics["discarded_episodes"] == metrics["bad_rewards"] == 0
+    length = {"trap": 3, "goal": 3, "clock": 5}[kind]
+    np.testing.assert_array_equal(state.replay.episodes.length[:8], length)
+    assert float(metrics.get("train_length_mean", length)) == length
+
+
+class Wrong(Walk):
+    """A walk with a spec that is not its own."""
+
+    def __init__(self, **changes):
+        super().__init__()
+        self.spec = dataclasses.replace(self.spec, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"observation": jax.ShapeDtypeStruct((3,), jnp.float32)}, "observation"),
+        ({"goal_size": 3}, "goal_size"),
+        ({"action_size": 1}, "action_size"),
+        ({"episode_length": 7}, "episode_length"),
+        ({"ends": False}, "ends"),
+    ],
+)
+def test_a_spec_that_disagrees_with_the_arrays_is_rejected_before_training(changes, field):
+    with pytest.raises(ValueError, match=f"spec: {field}"):
+        make_train(Wrong(**changes), Config())
+
+
+def test_a_spec_that_cannot_be_is_rejected():
+    one = jax.ShapeDtypeStruct((1,), jnp.float32)
+    for changes in ({"reward_range": (0, 0)}, {"reward_range": (math.nan, 0)}, {"episode_length": 0}, {"ends_at_goal": True}):
+        with pytest.raises(ValueError, match="|".join([*changes, "ends"])):
+            EnvSpec(**{"observation": one, "goal_size": 1, "action_size": 1, "episode_length": 5, **changes})
+    walk = Walk()
+    walk.spec = "mine"
+    with pytest.raises(ValueError, match="spec"):
+        env_spec(walk)
