@@ -2,21 +2,18 @@
 
     python bench/fleet.py kills [--rounds 20] [--seeds 12] [--seed 0]
     python bench/fleet.py overhead [--seconds 60]
-    python bench/fleet.py many [--trials 10000]
 
 `kills` starts a cluster of four nodes on this machine (`ray.cluster_utils.Cluster`), sweeps the point mass of docs/examples
 with the real command, and kills (SIGKILL) a worker, a node and the driver in turn, at random times; a node comes back, and a
 driver is started again with the same command. When a sweep has ended before all kills are made, another one begins. Each must
 have every trial, none twice, and the tables of the same sweep without Ray. `overhead` times the same sweep by the plain
-command and by `--ray local` with one task at a time, after what it has to compile is in the cache. `many` takes trials that do
-not train through the driver, and looks at its memory and its time per thousand trials. The extra ray is needed.
+command and by `--ray local` with one task at a time, after its programs have been compiled. The extra ray is needed.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import itertools
 import os
 import random
 import signal
@@ -185,95 +182,21 @@ def overhead(seconds):
     return rows
 
 
-def pretend(chunk, tell):
-    """The files of runs, without any training."""
-    import json
-
-    import numpy as np
-
-    from mjx_dher.fleet import parcels
-    from mjx_dher.runs.folder import fingerprint, loggers, run_folder
-    from mjx_dher.system import files
-
-    packed, summary = [], {"success_rate": 0.5, "reset_success_rate": 0.0, "return_mean": -1.0, "episodes": 10}
-    for spec in chunk.specs:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            run = fingerprint.identity(spec, "native", fingerprint.sources(spec))
-            run_folder.write_config(folder, spec, "native", {})
-            log = loggers.CsvSink(folder / "metrics.csv", 0, fingerprint.digest(run))
-            for epoch in range(1, 11):
-                log.write({"epoch": epoch, "env_steps": epoch * 100, "updates": epoch, "wall_seconds": 0.1, **summary})
-            log.close()
-            weights = np.zeros(20_000, np.float32)
-            np.savez(folder / "policy.npz", weights=weights, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
-            content = {
-                "status": "finished",
-                "reason": "",
-                "epochs": 10,
-                "lanes": 1,
-                "digest": fingerprint.digest(run),
-                **summary,
-            }
-            files.write_json(folder / "result.json", content)
-            packed.append(parcels.pack(folder))
-    return packed
-
-
-def many(trials, blocks=10):
-    """Time and memory of the driver by block of trials."""
-    from mjx_dher import presets
-    from mjx_dher.fleet import chunks, cluster, driver, plan
-    from mjx_dher.fleet.ledger import Ledger
-    from mjx_dher.runs.options import Options
-    from mjx_dher.sweeps import grid
-
-    rows, marks = [], []
-
-    def show(state):
-        if state.ended >= trials / blocks * len(marks):
-            resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-            marks.append((state.ended, time.perf_counter(), time.process_time(), resident))
-            print(f"{state.ended} trials, {resident:.0f} MB", flush=True)
-
-    with tempfile.TemporaryDirectory() as folder:
-        specs = grid.trials([presets.preset("cpu", "reach")], range(trials))
-        request = plan.Request("local", "cpu", cpus=1)
-        with cluster.joined(request, None) as tasks:
-            kinds = plan.kinds_of(request, list(tasks.resources().values()), "auto")
-            size = lambda kind, run: plan.most_of(kind, request, None, None)  # noqa: E731
-            job = driver.Job(
-                Path(folder), Options(), None, None, chunks.files_digest(), kinds, size, pretend, print, show, lambda: False
-            )
-            lost = driver.run(tasks, job, Ledger(Path(folder), specs))
-        whole = sum(grid.is_done(Path(folder), run) for run in specs)
-    for before, now in itertools.pairwise(marks):
-        count = now[0] - before[0]
-        wall, cpu = ((now[i] - before[i]) / count * 1000 for i in (1, 2))
-        rows.append([f"{before[0]} to {now[0]}", f"{wall:.1f} ms", f"{cpu:.2f} ms", f"{now[3]:.0f} MB"])
-    print(f"{whole} of {trials} trials are there; lost: {lost or 'none'}")
-    return rows
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("kills", "overhead", "many"))
+    parser.add_argument("part", choices=("kills", "overhead"))
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--trials", type=int, default=10_000)
     args = parser.parse_args()
     load = os.getloadavg()[0]
     if args.part == "kills":
         head = ["kills", "starts of the driver", "trials", "tables", "left in the storage", "time"]
         rows = kills(args.rounds, args.seeds, args.seed)
-    elif args.part == "overhead":
+    else:
         head = ["plain", "ray", "more", "of which the start, and an epoch each", "tables"]
         rows = overhead(args.seconds)
-    else:
-        head = ["trials", "wall time a trial", "the driver's CPU time", "its memory"]
-        rows = many(args.trials)
     print_table(head, rows)
     print(
         f"load of the machine: {load:.1f} before, {os.getloadavg()[0]:.1f} after; {os.cpu_count()} cores; ray {ray.__version__}"

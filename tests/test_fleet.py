@@ -1,199 +1,315 @@
-"""A fleet without Ray: how large tasks are, what is refused, own code, the screen."""
+"""A sweep on a cluster without Ray: options, chunks, runs as bytes, and the driver on a cluster that is this process."""
 
 import dataclasses
-import json
 import re
+import shutil
+import threading
+import zipfile
 from pathlib import Path
 
 import pytest
-from sweep_helpers import CONFIG, make_grid
+from rich.console import Console
+from sweep_helpers import CONFIG, compile_once, make_grid, run, table  # noqa: F401
 
-import mjx_dher
 from mjx_dher import Options, cli, lookup
 from mjx_dher.cli import fleet
-from mjx_dher.cli.fleet_options import FleetArgs, request_of
-from mjx_dher.cli.fleet_screen import FleetScreen
-from mjx_dher.fleet import chunks, driver, own_code, plan
-from mjx_dher.fleet.chunks import Told
-from mjx_dher.fleet.plan import Kind, Node, Request
+from mjx_dher.fleet import chunks, driver, worker
+from mjx_dher.fleet.chunks import Task
+from mjx_dher.fleet.cluster import LostError, Running
+from mjx_dher.fleet.options import FleetOptions
+from mjx_dher.runs.folder import results
 from mjx_dher.spec import RunSpec
-from mjx_dher.sweeps import grid
+from mjx_dher.sweeps import grid, tables
+from mjx_dher.system.files import FolderError
+from probes import PointMass, held
 
-GPU, CPU = Kind("gpu", 1, 1), Kind("cpu", 0, 2)
-
-
-@pytest.mark.parametrize(
-    ("runs", "speeds", "most", "size"),
-    [
-        (40, [1.0] * 4, None, 10),  # each slot one task
-        (40, [1.0] * 4, 8, 5),  # memory holds 8: two rounds of 5, not of 8 and 2
-        (80, [2.0] * 4 + [1.0] * 4, None, 7),  # a slow slot takes 80 / 12 in the time in which a fast one takes two of them
-        (3, [1.0] * 8, None, 1),
-        (1, [1.0], 8, 1),
-        (10, [1.0] * 3, None, 4),
-        (10_000, [1.0] * 4, 8, 8),
-    ],
-)
-def test_all_slots_have_work_until_the_end(runs, speeds, most, size):
-    assert plan.chunk_size(runs, speeds, most) == size
-
-
-def test_a_task_is_as_large_as_memory_allows():
-    nodes = [node(gpu_bytes=80 << 30), node(gpu_bytes=24 << 30)]
-    assert plan.lanes_that_fit(nodes, 1 << 30) == 12  # half of 24
-    assert plan.lanes_that_fit(nodes, 100 << 30) == 1
-    assert plan.lanes_that_fit([node()], 1 << 30) is None
-    assert plan.most_of(GPU, Request("auto"), None, 12) == 12
-    assert plan.most_of(GPU, Request("auto"), 5, 12) == 5
-    assert plan.most_of(GPU, Request("auto"), None, None) is None
-    assert plan.most_of(CPU, Request("auto"), None, None) == plan.TURNS
-    assert plan.most_of(CPU, Request("auto"), 2, None) == 2 * plan.TURNS
-
-
-def test_a_task_on_a_gpu_has_as_many_lanes_as_rings_fit(tmp_path):
-    """Of a sweep that is trained with warp, on a machine that has no GPU; 30 runs on two GPUs, and memory for 6 rings."""
-    push = mjx_dher.preset("gpu", "push", engine="warp")
-    trials = grid.trials([push], range(30))
-    ring = fleet._ring_bytes(push)
-    assert ring > 4 * push.config.replay_size * 25  # observations of 25 float32 alone
-    order = fleet.Order(Request("auto"), tmp_path, "warp", None, Options(), list, list)
-    size = fleet._Sizes(order, [GPU], [node(gpu_bytes=2 * 6 * ring)], trials)
-    assert size(GPU, trials[0]) == 5  # 15 for each, in three rounds
-    limited = fleet._Sizes(dataclasses.replace(order, lanes=4), [GPU], [node()], trials)
-    assert limited(GPU, trials[0]) == 4
-
-
-def node(host="a", **changes):
-    fields = {"versions": {"mjx_dher": "1", "files": "f", "jax": "1"}, "sources": {}, "hardware": "h", "gpu_bytes": None}
-    return Node(host, host, **{**fields, "storage": None, "resources": {"CPU": 4.0, "GPU": 2.0}, **changes})
-
-
-def test_what_tasks_take_is_what_nodes_have():
-    mixed = [{"CPU": 8.0, "GPU": 2.0}, {"CPU": 4.0}, {"CPU": 0.0}]
-    kinds = lambda engine="auto", nodes=mixed, **wishes: plan.kinds_of(Request("auto", **wishes), nodes, engine)  # noqa: E731
-    assert kinds() == [Kind("gpu", 1, 1)]
-    assert kinds(on="cpu") == [Kind("cpu", 0, 4)]
-    assert kinds(cpus=2) == [Kind("cpu", 0, 2)]
-    assert kinds(on="both", cpus=2, engine="native") == [Kind("gpu", 1, 1), Kind("cpu", 0, 2)]
-    assert kinds(nodes=mixed[1:]) == [Kind("cpu", 0, 4)]
-    assert [[kind.slots(own) for own in mixed] for kind in (GPU, CPU)] == [[2, 0, 0], [4, 2, 0]]
-    with pytest.raises(ValueError, match=r"ray_on both: .*name one, --engine native or jax"):
-        kinds(on="both")
-    with pytest.raises(ValueError, match="no node of the cluster has a GPU for a task; its nodes have 4 CPUs, 0 GPUs"):
-        kinds(on="gpu", nodes=mixed[1:2])
-    with pytest.raises(ValueError, match=r"no node of the cluster has 9 CPUs \(ray_cpus\)"):
-        kinds(on="cpu", cpus=9)
-    with pytest.raises(ValueError, match="its nodes have nothing"):
-        kinds(nodes=[])
-
-
-def test_slower_nodes_count_for_less():
-    assert plan.speeds([node(speed=2.0), node(speed=1.0, resources={"CPU": 2.0})], CPU) == [2.0, 2.0, 1.0]
-    assert plan.describe([node()], [GPU, CPU]) == "1 node: 2 tasks at once with a GPU each, 2 tasks at once with 2 CPUs each"
-
-
-def test_nodes_that_cannot_take_part_are_named():
-    own = {"mjx_dher": "1", "files": "f", "jax": "1"}
-    assert plan.problems([node(), node("b")], own, {}) == []
-    told = plan.problems(
-        [
-            node("b", versions={**own, "mjx_dher": "2", "files": "g"}),
-            node("c", versions={**own, "files": "g"}),
-            node("d", storage="/x cannot be written to"),
-            node("e", sources={"env m:E": "m.py 2"}),
-            node("f"),
-        ],
-        own,
-        {"env m:E": "m.py 1"},
-    )
-    assert [line for line in told if "where this machine" not in line] == [
-        "ray: node b has mjx-dher 2, and this machine 1: install the same version on every node",
-        "ray: node c has files of mjx-dher with the digest g, and this machine f: install the same version on every node",
-        "storage: node d: /x cannot be written to",
-    ]
-    assert "env m:E: node e has m.py 2 where this machine has m.py 1" in told
-    assert "env m:E: node f has no such module where this machine has m.py 1" in told
-    assert plan.other_libraries([node(), node("b", versions={**own, "jax": "2"})], own) == [
-        "jax is 1 here and 2 on other nodes"
-    ]
-
+OPTIONS = Options(final_episodes=15, checkpoint_every=1)
+LONG = dataclasses.replace(CONFIG, total_steps=4 * CONFIG.total_steps)  # four epochs
+GPU, CPU = Task(1, 1), Task(0, 2)
 
 WRONG = [
-    (["--ray", ""], "ray must be local .*, auto .*, or HOST:PORT"),
-    (["--ray", "nonsense"], "ray must be local .*; got 'nonsense'"),
-    (["--ray", "ray://head:10001"], "ray must be local .*; got 'ray://head:10001'"),
-    (["--ray", "head:0"], "ray must be local .*; got 'head:0'"),
-    (["--ray", "head:99999999999999999999"], "ray must be local"),
+    (["--ray", ""], "ray must be"),
+    (["--ray", "ray://head:10001"], "ray must be .*; got 'ray://head:10001'"),
+    (["--ray", "head:0"], "ray must be"),
     (["--ray", "local", "--ray-cpus", "0"], r"ray_cpus must lie in \[1, .*; got 0"),
-    (["--ray", "local", "--ray-chunk", "-1"], r"ray_chunk must lie in \[1, .*; got -1"),
     (["--ray", "local", "--ray-chunk", "100000000000000000000"], "ray_chunk must lie in"),
-    (["--ray", "local", "--ray-on", "gpu", "--ray-cpus", "2"], "ray_cpus is for tasks on CPUs"),
-    (["--ray", "local", "--dry-run"], "dry_run does not go with --ray"),
-    (["--ray", "local", "--storage", ""], "storage must be a folder, or begin with gs://"),
-    (["--ray", "local", "--storage", "ftp://host/x"], "storage must be a folder, or begin with gs://"),
-    (["--ray", "local", "--storage", "gs://"], "storage must name a bucket"),
-    (["--ray", "local", "--storage", __file__], "storage: .*test_fleet.py is there already and is no folder"),
-    (["--ray", "127.0.0.1:1"], "ray: nobody answers at 127.0.0.1:1 .*ray start --head"),
-    (["--ray-cpus", "2"], "ray_cpus is for --ray local, auto or HOST:PORT, which is not given; got 2"),
-    (["--storage", "/tmp/x"], "storage is for --ray"),
-    (["--ray-on", "cpu"], "ray_on is for --ray"),
+    (["--ray", "local", "--dry-run"], "dry_run"),
+    (["--ray", "local", "--devices", "2"], "devices"),
+    (["--ray", "local", "--storage", "gs://bucket"], "storage must be a folder"),
+    (["--ray", "local", "--storage", __file__], "storage must be a folder"),
+    (["--ray", "127.0.0.1:1"], "ray: no cluster answers at 127.0.0.1:1 .*ray start --head"),
+    (["--ray-cpus", "2"], "ray_cpus needs --ray"),
+    (["--storage", "/tmp/x"], "storage needs --ray"),
 ]
 
 
 @pytest.mark.parametrize(("arguments", "said"), WRONG)
-def test_wishes_that_cannot_be_met_are_refused_at_once(tmp_path, arguments, said, capsys):
+def test_options_that_cannot_be_used_are_rejected_before_anything_is_written(tmp_path, arguments, said, capsys):
     assert cli.main(["sweep", "--out", str(tmp_path / "new"), *arguments]) == 2
     assert not (tmp_path / "new").exists()
     assert re.search(said, capsys.readouterr().err)
 
 
-def test_without_the_extra_the_refusal_names_it(monkeypatch):
+def test_without_the_extra_the_error_names_it(monkeypatch):
     find = lookup.importlib.util.find_spec
     monkeypatch.setattr(lookup.importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
-    with pytest.raises(ValueError, match=r'--ray needs ray, which the extra "ray" installs: pip install -e ".\[ray\]"'):
-        request_of(FleetArgs(ray="local"))
+    with pytest.raises(ValueError, match=r'pip install -e ".\[ray\]"'):
+        FleetOptions(ray="local").check()
 
 
-def test_checkpoints_of_one_machine_are_kept_beside_its_sweep():
-    assert plan.storage_of(Request("local"), Path("/s")) == "/s/unfinished"
-    assert plan.storage_of(Request("auto"), Path("/s")) is None
-    assert plan.storage_of(Request("auto", storage="gs://b/x"), Path("/s")) == "gs://b/x"
-    assert plan.storage_of(Request("auto", storage="/a/../b"), Path("/s")) == "/b"
+def test_a_task_takes_what_nodes_have():
+    mixed = [{"CPU": 8.0, "GPU": 2.0}, {"CPU": 4.0}, {"CPU": 0.0}]
+    assert chunks.task_of(None, mixed) == Task(1, 1)
+    assert chunks.task_of(2, mixed) == Task(0, 2)
+    assert chunks.task_of(None, mixed[1:]) == Task(0, 4)
+    assert [[task.slots(own) for own in mixed] for task in (GPU, CPU)] == [[2, 0, 0], [4, 2, 0]]
+    for cpus, nodes in ((9, mixed), (None, [])):
+        with pytest.raises(ValueError, match=f"no node has 0 GPUs and {cpus or 1} CPUs for a task"):
+            chunks.task_of(cpus, nodes)
 
 
-def test_own_code_lies_in_one_folder(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("runs", "task", "slots", "lanes", "size", "sizes"),
+    [
+        (40, GPU, 4, None, None, [10] * 4),  # each slot one task
+        (40, GPU, 4, 8, None, [5] * 8),  # two rounds of 5, not of 8 and 2
+        (10, GPU, 3, None, None, [4, 4, 2]),
+        (3, GPU, 8, None, None, [1] * 3),
+        (40, CPU, 1, None, None, [8] * 5),
+        (40, CPU, 1, 2, None, [14, 14, 12]),  # at most 16
+        (6, CPU, 1, None, 4, [4, 2]),
+    ],
+)
+def test_chunks_keep_all_slots_busy_until_the_end(runs, task, slots, lanes, size, sizes):
+    trials = make_grid(("future",), range(runs))
+    found = chunks.split(trials, task, slots, lanes, size)
+    assert [len(chunk) for chunk in found] == sizes
+    assert [one for chunk in found for one in chunk] == trials
+
+
+def test_runs_of_a_chunk_share_a_program():
+    trials = [*make_grid(("future",), (0, 1)), *make_grid(("future",), (0, 1), static=LONG)]
+    assert chunks.split(trials, CPU, 1, None, 3) == [tuple(trials[:2]), tuple(trials[2:])]
+
+
+def test_custom_code_lies_in_one_folder(tmp_path, monkeypatch):
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         (tmp_path / name / f"fleet_{name}.py").write_text("")
         monkeypatch.syspath_prepend(tmp_path / name)
     specs = [RunSpec(env="fleet_one:E"), RunSpec(env="fleet_one:E", seed=1), RunSpec()]
-    assert own_code.folder_of(specs) == tmp_path / "one"
-    assert own_code.folder_of([RunSpec(), RunSpec(sampler="numpy:add")]) is None  # installed
-    assert len(own_code.with_own_parts(specs)) == 1
-    with pytest.raises(ValueError, match=r"must lie in one folder.*env fleet_one:E in .*one; sampler fleet_two:s in .*two"):
-        own_code.folder_of([*specs, RunSpec(sampler="fleet_two:s")])
+    assert chunks.custom_code(specs) == tmp_path / "one"
+    assert chunks.custom_code([RunSpec(), RunSpec(sampler="numpy:add")]) is None  # installed
+    with pytest.raises(ValueError, match=r"one folder.*env fleet_one:E in .*one; sampler fleet_two:s in .*two"):
+        chunks.custom_code([*specs, RunSpec(sampler="fleet_two:s")])
 
 
 def test_the_screen_shows_all_nodes(capsys):
-    from rich.console import Console
-
-    trials = make_grid(("future",), (0, 1, 2, 3))
-    screen = FleetScreen(Console(width=200), trials)
-    one = Told("c", "node1", "push", 2, 1, 2, CONFIG.total_steps * 1.0, 500.0, {"future": 0.25}, ())
+    screen = fleet._Screen(Console(width=200), make_grid(("future",), (0, 1, 2, 3)))
+    one = worker.News("c", "node1", CONFIG.total_steps * 1.0, 500.0, {"future": 0.25}, ())
     other = one._replace(chunk="d", host="node2", success={"future": 0.75})
     screen._printed -= 100
-    screen.show(driver.State(1, 0, frozenset("cd"), 2, [one, other]))
+    screen.show(driver.State(1, frozenset("cd"), 2, [one, other]))
     line = capsys.readouterr().out
-    assert "75%  1 of 4 runs have ended; 2 of 2 tasks train on 2 hosts  1,000 steps/s  future 0.50  ETA not known yet" in line
-    screen.show(driver.State(4, 0, frozenset(), 2, []))
+    assert "75%  1 of 4 runs have ended; 2 of 2 tasks train on 2 hosts  1,000 steps/s  future 0.50  ETA" in line
+    screen.show(driver.State(4, frozenset(), 2, []))
     assert "100%  4 of 4 runs have ended" in capsys.readouterr().out
-    table = screen._table("title")
-    assert [*table.columns[0].cells] == ["node1", "node2"]
-    screen.close()
 
 
-def test_the_package_is_known_by_its_files():
-    versions = chunks.versions()
-    assert versions["mjx_dher"] == chunks.__version__
-    assert re.fullmatch("[0-9a-f]{10}", versions["files"])
-    assert json.dumps(versions)
+def test_checkpoints_of_one_machine_lie_in_its_sweep(tmp_path):
+    order = fleet.Order(FleetOptions(ray="local"), tmp_path, "auto", None, OPTIONS, list, list)
+    assert order.storage.parent == tmp_path / "unfinished"
+    assert dataclasses.replace(order, fleet=FleetOptions(ray="auto")).storage is None
+    own = dataclasses.replace(order, fleet=FleetOptions(ray="auto", storage=Path("/shared")))
+    assert own.storage.parent == Path("/shared")
+    assert dataclasses.replace(own, out=tmp_path / "other").storage != own.storage
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run that has ended, without Ray."""
+    folder, (trial,) = tmp_path_factory.mktemp("trained"), make_grid(("future",), (0,))
+    run(folder, [trial])
+    return trial, worker.pack(grid.folder_of(folder, trial))
+
+
+def test_a_run_comes_back_whole_and_once(trained, tmp_path):
+    trial, parcel = trained
+    target = grid.folder_of(tmp_path, trial)
+    (target / "checkpoints" / "epoch-000001").mkdir(parents=True)  # of a run without Ray
+    (target / "metrics.csv").write_text("cut")
+    worker.unpack(target, parcel)
+    assert results.is_whole(target)
+    assert not (target / "checkpoints").exists()
+    assert worker.pack(target) == parcel
+    written = (target / "result.json").stat().st_mtime_ns
+    worker.unpack(target, parcel)
+    assert (target / "result.json").stat().st_mtime_ns == written
+    assert len(tables.read(tmp_path)) == 1
+
+
+def test_a_damaged_run_is_rejected_and_nothing_is_lost(trained, tmp_path):
+    _, parcel = trained
+    kept = tmp_path / "a" / "checkpoints" / "epoch-000001"
+    kept.mkdir(parents=True)
+    for damaged in (b"", b"nonsense", parcel[:-40], parcel[:200] + b"\0" * 50 + parcel[250:]):
+        with pytest.raises(FolderError, match="is damaged"):
+            worker.unpack(tmp_path / "a", damaged)
+        assert kept.exists()
+        assert not (tmp_path / "a" / "result.json").exists()
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("../outside", "x")
+        archive.writestr("result.json", "{}")
+    with pytest.raises(FolderError, match="is damaged"):
+        worker.unpack(tmp_path / "b" / "c", (tmp_path / "other.zip").read_bytes())
+    assert not (tmp_path / "b" / "outside").exists()
+
+
+def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):
+    trials = make_grid(("future", "weighted"), (0, 1, 2))
+    for chunk in (trials[2:4], trials[4:]):
+        chunks.make(tuple(chunk), OPTIONS, None, CPU, tmp_path, {})
+    assert set(chunks.unfinished(tmp_path, trials, trials)) == {tuple(trials[2:4]), tuple(trials[4:])}
+    assert chunks.unfinished(tmp_path, trials, trials[:4]) == [tuple(trials[2:4])]
+    assert chunks.unfinished(tmp_path, trials, trials[3:4]) == [tuple(trials[2:4])]  # one has ended: both, as they were
+    assert chunks.unfinished(tmp_path, trials[:2], trials[:2]) == []  # of another sweep
+    for path in tmp_path.glob("*/chunk.json"):
+        path.write_text("{")
+    assert chunks.unfinished(tmp_path, trials, trials) == chunks.unfinished(None, trials, trials) == []
+
+
+def chunk_of(trials, storage=None, lanes=1):
+    return chunks.make(tuple(trials), OPTIONS, lanes, CPU, storage, chunks.code_of(trials))
+
+
+def make_point_mass(run):
+    return PointMass()
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_chunk_resumes_where_it_was_on_another_node(tmp_path, killed, monkeypatch):
+    """Its runs end as if nothing had happened; two side by side, in the second of four epochs."""
+    monkeypatch.setattr(worker, "SECONDS_BETWEEN_NEWS", -1.0)
+    trials = make_grid(("future",), (0, 1), static=LONG)
+    run(tmp_path / "plain", trials, lanes=2)
+
+    def stops(news):
+        if killed and news.steps == 2 * 2 * CONFIG.total_steps:
+            raise KeyboardInterrupt
+        return news.steps == 2 * 2 * CONFIG.total_steps
+
+    chunk, told = chunk_of(trials, tmp_path / "storage", lanes=2), []
+    if killed:
+        with pytest.raises(KeyboardInterrupt):
+            worker.train(chunk, make_point_mass, stops)
+    else:
+        assert worker.train(chunk, make_point_mass, stops) == [b"", b""]
+    parcels = worker.train(chunk, make_point_mass, lambda news: told.append(news) or False)
+    assert [news.steps / CONFIG.total_steps / 2 for news in told] == ([2, 3, 4] if killed else [3, 4])
+    assert any("going on from" in line for line in told[0].lines)
+    for trial, parcel in zip(trials, parcels):
+        worker.unpack(grid.folder_of(tmp_path / "fleet", trial), parcel)
+    for name in (tables.RESULTS, tables.FINALS):
+        assert table(tmp_path / "fleet", name) == table(tmp_path / "plain", name)
+
+
+def test_a_node_with_other_code_or_another_storage_is_rejected(tmp_path):
+    chunk = chunk_of(make_grid(("future",), (0,)), tmp_path)
+    other = chunk._replace(code={**chunk.code, "version of mjx_dher": "0"})
+    with pytest.raises(ValueError, match=r"version of mjx_dher is .*, not 0"):
+        worker.train(other, make_point_mass, lambda news: False)
+    shutil.rmtree(chunk.storage)
+    with pytest.raises(ValueError, match="storage must be one folder for all nodes"):
+        worker.train(chunk, make_point_mass, lambda news: False)
+
+
+class Here:
+    """A cluster that is this process: chunks are trained when they are waited for, unless they are lost."""
+
+    def __init__(self, slots=2, lost=()):
+        self.slots, self.lost = slots, set(lost)
+        self.most, self.taken, self.cancelled, self.news = 0, [], [], []
+
+    def resources(self):
+        return [{"CPU": 2.0 * self.slots}]
+
+    def submit(self, chunk, task, work):
+        self.taken.append(chunk)
+        return Running(chunk, work)
+
+    def wait(self, running, seconds):
+        self.most = max(self.most, len(running))
+        return running[:1]
+
+    def result(self, running):
+        if running.chunk in self.cancelled:
+            return []
+        if self.taken.index(running.chunk) in self.lost:
+            raise LostError("the node died")
+        return running.ref(running.chunk, lambda news: self.news.append(news) or False)
+
+    def cancel(self, running):
+        self.cancelled.append(running.chunk)
+
+    def look(self, stop):
+        news, self.news = self.news, []
+        return news
+
+
+def drive(here, folder, trials, stop=lambda: False, size=2, work=None):
+    """What `driver.run` returns, and the states that it shows."""
+    states, storage = [], folder / "storage"
+    before = chunks.unfinished(storage, trials, trials)
+    left = [trial for trial in trials if not any(trial in chunk for chunk in before)]
+    parts = [*before, *chunks.split(left, CPU, here.slots, 1, size)]
+    work = work or (lambda chunk, tell: worker.train(chunk, make_point_mass, tell))
+    own = (OPTIONS, 1, CPU, storage, chunks.code_of(trials), work, lambda text: None, states.append, stop)
+    return driver.run(here, driver.Job(folder, parts, *own)), states
+
+
+def test_every_run_is_there_in_the_end_and_none_twice(tmp_path):
+    trials = make_grid(("future",), range(6))
+    run(tmp_path / "plain", trials)
+    here = Here()
+    lost, states = drive(here, tmp_path / "fleet", trials)
+    assert lost == []
+    assert [chunk.specs for chunk in here.taken] == [tuple(trials[i : i + 2]) for i in (0, 2, 4)]
+    assert states[-1].ended == 6
+    for name in (tables.RESULTS, tables.FINALS):
+        assert table(tmp_path / "fleet", name) == table(tmp_path / "plain", name)
+    assert not any((tmp_path / "fleet" / "storage").iterdir())
+
+
+def test_a_stop_takes_back_what_has_not_begun_and_a_lost_chunk_is_reported(tmp_path):
+    trials = make_grid(("future",), range(12))
+    here = Here(slots=1)
+    assert drive(here, tmp_path, trials, lambda: True)[0] == []
+    assert here.most == 3  # a slot and two that wait
+    assert len(list(tmp_path.glob("cells/*/result.json"))) == 2  # of the chunk that was running
+    left = [trial for trial in trials if not grid.is_done(tmp_path, trial)]
+    assert left == trials[2:]
+    here = Here(slots=1, lost={1})
+    assert drive(here, tmp_path, left)[0] == ["the node died"]
+    assert {chunk.specs for chunk in here.taken[:2]} == {tuple(trials[2:4]), tuple(trials[4:6])}  # taken back: first now
+    assert [trial for trial in trials if not grid.is_done(tmp_path, trial)] == list(here.taken[1].specs)
+
+
+def test_an_error_of_the_training_is_raised_and_a_run_of_another_program_is_left_to_it(trained, tmp_path):
+    trial, parcel = trained
+
+    def fails(chunk, tell):
+        raise ValueError("raised by the training")
+
+    with pytest.raises(ValueError, match="raised by the training"):
+        drive(Here(), tmp_path / "a", [trial], work=fails)
+    target = grid.folder_of(tmp_path / "b", trial)
+    target.mkdir(parents=True)
+    ended = []
+    with held(target):
+        thread = threading.Thread(
+            target=lambda: ended.extend(drive(Here(), tmp_path / "b", [trial], work=lambda chunk, tell: [parcel])[1])
+        )
+        thread.start()
+        thread.join()
+    assert ended[-1].ended == 0
+    assert not (target / "result.json").exists()

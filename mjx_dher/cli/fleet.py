@@ -1,23 +1,23 @@
-"""A sweep over the machines of a Ray cluster: `sweep --ray`."""
+"""A sweep on a Ray cluster: `sweep --ray`."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from mjx_dher import spec
-from mjx_dher.cli.common import make_env, settle_compiler, try_parts
-from mjx_dher.cli.fleet_screen import FleetScreen
-from mjx_dher.fleet import chunks, cluster, driver, own_code, parcels, plan
-from mjx_dher.fleet.chunks import Chunk, Tell
-from mjx_dher.fleet.ledger import Ledger
-from mjx_dher.fleet.plan import Kind, Node, Request
+from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_parts
+from mjx_dher.fleet import chunks, cluster, driver, worker
+from mjx_dher.fleet.chunks import Chunk
+from mjx_dher.fleet.options import LOCAL, FleetOptions
+from mjx_dher.fleet.worker import News, Tell
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.locks import Claims
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.signals import Stop
@@ -29,22 +29,30 @@ from mjx_dher.system.caches import prepare
 
 @dataclasses.dataclass(frozen=True)
 class Order:
-    """A sweep that a fleet is to train."""
+    """A sweep to train on a cluster."""
 
-    request: Request
+    fleet: FleetOptions
     out: Path
     engine: str
     lanes: int | None
     options: Options
-    make_trials: Callable[[str], list[RunSpec]]  # for a preset, cpu or gpu, where the user names none
-    announce: Callable[[list[RunSpec]], list[RunSpec]]  # says what there is to do, and returns the trials that have not ended
+    make_trials: Callable[[str], list[RunSpec]]  # for a preset, cpu or gpu, if the user names none
+    announce: Callable[[list[RunSpec]], list[RunSpec]]  # prints the work that is left, and returns its trials
+
+    @property
+    def storage(self) -> Path | None:
+        """Folder for checkpoints: the user's, or one in the sweep's folder if all tasks run on this machine."""
+        if self.fleet.storage is None and self.fleet.ray != LOCAL:
+            return None
+        root = self.fleet.storage or self.out / "unfinished"
+        return (root / f"fleet-{fingerprint.sha256_of(str(self.out.absolute()))[:10]}").absolute()
 
 
 def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
     """Trains a chunk in a worker of Ray's."""
     settle_compiler(chunk.specs[0].engine)
     prepare()
-    return chunks.train(chunk, make_env, tell)
+    return worker.train(chunk, make_env, tell)
 
 
 def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec], int | None]:
@@ -54,159 +62,101 @@ def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec],
       All trials, those that had not ended before, and the signal that asked for a stop, or None.
 
     Raises:
-      ValueError: the cluster cannot be used as asked for, or a run cannot be trained.
+      ValueError: the cluster cannot be used, or a run cannot be trained.
     """
-    _stay_on_cpu()
-    code = own_code.folder_of(order.make_trials("cpu"))
-    with cluster.joined(order.request, code) as tasks:
-        resources = tasks.resources()
-        kinds = plan.kinds_of(order.request, list(resources.values()), order.engine)
-        specs = order.make_trials("gpu" if kinds[0].gpus else "cpu")
-        _try_own(specs, order.engine, console)  # JAX starts here: Ray's processes are forked before
+    import jax
+
+    jax.config.update("jax_platforms", "cpu")  # the GPUs are for the tasks
+    code = chunks.custom_code(order.make_trials("cpu"))
+    with cluster.joined(str(order.fleet.ray), code) as ray:
+        task = chunks.task_of(order.fleet.ray_cpus, ray.resources())
+        trials = order.make_trials("gpu" if task.gpus else "cpu")
+        _try_own(trials, order.engine, console)  # JAX starts here: Ray's processes are forked before
         report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
-        todo = order.announce(specs)
-        claims = Claims(True, report)
-        free = [run for run in todo if claims.is_free(run, grid.folder_of(order.out, run))]
-        signum = _train(order, tasks, kinds, free, report, console) if free else None
-    return specs, todo, signum
+        if order.storage is not None:
+            try:
+                files.make_folder(order.storage)
+            except OSError as error:
+                raise ValueError(f"storage: {order.storage} cannot be written to ({error.strerror})") from error
+        files.make_folder(order.out / grid.CELLS)
+        with files.lock(order.out):
+            todo = order.announce(trials)
+            claims = Claims(True, report)
+            free = [run for run in todo if claims.is_free(run, grid.folder_of(order.out, run))]
+            signum = _train(order, ray, task, trials, free, report, console) if free else None
+    return trials, todo, signum
 
 
 def _train(
     order: Order,
-    tasks: cluster.Cluster,
-    kinds: Sequence[Kind],
+    ray: cluster.Cluster,
+    task: chunks.Task,
+    trials: Sequence[RunSpec],
     todo: Sequence[RunSpec],
     report: Callable[[str], None],
     console: Console,
 ) -> int | None:
     """Trains runs that no other program has; returns the signal that asked for a stop, or None."""
-    ledger = Ledger(order.out, [run for together in grid.by_program(todo) for run in together])
-    storage = plan.storage_of(order.request, order.out)
-    nodes = _looked_at(tasks, kinds, own_code.with_own_parts(todo), storage, ledger.sweep, report)
-    report(f"ray: {plan.describe(nodes, kinds)}; {len(todo)} runs to train")
-    stop, screen = Stop(console, order.out), FleetScreen(console, todo)
-    with stop, contextlib.closing(screen):
-        job = driver.Job(
-            order.out,
-            order.options,
-            order.lanes,
-            storage,
-            chunks.files_digest(),
-            kinds,
-            _Sizes(order, kinds, nodes, todo),
-            train_chunk,
-            report,
-            screen.show,
-            lambda: stop.asked is not None,
-        )
-        lost = driver.run(tasks, job, ledger)
+    nodes = [node for node in ray.resources() if task.slots(node)]
+    slots = sum(map(task.slots, nodes))
+    report(
+        f"ray: nodes {len(nodes)}, tasks at once {slots}, GPUs of a task {task.gpus}, its CPUs {task.cpus}; {len(todo)} runs"
+    )
+    before = chunks.unfinished(order.storage, trials, todo)
+    others = [run for run in todo if not any(run in chunk for chunk in before)]
+    parts = [*before, *chunks.split(others, task, slots, order.lanes, order.fleet.ray_chunk)]
+    stop, screen = Stop(console, order.out), _Screen(console, todo)
+    code = chunks.code_of(todo)
+    with stop:
+        asked = lambda: stop.asked is not None  # noqa: E731
+        own = (order.options, order.lanes, task, order.storage, code, train_chunk)
+        lost = driver.run(ray, driver.Job(order.out, parts, *own, report, screen.show, asked))
     if lost:
-        raise ValueError(
-            f"ray: {len(lost)} tasks were lost {cluster.RETRIES + 1} times each ({'; '.join(lost[:3])}); the same command tries"
-            " their runs again"
-        )
-    if stop.asked is None:
-        ledger.close()
-        if storage is not None and order.request.storage is None:
-            with contextlib.suppress(OSError):  # not empty: runs of the plain command that have not ended
-                Path(storage).rmdir()
+        tries = cluster.RETRIES + 1
+        raise ValueError(f"ray: {len(lost)} tasks were lost {tries} times ({'; '.join(lost[:3])}); run the same command again")
+    if stop.asked is None and order.storage is not None:
+        for path in (order.storage, order.storage.parent) if order.fleet.storage is None else (order.storage,):
+            with contextlib.suppress(OSError):  # not empty
+                path.rmdir()
     return stop.asked
 
 
-@contextlib.contextmanager
-def claimed(out: Path) -> Iterator[None]:
-    """Makes a sweep's folder and locks it against a second driver; removes what is empty again where nothing was trained.
-
-    Raises:
-      BusyError: another driver has it.
-      FolderError: it cannot be written to.
-    """
-    missing = [path for path in (out / grid.CELLS, out, *out.parents) if not path.exists()]
-    try:
-        files.make_folder(out / grid.CELLS)
-        with files.lock(out):
-            yield
-    finally:
-        kept = {path.name for path in (*out.glob("*"), *(out / grid.CELLS).glob("*"))} - {files.LOCK, grid.CELLS}
-        if missing and not kept:
-            (out / files.LOCK).unlink(missing_ok=True)
-            for path in missing:
-                with contextlib.suppress(OSError):  # something is in it
-                    path.rmdir()
-
-
-def _stay_on_cpu() -> None:
-    """Keeps JAX of this process off the GPUs, which the tasks are to have."""
-    import jax
-
-    jax.config.update("jax_platforms", "cpu")
-
-
 def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
-    """Tries out parts of the user's own on this machine, before a cluster is asked for anything."""
+    """Tries out custom components on this machine."""
     for _, group in itertools.groupby(specs, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.custom_components, own)):
             settle_compiler(engine)
-            try_parts(_env_here(own[0]), own, console)
+            try_parts(make_env(own[0], "native" if own[0].engine == "warp" else None), own, console)
 
 
-def _env_here(run: RunSpec) -> Any:
-    """Makes an environment on this machine, whose sizes are those of any engine."""
-    return make_env(run, "native" if run.engine == "warp" else None)
+class _Screen:
+    """Progress of all nodes, a line now and then."""
 
+    def __init__(self, console: Console, specs: Sequence[RunSpec]):
+        self._console, self._runs = console, len(specs)
+        self._steps = sum(run.config.total_steps for run in specs) / max(1, len(specs))  # mean of a run
+        self._news: dict[str, News] = {}  # by chunk
+        self._started = self._printed = time.monotonic()
 
-def _looked_at(
-    tasks: cluster.Cluster,
-    kinds: Sequence[Kind],
-    specs: Sequence[RunSpec],
-    storage: str | None,
-    sweep: str,
-    report: Callable[[str], None],
-) -> list[Node]:
-    """Returns the nodes that take tasks, with their speeds where they are not alike.
+    def show(self, state: driver.State) -> None:
+        """Prints a line if it is time for one."""
+        self._news = {name: one for name, one in self._news.items() if name in state.running}
+        self._news |= {one.chunk: one for one in state.news if one.chunk in state.running}
+        now = time.monotonic()
+        if now - self._printed > SECONDS_PER_LINE or state.ended == self._runs:
+            self._console.print(self._line(state, now), soft_wrap=True, highlight=False)
+            self._printed = now
 
-    Raises:
-      ValueError: one of them cannot take part, or the storage cannot be used.
-    """
-    here = chunks.inspect("", {}, specs, None, sweep, "")
-    taking = [node for node, own in tasks.resources().items() if any(kind.slots(own) for kind in kinds)]
-    with parcels.shown(storage, sweep) if storage is not None else contextlib.nullcontext("") as token:
-        nodes = tasks.inspect(taking, specs, storage, sweep, token)
-    if wrong := plan.problems(nodes, here.versions, here.sources):
-        raise ValueError("\n".join(wrong[:5]))
-    for line in plan.other_libraries(nodes, here.versions):
-        report(f"ray: {line}")
-    if len({node.hardware for node in nodes}) == 1:
-        return nodes
-    kind = kinds[0]
-    speeds = [tasks.measure(node, kind) if kind.slots(node.resources) else 0.0 for node in nodes]
-    slowest = min((speed for speed in speeds if speed), default=1.0)
-    return [node._replace(speed=(speed or slowest) / slowest) for node, speed in zip(nodes, speeds)]
-
-
-class _Sizes:
-    """Number of runs of a task, for each kind and program."""
-
-    def __init__(self, order: Order, kinds: Sequence[Kind], nodes: Sequence[Node], todo: Sequence[RunSpec]):
-        self._request, self._lanes, self._nodes = order.request, order.lanes, nodes
-        self._runs: dict[RunSpec, int] = {}
-        for run in todo:
-            self._runs[run.program] = self._runs.get(run.program, 0) + 1
-        self._speeds = {kind: plan.speeds(nodes, kind) for kind in kinds}
-        self._known: dict[tuple[Kind, RunSpec], int] = {}
-
-    def __call__(self, kind: Kind, run: RunSpec) -> int:
-        key = kind, run.program
-        if key not in self._known:
-            fitting = plan.lanes_that_fit(self._nodes, _ring_bytes(run)) if kind.gpus and not self._request.chunk else None
-            most = plan.most_of(kind, self._request, self._lanes, fitting)
-            runs, all_speeds = self._runs[run.program], [x for speeds in self._speeds.values() for x in speeds]
-            self._known[key] = self._request.chunk or plan.chunk_size(runs, all_speeds, most)
-        return self._known[key]
-
-
-def _ring_bytes(run: RunSpec) -> int:
-    from mjx_dher.runs.program import program
-
-    return program.make_loop(_env_here(run), run, program.choices_of([run])).replay_bytes
+    def _line(self, state: driver.State, now: float) -> str:
+        news = self._news.values()
+        done = state.ended * self._steps + sum(one.steps for one in news)
+        share = min(1.0, done / max(1.0, self._runs * self._steps))
+        eta = clock((now - self._started) * (1 - share) / share) if share else "not known yet"
+        rates: dict[str, list[float]] = {}
+        for name, rate in ((name, rate) for one in news for name, rate in one.success.items()):
+            rates.setdefault(name, []).append(rate)
+        success = "".join(f"  {name} {sum(own) / len(own):.2f}" for name, own in rates.items())
+        busy = f"{len(news)} of {state.slots} tasks train on {len({one.host for one in news})} hosts"
+        speed = sum(one.steps_per_second for one in news)
+        return f"{share:.0%}  {state.ended} of {self._runs} runs have ended; {busy}  {speed:,.0f} steps/s{success}  ETA {eta}"

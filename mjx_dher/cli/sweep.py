@@ -14,10 +14,9 @@ from mjx_dher import presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_parts
-from mjx_dher.cli.fleet_options import FleetArgs, request_of
 from mjx_dher.cli.processes import join
 from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
-from mjx_dher.fleet.plan import Request
+from mjx_dher.fleet.options import FleetOptions
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.signals import Stop
@@ -107,7 +106,7 @@ class SweepArgs:
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     devices: Devices = 1
     """Devices to train on, or all: runs side by side are shared out among them; where they are more, several share each run."""
-    fleet: Annotated[FleetArgs, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetArgs)
+    fleet: Annotated[FleetOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetOptions)
     threshold: float = 0.9
     """Success rate for the time that it takes to get there."""
     baseline: str = "future"
@@ -150,7 +149,8 @@ def _check(args: SweepArgs) -> None:
     args.options.check()
     args.options.check_many()
     check_number("threshold", args.threshold, "(0, 1]", float)
-    if request_of(args.fleet) is not None and (args.devices != 1 or args.distributed):
+    args.fleet.check()
+    if args.fleet.ray is not None and (args.devices != 1 or args.distributed):
         raise ValueError("devices and distributed are for one program over several devices; with ray each task has a device")
     if args.fleet.ray is not None and args.dry_run:
         raise ValueError("dry_run does not go with --ray: try the command without --ray")
@@ -186,8 +186,8 @@ def sweep_command(argv: list[str], console: Console) -> int:
     args, trials = parse_sweep_args(argv)
     if args.dry_run:
         return _dry_run(args, trials, console)
-    if (request := request_of(args.fleet)) is not None:
-        return _sweep_fleet(args, request, console)
+    if args.fleet.ray is not None:
+        return _sweep_fleet(args, console)
     settle_compiler(args.engine)
     described = {name: value for name, value in dataclasses.asdict(args).items() if name != "out"}
     screen = join(args.distributed, {**described, "trials": [*map(fingerprint.trial_name, trials)]}, console)
@@ -209,25 +209,17 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     return int(processes.broadcast(lambda: _end(args, trials, todo, signum, console)))
 
 
-def _sweep_fleet(args: SweepArgs, request: Request, console: Console) -> int:
-    """Trains a grid of runs on a cluster, whose machines say which preset it is where the user does not."""
+def _sweep_fleet(args: SweepArgs, console: Console) -> int:
+    """Trains a grid of runs on a cluster, whose machines decide the preset if the user names none."""
     from mjx_dher.cli import fleet
 
     def make_trials(preset: str) -> list[RunSpec]:
         return _trials(args, preset if args.preset == "auto" else args.preset)
 
-    with fleet.claimed(args.out):
-        order = fleet.Order(
-            request,
-            args.out,
-            args.engine,
-            args.lanes,
-            args.options,
-            make_trials,
-            lambda trials: _announce(args, trials, console),
-        )
-        trials, todo, signum = fleet.train(order, console)
-        return _end(args, trials, todo, signum, console)
+    announce = lambda trials: _announce(args, trials, console)  # noqa: E731
+    order = fleet.Order(args.fleet, args.out, args.engine, args.lanes, args.options, make_trials, announce)
+    trials, todo, signum = fleet.train(order, console)
+    return _end(args, trials, todo, signum, console)
 
 
 def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:

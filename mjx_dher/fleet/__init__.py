@@ -1,1 +1,1 @@
-"""Sweeps over many machines, by Ray Core: what a chunk is, how it is trained on a node, how its runs come back."""
+"""Sweeps on a Ray cluster: chunks of runs, the worker that trains them, the cluster and the driver."""

@@ -1,0 +1,46 @@
+"""Options of a sweep on a Ray cluster. Loads neither Ray nor JAX."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from mjx_dher import lookup
+from mjx_dher.config import check_count
+
+LOCAL = "local"
+
+
+@dataclasses.dataclass(frozen=True)
+class FleetOptions:
+    """Options of a sweep on a Ray cluster."""
+
+    ray: str | None = None
+    """Train on a Ray cluster: local (all GPUs or cores of this machine), auto (the cluster that it is part of) or HOST:PORT of
+    the cluster's head (docs/scaling.md). Needs the extra ray."""
+    ray_cpus: int | None = None
+    """Train on CPUs, each task on this many cores; by default tasks take a GPU each, or all cores of a node without GPUs."""
+    ray_chunk: int | None = None
+    """Runs of a task; by default as many as keep the whole cluster busy."""
+    storage: Path | None = None
+    """Folder that all nodes share, for checkpoints: a lost node then costs no more than one interval."""
+
+    def check(self) -> None:
+        """Raises ValueError, naming the option and what is allowed, before Ray is loaded."""
+        if self.ray is None:
+            for name in ("ray_cpus", "ray_chunk", "storage"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} needs --ray local, auto or HOST:PORT; got {getattr(self, name)} without it")
+            return
+        host, _, port = self.ray.rpartition(":")
+        is_address = bool(host) and "://" not in self.ray and port.isdecimal() and 0 < int(port) < 65536
+        if self.ray not in (LOCAL, "auto") and not is_address:
+            raise ValueError(f"ray must be local, auto (this machine's cluster), or HOST:PORT of a head; got {self.ray!r}")
+        for name in ("ray_cpus", "ray_chunk"):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name))
+        if self.storage is not None:
+            is_url = ":" in str(self.storage).partition("/")[0]
+            if is_url or (self.storage.exists() and not self.storage.is_dir()):
+                raise ValueError(f"storage must be a folder; got {str(self.storage)!r}")
+        lookup.require_extra("--ray", "ray", "ray")

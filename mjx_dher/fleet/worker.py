@@ -1,0 +1,174 @@
+"""Trains a chunk on a node, inside Ray's workers, and turns its run folders into bytes and back. Knows nothing of Ray.
+
+A chunk is trained as a small sweep, in its folder of the storage or in a scratch folder of the node.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import socket
+import tempfile
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_dher.fleet import chunks
+from mjx_dher.fleet.chunks import Chunk
+from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.runs.program.loop import Progress
+from mjx_dher.spec import RunSpec
+from mjx_dher.sweeps import grid, sweep
+from mjx_dher.system import files
+from mjx_dher.system.files import FolderError
+from mjx_dher.types import Env
+
+SECONDS_BETWEEN_NEWS = 1.0
+
+
+class News(NamedTuple):
+    """Progress of a chunk."""
+
+    chunk: str
+    host: str
+    steps: float  # environment steps of all its runs so far
+    steps_per_second: float
+    success: dict[str, float]  # mean success rate by sampler
+    lines: tuple[str, ...]  # for the user
+
+
+Tell = Callable[[News], bool]  # returns whether to stop
+
+
+def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[bytes]:
+    """Trains a chunk; resumes it if its folder in the storage has checkpoints.
+
+    Returns:
+      Each run folder as bytes, as `pack` makes them; empty for a run that has not ended, because of a stop.
+
+    Raises:
+      ValueError: as `train_runs`; or this node has other code than the driver, or another storage.
+    """
+    here = chunks.code_of(chunk.specs)
+    wrong = [f"{name} is {here.get(name)}, not {text}" for name, text in chunk.code.items() if here.get(name) != text]
+    if wrong:
+        raise ValueError(f"ray: node {socket.gethostname()} must have the driver's code: {'; '.join(wrong)}")
+    reporter = _Reporter(chunk.id, tell)
+    with contextlib.ExitStack() as stack:
+        place = chunk.storage or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mjx-dher-fleet-")))
+        if chunk.storage is not None and not (place / chunks.NAMES_FILE).exists():
+            raise ValueError(f"storage must be one folder for all nodes; node {socket.gethostname()} does not see {place}")
+        if todo := [spec for spec in chunk.specs if not grid.is_done(place, spec)]:
+            sweep.run(
+                place,
+                todo,
+                make_env,
+                options=chunk.options,
+                lanes=chunk.lanes,
+                should_stop=lambda: reporter.stop,
+                report=reporter.add_line,
+                on_epoch=reporter.on_epoch,
+            )
+        folders = [grid.folder_of(place, spec) for spec in chunk.specs]
+        return [pack(folder) if results.is_whole(folder) else b"" for folder in folders]
+
+
+class _Reporter:
+    """Tells the driver about epochs, at most once a second, and learns whether to stop."""
+
+    def __init__(self, chunk: str, tell: Tell):
+        self.stop = False
+        self._chunk, self._tell, self._lines = chunk, tell, list[str]()
+        self._present: Sequence[RunSpec] = ()
+        self._ended = self._steps = self._told_at = 0.0  # steps of runs that were trained before, and of those that are now
+
+    def add_line(self, text: str) -> None:
+        """Keeps a line for the user, unless it is about compiling, which every chunk does."""
+        if ": compil" not in text:
+            self._lines.append(text)
+
+    def on_epoch(self, specs: Sequence[RunSpec], progress: Progress) -> None:
+        """Tells about an epoch; always about the last one."""
+        if list(specs) != list(self._present):
+            self._present, self._ended = specs, self._ended + self._steps
+        self._steps = len(specs) * progress.env_steps
+        if progress.epoch < progress.num_epochs and time.monotonic() - self._told_at < SECONDS_BETWEEN_NEWS:
+            return
+        rates: dict[str, list[float]] = {}
+        for spec, rate in zip(specs, np.atleast_1d(progress.metrics["success_rate"])):
+            rates.setdefault(spec.sampler, []).append(float(rate))
+        speed = self._steps / progress.epoch / max(progress.epoch_seconds, 1e-9)
+        success = {name: sum(own) / len(own) for name, own in rates.items()}
+        host, lines = socket.gethostname(), tuple(self._lines[:20])
+        self.stop = self._tell(News(self._chunk, host, self._ended + self._steps, speed, success, lines))
+        self._lines.clear()
+        self._told_at = time.monotonic()
+
+
+def pin(cores: int) -> None:
+    """Keeps this process on `cores` of the node's cores that no other task has, as long as it runs.
+
+    Call it before JAX starts its threads, one for each core. Without free cores nothing happens.
+    """
+    usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
+    for first in range(0, len(usable) - cores + 1, cores) if cores < len(usable) else ():
+        group = Path(tempfile.gettempdir()) / f"mjx-dher-cores-{os.getuid()}" / f"{usable[first]}-{cores}"
+        with contextlib.suppress(OSError, ValueError):
+            group.mkdir(parents=True, exist_ok=True)
+            _held.enter_context(files.lock(group))
+            os.sched_setaffinity(0, usable[first : first + cores])
+            return
+
+
+_held = contextlib.ExitStack()  # locks of this process's cores, which the system releases when it ends
+
+
+def pack(folder: Path) -> bytes:
+    """Returns a run folder as bytes: all files except its lock and its checkpoints."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder)
+            if path.is_file() and name.parts[0] not in (files.LOCK, run_folder.CHECKPOINTS):
+                entry = zipfile.ZipInfo(name.as_posix())  # without a time: the same run gives the same bytes
+                archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED, compresslevel=1)
+    return buffer.getvalue()
+
+
+def unpack(folder: Path, parcel: bytes) -> None:
+    """Writes a run that has ended into its folder, result.json last: the run is there whole, or has not ended.
+
+    A run that has ended there already stays as it is.
+
+    Raises:
+      FolderError: another program has the folder, it cannot be written to, or the bytes are not a whole run.
+    """
+    try:
+        files.make_folder(folder)
+        with files.lock(folder), zipfile.ZipFile(io.BytesIO(parcel)) as archive:
+            if results.is_whole(folder):
+                return
+            content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are compared
+            (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
+            for path in folder.iterdir():  # left by a run without Ray, or by a driver that was killed
+                if path.name != files.LOCK:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            archive.extractall(folder, [name for name in content if name != run_folder.RESULT_FILE])
+            files.flush_all(folder)
+            with files.atomic_write(folder / run_folder.RESULT_FILE) as partial:
+                partial.write_bytes(content[run_folder.RESULT_FILE])
+                files.flush(partial)
+            files.flush(folder)
+    except OSError as error:
+        raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); run the same command again") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
+        raise FolderError(f"{folder}: the run that came back is damaged ({error})") from error
+    if (problem := results.result_problem(folder)) is not None:
+        raise FolderError(f"the run that came back is damaged: {problem}")
