@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,7 +28,8 @@ except ImportError as error:
     raise ImportError(f"{missing_extra('mjx_dher.gym', 'gymnasium 1.1 or newer', 'gym')} ({error})") from error
 
 if TYPE_CHECKING:
-    from mjx_dher.envs import GoalEnv, State
+    from mjx_dher.envs import State
+    from mjx_dher.types import EnvSpec
 
 __all__ = ["IDS", "GymEnv", "GymVectorEnv", "episode_seed"]
 
@@ -41,7 +42,7 @@ IDS = {
 HORIZON = 50  # steps; the tasks' default episode_length, which cannot be read without loading JAX
 PICTURE = 480  # width and height of a picture, pixels
 
-Obs = dict[str, np.ndarray]
+Obs = dict[str, Any]
 
 
 def episode_seed(np_random: np.random.Generator) -> int:
@@ -69,19 +70,28 @@ class _GoalApi:
         return rewards[:num_goals].reshape(achieved.shape[:-1])[()]
 
     def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Returns [...] False: an episode continues when its goal is reached. Arguments as in `compute_reward`."""
+        """Whether reaching these goals ends an episode, bool [...]; always False unless the task ends at its goal.
+
+        Arguments as in `compute_reward`. A failure, which ends an episode for any goal, is in the `terminated` of `step`.
+        """
+        if self._compiled.spec.ends_at_goal:
+            from mjx_dher import context
+            from mjx_dher.config import HParams
+
+            goals: Any = self._goals(achieved_goal, desired_goal)
+            return np.asarray(context.of_env(self._compiled.env, HParams()).reached(*goals))[()]
         return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Returns [...] False: truncation depends on the number of steps, not on goals. Arguments as in `compute_reward`."""
-        return self.compute_terminated(achieved_goal, desired_goal, info)
+        """Returns [...] False: truncation does not depend on goals. Arguments as in `compute_reward`."""
+        return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
 
     def _goals(self, achieved_goal: Any, desired_goal: Any) -> tuple[np.ndarray, np.ndarray]:
         try:
             achieved, desired = np.asarray(achieved_goal, np.float32), np.asarray(desired_goal, np.float32)
         except TypeError as error:
             raise ValueError(f"goals must be numbers; got {achieved_goal!r} and {desired_goal!r}") from error
-        size = self._compiled.env.goal_size
+        size = self._compiled.spec.goal_size
         for goals in (achieved, desired):
             if goals.shape[-1:] != (size,):
                 raise ValueError(f"goals must end in an axis of {size}; got shapes {achieved.shape} and {desired.shape}")
@@ -90,12 +100,12 @@ class _GoalApi:
 
 
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
-    """A single environment. It never ends an episode: `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
+    """A single environment. `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
 
     Observations are float32, as the state is. Actions outside [-1, 1] are clipped.
 
     Args:
-      name: one of `envs.list_envs()`.
+      name: one of `envs.list_envs()`, or module:attribute.
       render_mode: None or "rgb_array".
       **options: arguments of `envs.make`: `engine`, `reward_type`, ...
 
@@ -113,7 +123,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         if render_mode is not None:
             render.check_drawable(self._compiled.env)
         self.render_mode = render_mode
-        self.observation_space, self.action_space = _spaces(self._compiled.env)
+        self.observation_space, self.action_space = _spaces(self._compiled.spec)
         self._state: Any = None
         self._qpos: deque[np.ndarray] = deque()  # configurations to be drawn
         self._pictures: Generator[np.ndarray] | None = None  # renderer of this episode
@@ -126,15 +136,16 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         """
         (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
-        self._compiled.env.check()
+        self._compiled.check()
         self.close()
         self._state = self._compiled.reset(episode_seed(self.np_random))
         obs, _, info = _to_numpy(self._state)
         return obs, {key: value.item() for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Returns the next observation, the reward, False, False, and info: `is_success` (1.0 or 0.0) and `failed`.
+        """Returns observation, reward, `terminated`, `truncated`, and info: `is_success` (1.0 or 0.0) and `failed`.
 
+        `terminated` means that no future follows, `truncated` that the task ends the episode for another reason.
         `failed` is True from the step at which the simulation diverged to the end of the episode; do not learn from these.
 
         Raises:
@@ -143,7 +154,8 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         """
         self._state = self._compiled.step(self._state, _checked(action, self.action_space, self._state))
         obs, reward, info = _to_numpy(self._state)
-        return obs, reward.item(), False, False, {key: value.item() for key, value in info.items()}
+        terminated, truncated = (bool(flag) for flag in self._compiled.ended(self._state))
+        return obs, reward.item(), terminated, truncated, {key: value.item() for key, value in info.items()}
 
     def render(self) -> np.ndarray:
         """Draws a picture [480, 480, 3] uint8 of the state, with the goal as a red ball.
@@ -175,11 +187,11 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):
     """A vectorised environment: N copies of one environment, stepped by one compiled program.
 
-    All copies start and end together. The step after an episode's last one resets all of them and ignores its actions
-    (`AutoresetMode.NEXT_STEP`). Copy i does the same as a single environment with seed + i, up to rounding.
+    The step after a copy's last one resets it and ignores its action (`AutoresetMode.NEXT_STEP`). Copy i does the
+    same as a single environment with seed + i, up to rounding.
 
     Args:
-      name: one of `envs.list_envs()`.
+      name: one of `envs.list_envs()`, or module:attribute.
       num_envs: number of copies, N.
       max_episode_steps: length of an episode; None means the environment's `episode_length`.
       render_mode: must be None; vectorised environments are not drawn.
@@ -204,12 +216,13 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         self.num_envs = num_envs
         self.max_episode_steps = env.episode_length if max_episode_steps is None else max_episode_steps
         check_count("max_episode_steps", self.max_episode_steps)
-        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.single_observation_space, self.single_action_space = _spaces(self._compiled.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._np_random, self._np_random_seed = zip(*(seeding.np_random() for _ in range(num_envs)))
         self._states: Any = None
-        self._steps = 0  # number of steps in this episode
+        self._steps = np.zeros(num_envs, int)  # number of steps in each episode
+        self._ended = np.zeros(num_envs, bool)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -236,19 +249,31 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         actions = _checked(actions, self.action_space, self._states)
-        if self._steps == self.max_episode_steps:
+        restarted = self._ended
+        if restarted.all():
             obs, rewards, infos = self._restart()
         else:
             self._states = self._compiled.step_all(self._states, actions)
             self._steps += 1
+            if restarted.any():
+                self._states = self._compiled.restart(self._states, self._seeds(restarted), restarted)
+                self._steps[restarted] = 0
             obs, rewards, infos = self._results()
-        ended = self._steps == self.max_episode_steps
-        return obs, rewards, np.zeros(self.num_envs, bool), np.full(self.num_envs, ended), infos
+        rewards = np.where(restarted, 0.0, rewards)
+        terminated, done = (np.asarray(flag) & ~restarted for flag in self._compiled.ended(self._states))
+        truncated = (done | (self._steps == self.max_episode_steps)) & ~terminated
+        self._ended = terminated | truncated
+        return obs, rewards, terminated, truncated, infos
+
+    def _seeds(self, which: np.ndarray) -> np.ndarray:
+        """Seeds [N] int32, drawn for the copies in the mask `which` [N] only."""
+        drawn = (episode_seed(random) if one else 0 for random, one in zip(self._np_random, which))
+        return np.fromiter(drawn, np.int32, self.num_envs)
 
     def _restart(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
-        self._compiled.env.check()
-        seeds = np.array([episode_seed(random) for random in self._np_random], np.int32)
-        self._states, self._steps = self._compiled.reset_all(seeds), 0
+        self._compiled.check()
+        self._states = self._compiled.reset_all(self._seeds(np.ones(self.num_envs, bool)))
+        self._steps, self._ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         return self._results()
 
     def _results(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
@@ -256,18 +281,36 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, rewards, infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
 
 
-def _spaces(env: GoalEnv) -> tuple[Any, Any]:
-    """Returns the spaces of observations, which have no meaningful bounds, and of actions."""
-    sizes = {"observation": env.observation_size, "achieved_goal": env.goal_size, "desired_goal": env.goal_size}
-    boxes: dict[str, Any] = {key: gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32) for key, size in sizes.items()}
-    return gymnasium.spaces.Dict(boxes), gymnasium.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
+def _spaces(spec: EnvSpec) -> tuple[Any, Any]:
+    """Returns the spaces of observations, of which floats have no meaningful bounds, and of actions."""
+    goal = gymnasium.spaces.Box(-np.inf, np.inf, (spec.goal_size,), np.float32)
+    spaces: dict[str, Any] = {"observation": _space(spec.observation), "achieved_goal": goal, "desired_goal": goal}
+    return gymnasium.spaces.Dict(spaces), gymnasium.spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
+
+
+def _space(observation: Any) -> Any:
+    """The space of an observation: a Box for an array, a Dict or a Tuple of them for a tree."""
+    if isinstance(observation, Mapping):
+        return gymnasium.spaces.Dict({key: _space(value) for key, value in observation.items()})
+    if isinstance(observation, (tuple, list)):
+        return gymnasium.spaces.Tuple([_space(value) for value in observation])
+    dtype = np.dtype(observation.dtype)
+    low, high = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return gymnasium.spaces.Box(low, high, observation.shape, dtype)
 
 
 def _to_numpy(state: State) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
     """Copies observation, reward (float64) and info of one state or a batch to arrays that the caller may write to."""
-    obs = {key: np.array(value) for key, value in state.obs.items()}
-    info = {"is_success": np.array(state.success, np.float64), "failed": np.array(state.failed)}
+    obs = {key: _copied(value) for key, value in state.obs.items()}
+    failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
+    info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
     return obs, np.array(state.reward, np.float64), info
+
+
+def _copied(tree: Any) -> Any:
+    if isinstance(tree, Mapping):
+        return {key: _copied(value) for key, value in tree.items()}
+    return tuple(map(_copied, tree)) if isinstance(tree, (tuple, list)) else np.array(tree)
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:

@@ -103,8 +103,8 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
     _check_same_shapes(state, following)
     reward = following.reward
     if spec.ends:
-        following = _where(playing.over, state, following)
-        action, reward = (_where(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
+        following = where_each(playing.over, state, following)
+        action, reward = (where_each(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
     played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
     length = playing.length + (~playing.over).astype(jnp.int32)
     return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
@@ -142,7 +142,7 @@ def _has_ended(env: Any, spec: EnvSpec, state: Any) -> Array:
     return ended
 
 
-def _where(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
+def where_each(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """Selects `yes` or `no` by `condition` [N]; leaves lead with [N]."""
 
     def select(a: Array, b: Array) -> Array:

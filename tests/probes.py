@@ -161,3 +161,8 @@ class Corridor(PointMass):
             return PointState(obs, reward, (reward == 0).astype(jnp.float32))
         trapped = (place[0] > 2.5) & (self.kind == "trap")
         return WalkState(obs, reward, (reward == 0).astype(jnp.float32), trapped, trapped)
+
+
+def WalkToGoal():
+    """A `Walk` that ends at its goal."""
+    return Walk(ends_at_goal=True)

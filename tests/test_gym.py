@@ -316,3 +316,38 @@ def test_stable_baselines3_learns_to_reach(capsys):
     (example,) = [block for block in blocks if "stable_baselines3" in block]
     exec(compile(example, "gymnasium.md", "exec"), {})
     assert float(capsys.readouterr().out.split()[-1]) >= 0.9
+
+
+@pytest.mark.parametrize("ends_at_goal", [False, True])
+def test_terminated_and_truncated_are_those_of_the_task(ends_at_goal):
+    """A walk of its own: it is truncated beyond x = 1, terminated below y = -1 and, if that ends it, at its goal."""
+    name = f"probes:{'WalkToGoal' if ends_at_goal else 'Walk'}"
+    single = mjx_dher.gym.GymEnv(name)
+    many = mjx_dher.gym.GymVectorEnv(name, num_envs=3)
+    obs, _ = single.reset(seed=3)
+    all_obs, _ = many.reset(seed=[3, 4, 5])
+    random = np.random.default_rng(0)
+    seen, length = set(), 0
+    for _ in range(300):
+        actions = 0.5 * random.normal(size=(3, 2)).astype(np.float32)
+        was_over = many._ended.copy()
+        if was_over[0]:
+            obs, _ = single.reset()
+            terminated = truncated = False
+            length = 0
+        else:
+            obs, _, terminated, truncated, _ = single.step(actions[0])
+            length += 1
+        all_obs, rewards, all_terminated, all_truncated, _ = many.step(actions)
+        x, y = obs["achieved_goal"]
+        reached = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"]) <= 0.1
+        assert terminated == (length > 0 and bool(y < -1 or (ends_at_goal and reached)))
+        assert truncated == (length > 0 and bool(x > 1 and not terminated))
+        assert single.compute_terminated(obs["achieved_goal"], obs["desired_goal"], {}) == (ends_at_goal and reached)
+        np.testing.assert_allclose(all_obs["achieved_goal"][0], obs["achieved_goal"], atol=1e-6)
+        assert all_terminated[0] == terminated
+        assert all_truncated[0] == (truncated or (length == 12 and not terminated))
+        assert not (all_terminated & all_truncated).any()
+        assert (rewards[was_over] == 0).all()
+        seen.add((bool(terminated), bool(truncated)))
+    assert seen == {(False, False), (True, False), (False, True)}

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjx_dher import envs
+from mjx_dher.lookup import is_import_path
 
 if TYPE_CHECKING:
     from mjx_dher.envs import GoalEnv, State
+    from mjx_dher.types import EnvSpec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,11 +24,19 @@ class Programs:
     name: str
     options: tuple[tuple[str, Any], ...]
     env: GoalEnv
+    spec: EnvSpec
     reset: Callable[[Any], State]  # seed [] -> state
     step: Callable[[State, np.ndarray], State]  # state, action [A] -> state
     reset_all: Callable[[Any], State]  # seeds [N] -> states [N, ...]
     step_all: Callable[[State, np.ndarray], State]  # states, actions [N, A] -> states
+    restart: Callable[[State, Any, Any], State]  # states, seeds [N], which to reset [N] -> states
+    ended: Callable[[State], tuple[Any, Any]]  # state, or states [N] -> terminated, truncated; bool, of that shape
     reward: Callable[[np.ndarray, np.ndarray], Any]  # achieved [M, G], desired [M, G] -> [M]
+
+    def check(self) -> None:
+        """Raises ValueError if the environment found a fault in the steps so far."""
+        if callable(check := getattr(self.env, "check", None)):
+            check()
 
     def __reduce__(self) -> Any:
         """Returns how a copy, or a pickle, is made: compiled functions cannot be copied, but made again, or shared."""
@@ -46,26 +56,43 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
     for key, value in options.items():
         if not isinstance(value, Hashable):
             raise ValueError(f"option {key} must be a single value; got {value!r}")
-    engine = resolve_engine(options.get("engine", "auto"))  # so that auto shares the programs of the engine it stands for
-    return _compile(name, tuple(sorted({**options, "engine": engine}.items())))
+    if "engine" in options or not is_import_path(name):  # auto shares the programs of the engine it stands for
+        options = {**options, "engine": resolve_engine(options.get("engine", "auto"))}
+    return _compile(name, tuple(sorted(options.items())))
 
 
 @functools.cache
 def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 
+    from mjx_dher import context, rollout
+    from mjx_dher.config import HParams
+
     env = envs.make(name, **dict(options))
+    spec = rollout.env_spec(env)
 
     def reset(seed):
         return env.reset(jax.random.key(seed))
+
+    def restart(states, seeds, which):
+        return rollout.where_each(which, jax.vmap(reset)(seeds), states)
+
+    def ended(state):
+        terminated = getattr(state, "terminal", state.reward != state.reward)  # False, of the shape of the rewards
+        if spec.ends_at_goal:
+            terminated |= context.of_env(env, HParams()).reached(state.obs["achieved_goal"], state.obs["desired_goal"])
+        return terminated, getattr(state, "done", terminated) & ~terminated
 
     return Programs(
         name=name,
         options=options,
         env=env,
+        spec=spec,
         reset=jax.jit(reset),
         step=jax.jit(env.step),
         reset_all=jax.jit(jax.vmap(reset)),
         step_all=jax.jit(jax.vmap(env.step)),
+        restart=jax.jit(restart),
+        ended=jax.jit(ended),
         reward=jax.jit(env.compute_reward),
     )
