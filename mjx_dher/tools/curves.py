@@ -28,7 +28,7 @@ _PANELS = (
 
 
 class Curve(NamedTuple):
-    """What a run folder has of how the run went."""
+    """Learning curve of a run, from its folder."""
 
     folder: Path
     spec: RunSpec
@@ -39,21 +39,22 @@ class Curve(NamedTuple):
     result: dict[str, Any]  # of result.json; empty for a run that has not ended
 
     def column(self, name: str) -> NDArray:
-        """Returns a metric [P] of all epochs; NaN where an epoch lacks it."""
+        """A metric [P] of all epochs; NaN if an epoch lacks it."""
         return np.array([row.get(name, math.nan) for row in self.rows], float)
 
 
 def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
-    """Returns the curve of the run in `folder`, finished or not.
+    """Reads the curve of the run in `folder`, finished or not.
 
     Raises:
-      FolderError: no run folder, one that cannot be believed, or, unless `allow_empty`, no epoch has ended.
+      FolderError: no run folder, a damaged one, or no epoch has ended and not `allow_empty`.
     """
     content, spec = run_folder.read_run(folder)
-    ended = results.has_result(folder)
-    if ended and (problem := results.result_problem(folder)) is not None:
-        raise FolderError(problem)
-    result = results.read_result(folder) if ended else {}
+    result: dict[str, Any] = {}
+    if results.has_result(folder):
+        if (problem := results.result_problem(folder)) is not None:
+            raise FolderError(problem)
+        result = results.read_result(folder)
     rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
     status = result.get("status", NOT_ENDED)
     if not rows and not allow_empty:
@@ -63,7 +64,7 @@ def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
 
 
 def title(curve: Curve) -> str:
-    """Returns what a run is, and how far it came, in a line."""
+    """One line about a run: its settings, and how far it came."""
     spec = curve.spec
     parts = [spec.env, *spec.env_kwargs, f"sampler {spec.sampler}", f"learner {spec.learner}", f"seed {spec.seed}"]
     steps = f"{curve.rows[-1]['env_steps']:,} steps in {curve.rows[-1]['wall_seconds']:,.0f} s" if curve.rows else "no epoch"
@@ -72,7 +73,7 @@ def title(curve: Curve) -> str:
 
 
 def draw_curve(curve: Curve) -> Any:
-    """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values and losses."""
+    """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values, and losses."""
     panels = [
         (label, {name: text for name, text in columns.items() if np.isfinite(curve.column(name)).any()}, log)
         for label, columns, log in _PANELS
@@ -104,7 +105,7 @@ def draw_curve(curve: Curve) -> Any:
 
 
 def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
-    """Draws the success of evaluation and exploration, of the last evaluation, and at the reset."""
+    """Draws the success of evaluation, exploration, the last evaluation, and the resets."""
     rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
     bounds = [stats.wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
     low, high = np.reshape(bounds, (-1, 2)).T
@@ -125,13 +126,13 @@ def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
 
 
 def _unit(curves: Sequence[Curve]) -> tuple[float, str]:
-    """Returns what environment steps are counted in, and the label of their axis."""
+    """Unit of environment steps, and the label of their axis."""
     last = max((curve.rows[-1]["env_steps"] for curve in curves if curve.rows), default=0)
     return (1e6, "million environment steps") if last >= 1e6 else (1e3, "thousand environment steps")
 
 
 def labels(curves: Sequence[Curve]) -> list[str]:
-    """Returns a name for each run: the settings in which the runs differ, or else their folders."""
+    """A name for each run: the settings in which the runs differ, or else their folders."""
     settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
     varying = [name for name in settings[0] if len({str(each[name]) for each in settings}) > 1 and name != "engine"]
     told = [", ".join(_value(name, each[name]) for name in varying) for each in settings]
@@ -171,7 +172,7 @@ def draw_together(curves: Sequence[Curve]) -> Any:
 
 
 def curves_table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
-    """Returns a table of several runs, its head and its cells: what each is, how far it came, and its success."""
+    """Table of several runs: its head, and cells with settings, progress and success."""
     head = ["run", "what differs", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
     cells = []
     for curve, name in zip(curves, labels(curves)):

@@ -1,6 +1,6 @@
-"""Rendering of episodes: a policy is played in its environment, drawn without a screen, and written as a video or as stills.
+"""Rendering of episodes without a screen, as a video or as stills.
 
-The modules that draw are slow to import, so the functions import them. `choose_gl` must be called before MuJoCo is imported.
+The modules that draw are slow to import, so the functions import them. Call `choose_gl` before MuJoCo is imported.
 """
 
 from __future__ import annotations
@@ -39,11 +39,7 @@ FORMATS = {
 
 
 def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
-    """Raises if the arguments are not allowed, before anything slow happens.
-
-    Raises:
-      ValueError: names each invalid argument and what is allowed.
-    """
+    """Raises ValueError for invalid arguments, before anything slow happens."""
     problems = []
     try:
         files.check_file(out, FORMATS, overwrite)
@@ -57,11 +53,7 @@ def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
 
 
 def ffmpeg() -> str:
-    """Returns the path of ffmpeg, the program that writes pictures.
-
-    Raises:
-      ValueError: it is not installed.
-    """
+    """Path of ffmpeg, which writes the pictures. Raises ValueError if it is not installed."""
     lookup.require_extra("writing pictures", "imageio_ffmpeg", "video")
     from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -98,9 +90,9 @@ def choose_gl() -> str:
 
 
 def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
-    """Returns in one line why MuJoCo cannot draw with MUJOCO_GL=`name`; None if it can.
+    """Reason, in one line, why MuJoCo cannot draw with MUJOCO_GL=`name`; None if it can.
 
-    A child process tries it, because MuJoCo chooses only once, when it is imported, and a failed attempt may crash.
+    A child process tries it, because MuJoCo chooses only once, at its import, and a failed attempt may crash.
     """
     probe = "import mujoco as m\nwith m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 16, 16) as r: r.render()"
     variables = {"MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # nothing is worth keeping
@@ -108,7 +100,7 @@ def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
 
 
 def check_drawable(env: Any) -> None:
-    """Raises ValueError unless `env` has the attributes that `record_episodes` and `draw_frames` need."""
+    """Raises ValueError unless `env` has what `record_episodes` and `draw_frames` need."""
     import jax
 
     start = jax.eval_shape(env.reset, jax.random.key(0))
@@ -159,7 +151,7 @@ def record_episodes(
 
 
 def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
-    """Yields the N * (T + 1 + HOLD) frames [height, width, 3] uint8 of all episodes. Arguments as in `stills`."""
+    """Yields N * (T + 1 + HOLD) frames [height, width, 3] uint8 of all episodes. Arguments as in `stills`."""
     for episode, goal in zip(qpos, goals):
         for frame in draw_frames(model, episode, goal, width, height):
             yield frame
@@ -217,12 +209,12 @@ def draw_frames(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width:
 
 
 def write_frames(out: Path, frames: Iterable[np.ndarray]) -> None:
-    """Writes `frames`, [height, width, 3] uint8 each, in the format given by the suffix of `out`.
+    """Writes `frames`, [height, width, 3] uint8 each, in the format of the suffix of `out`.
 
-    On error, an existing file stays as it was. (imageio_ffmpeg.write_frames reports no error when ffmpeg fails at the end.)
+    An error leaves an existing file as it was. (imageio_ffmpeg.write_frames reports no error if ffmpeg fails at the end.)
 
     Raises:
-      ValueError: the file cannot be written; the message has ffmpeg's.
+      ValueError: the file cannot be written; the message includes ffmpeg's.
     """
     frames = iter(frames)
     first = next(frames)

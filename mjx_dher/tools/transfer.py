@@ -1,6 +1,6 @@
-"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo and so a virtual environment of their own.
+"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo in a virtual environment of its own.
 
-Run as a program in that environment, this file plays episodes and prints their outcomes. It needs gymnasium-robotics and
+In that environment this file is a program that plays episodes and prints their outcomes. It needs gymnasium-robotics and
 NumPy, but neither JAX nor this library's MuJoCo:
 
     python -m mjx_dher.tools.transfer RUN EPISODES FIRST_SEED
@@ -38,15 +38,15 @@ REACHED = 0.05  # m
 
 
 def default_environment() -> Path:
-    """Returns the folder of the virtual environment that `set_up` creates, in the user's cache folder."""
+    """Folder of the virtual environment that `set_up` creates, in the user's cache folder."""
     return user_cache() / "fetch-originals"
 
 
 def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
-    """Creates a virtual environment with the original tasks, from the package index, unless it is complete already.
+    """Creates a virtual environment with the original tasks, unless it is complete already.
 
     Raises:
-      ValueError: pip failed; the message has its output.
+      ValueError: pip failed; the message includes its output.
     """
     if is_ready(interpreter(environment), requirements):
         return
@@ -58,12 +58,12 @@ def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> N
 
 
 def interpreter(environment: Path) -> Path:
-    """Returns the Python of a virtual environment."""
+    """Python of a virtual environment."""
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
 def check_original(env_name: str, python: Path) -> str:
-    """Returns the gymnasium id of the original of a task.
+    """Gymnasium id of a task's original.
 
     Raises:
       ValueError: the task has no original, or `python` does not have the original tasks.
@@ -85,7 +85,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
       Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.
 
     Raises:
-      ValueError: a process failed; the message has the end of its output.
+      ValueError: a process failed; the message includes the end of its output.
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]
@@ -130,7 +130,7 @@ def play_original(run: Path, episodes: int, first_seed: int) -> dict[str, list[A
 
 
 def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool:
-    """Returns whether `python` exists and has the original tasks in the required versions."""
+    """Whether `python` exists and has the original tasks in the required versions."""
     names = [requirement.split("==")[0] for requirement in requirements]
     code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
     return tuple(subprocesses.ask((str(python), "-c", code)).out.split()) == requirements
