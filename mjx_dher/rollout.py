@@ -61,6 +61,19 @@ def rollout(
       ValueError: actions that are not [N, A], inputs that do not lead with [T], something that is no environment, or states
         that are not what `types.Env` and its spec say.
     """
+    return record_rollout(env, policy, key, num_envs, lambda state: (), inputs, goals)[:2]
+
+
+def record_rollout(
+    env: Env,
+    policy: PolicyFn,
+    key: PRNGKey,
+    num_envs: int,
+    record: Callable[[Any], PyTree],
+    inputs: PyTree = None,
+    goals: GoalsFn | None = None,
+) -> tuple[Episode, Outcome, PyTree]:
+    """Plays episodes as `rollout` does, and also returns `record(state)` of all states; its leaves lead with [N, T+1]."""
     spec = env_spec(env)
     check_size("num_envs", num_envs)
     _check_inputs(inputs, spec.episode_length)
@@ -69,10 +82,13 @@ def rollout(
     if goals is not None:
         first = _with_goals(env, first, goals(first.obs))
 
-    step = functools.partial(_step, env, spec, policy)
+    def step(playing: _Playing, step_inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:
+        following, played = _step(env, spec, policy, playing, step_inputs)
+        return following, (*played, record(playing.state))
+
     start = _Playing(first, jnp.zeros(num_envs, bool), jnp.zeros(num_envs, jnp.int32))
-    end, (observation, achieved_goal, action, reward) = jax.lax.scan(step, start, inputs, length=spec.episode_length)
-    last = end.state
+    end, played = jax.lax.scan(step, start, inputs, length=spec.episode_length)
+    (observation, achieved_goal, action, reward, recorded), last = played, end.state
 
     episodes = Episode(
         observation=jax.tree.map(_whole, observation, last.obs["observation"]),
@@ -83,7 +99,7 @@ def rollout(
         terminal=jnp.broadcast_to(getattr(last, "terminal", False), (num_envs,)),
     )
     valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,)) & _is_finite((episodes, jnp.moveaxis(reward, 0, 1)))
-    return episodes, Outcome(
+    outcome = Outcome(
         success=jnp.where(valid, last.success, 0.0),
         reset_success=first.success,
         ret=jnp.sum(reward, axis=0),
@@ -91,6 +107,7 @@ def rollout(
         bad_rewards=_bad_rewards(spec, reward, end.length),
         length=end.length,
     )
+    return episodes, outcome, jax.tree.map(_whole, recorded, record(last))
 
 
 def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:

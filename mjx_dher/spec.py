@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from typing_extensions import Doc
@@ -46,6 +48,9 @@ class RunSpec:
     generator: Annotated[str, _doc("generator", "Generator of the goals of training episodes")] = "reset"
     learner: Annotated[str, _doc("learner", "Learner")] = "ddpg"
     networks: Annotated[str, _doc("networks", "Networks of the learner")] = "mlp"
+    demonstrations: Annotated[
+        str, Doc("Episodes that fill the replay ring first: an .npz, or a Minari data set by folder or name.")
+    ] = ""
     seed: int = 0
     """Random seed."""
     config: Config = dataclasses.field(default_factory=Config)
@@ -126,7 +131,9 @@ def validate_values(spec: RunSpec) -> None:
     Raises:
       ValueError: names every invalid field, its value and what is allowed.
     """
-    config_lib.check_all(*((_check_text, name, getattr(spec, name)) for name in COMPONENTS), *_checks(spec, 1))
+    config_lib.check_all(
+        *((_check_text, name, getattr(spec, name)) for name in (*COMPONENTS, "demonstrations")), *_checks(spec, 1)
+    )
 
 
 def validate(spec: RunSpec, episode_length: int | None = None) -> None:
@@ -145,7 +152,19 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
         episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
     else:
         del names[0]
-    config_lib.check_all(*names, *_checks(spec, episode_length))
+    files = [(find_demonstrations, spec.demonstrations)] if spec.demonstrations else []
+    config_lib.check_all(*names, *files, *_checks(spec, episode_length))
+
+
+def find_demonstrations(source: str) -> Path:
+    """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none."""
+    if Path(source).is_file() and source.endswith(".npz"):
+        return Path(source)
+    root = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    for folder in (Path(source), root / source):
+        if (folder / "data").is_dir():
+            return folder
+    raise ValueError(f"demonstrations must be an .npz file, or the folder or name of a Minari data set; got {source!r}")
 
 
 def _episode_length(spec: RunSpec) -> Any:

@@ -34,8 +34,8 @@ from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGK
 
 # Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
-# Folded into a cycle's key, for its goals and for the rows that are renewed; no indices of `jax.random.split`.
-GENERATE, RENEW = 0x476F616C, 0x52656E65
+# Folded into a cycle's key, for its goals, renewed rows and added episodes; no indices of `jax.random.split`.
+GENERATE, RENEW, ADD = 0x476F616C, 0x52656E65, 0x44656D6F
 
 
 # generator(key, obs with leading [N], ring, context) -> goals [N, G] to play for; `contrib.generators.Generator` is one
@@ -58,6 +58,7 @@ class Train(NamedTuple):
 
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
+    add: Callable[[TrainState, Episode], TrainState]  # adds N demonstrations to the ring, and shows them to the normalizers
     learner: Learner
     replay_bytes: int  # memory of one run's ring on a device
     axis_name: AxisName = None
@@ -137,8 +138,7 @@ def make_train(
         same key. They average gradients and metrics; each has its own environments, ring and batches.
 
     Raises:
-      ValueError: a Config that cannot run, here or at all, observations that the learner cannot take, or an argument of another
-        kind. `epoch` raises it if a component gives arrays of the wrong shape, as soon as it is traced.
+      ValueError: an argument that cannot be used; from `epoch`, as soon as it is traced, an array of the wrong shape.
     """
     spec = env_spec(env)
     if not isinstance(config, Config):
@@ -166,6 +166,7 @@ def make_train(
     return Train(
         init=functools.partial(_init, loop),
         epoch=functools.partial(_epoch, loop),
+        add=functools.partial(_add_episodes, loop),
         learner=loop.learner,
         replay_bytes=replay.nbytes(loop.template, loop.num_episodes),
         axis_name=axis_name,
@@ -181,6 +182,17 @@ def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
         key=key,
         env_steps=jnp.zeros((), jnp.int32),
     )
+
+
+def _add_episodes(loop: Loop, state: TrainState, episodes: Episode) -> TrainState:
+    """Adds an equal share of the episodes on each device."""
+    rows = split.own_rows(episodes.action.shape[0], loop.axis_name)
+    episodes = jax.tree.map(lambda x: jnp.asarray(x)[rows], episodes)
+    context = _context(loop, state.learner, state.hparams, jnp.zeros(()))
+    ring = replay.add(state.replay, episodes, priorities.weights(loop.priority, episodes, context))
+    key = split.own_key(jax.random.fold_in(state.key, ADD), loop.axis_name)
+    learner, _ = _update_normalizers(loop, state.learner, episodes, jnp.ones(len(rows), bool), context, key)
+    return dataclasses.replace(state, learner=learner, replay=ring)
 
 
 def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:

@@ -18,6 +18,14 @@ def own_key(key: PRNGKey, axis_name: AxisName) -> PRNGKey:
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
 
 
+def own_rows(number: int, axis_name: AxisName) -> Array:
+    """Rows of this device, of `number` rows: an equal share, so that some devices may have a row twice."""
+    if axis_name is None:
+        return jnp.arange(number)
+    devices = jax.lax.axis_size(axis_name)
+    return (jnp.arange(-(-number // devices)) * devices + jax.lax.axis_index(axis_name)) % number
+
+
 def mean(tree: Tree, axis_name: AxisName) -> Tree:
     """Mean of the devices' arrays."""
     return tree if axis_name is None else jax.lax.pmean(tree, axis_name)

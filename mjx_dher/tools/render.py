@@ -131,23 +131,21 @@ def record_episodes(
       ValueError: the environment cannot be drawn.
     """
     import jax
-    import jax.numpy as jnp
+
+    from mjx_dher.rollout import record_rollout
 
     check_drawable(env)
 
-    def step(state, key):
-        following = jax.vmap(env.step)(state, act(state.obs, key))
-        return following, following.physics.qpos
-
     @jax.jit
-    def run(key):
+    def run(key: Any) -> tuple[Any, Any, Any]:
         reset_key, act_key = jax.random.split(key)
-        first = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
-        last, qpos = jax.lax.scan(step, first, jax.random.split(act_key, env.episode_length))
-        return jnp.concatenate([first.physics.qpos[None], qpos]), first.obs["desired_goal"], last.success
+        keys = jax.random.split(act_key, env.episode_length)
+        policy = lambda own_key, obs: act(obs, own_key)  # noqa: E731
+        played = record_rollout(env, policy, reset_key, num_episodes, lambda state: state.physics.qpos, keys)
+        return played[2], played[0].desired_goal, played[1].success
 
     qpos, goals, success = jax.device_get(run(jax.random.key(seed)))
-    return np.moveaxis(qpos, 0, 1), goals, success
+    return qpos, goals, success
 
 
 def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:

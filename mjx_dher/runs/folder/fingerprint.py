@@ -7,13 +7,14 @@ import functools
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from mjx_dher import lookup
 from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
-from mjx_dher.spec import RunSpec, custom_components
+from mjx_dher.spec import RunSpec, custom_components, find_demonstrations
 
 MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
 # A digest always includes these settings. It includes any other setting only if it differs from its default, so that a new
@@ -54,24 +55,42 @@ def text(value: Any) -> str:
 
 
 def sources(spec: RunSpec) -> dict[str, str]:
-    """Name and digest of each custom component's file, by field: "push2d.py 3fa9c1d2e4".
+    """Name and digest of the files of custom components and of demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
-    Files that it imports are not included. Each file is read once in a process, as its module is.
+    Files that a component imports are not included. Each file is read once in a process, as its module is.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
+    read["demonstrations"] = _demonstrations(spec.demonstrations)
     return {name: source for name, source in read.items() if source is not None}
 
 
 @functools.cache
 def _source(import_path: str) -> str | None:
     file = lookup.module_file(import_path)
-    return None if file is None else f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()[:10]}"
+    return None if file is None else _name_and_digest(file, [file])
+
+
+@functools.cache
+def _demonstrations(source: str) -> str | None:
+    try:
+        path = find_demonstrations(source)
+    except ValueError:
+        return None
+    return _name_and_digest(path, [path] if path.is_file() else sorted(x for x in (path / "data").rglob("*") if x.is_file()))
+
+
+def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
+    content = hashlib.sha256()
+    for file in files:
+        content.update(file.read_bytes())
+    return f"{path.name} {content.hexdigest()[:10]}"
 
 
 def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
     """Everything that a run computes with, for JSON: settings, seed, the physics that runs, and custom source files."""
     defaults = settings(RunSpec())
     kept = {name: x for name, x in settings(spec).items() if name in _ALWAYS or x != defaults[name]}
+    kept.pop("demonstrations", None)  # the file's digest is among the sources
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
@@ -87,6 +106,7 @@ def trial_name(spec: RunSpec) -> str:
     """Name of a trial's folder: readable settings, and a digest of all settings and of custom code."""
     values, defaults = settings(spec), settings(RunSpec())
     kept = {name: value for name, value in values.items() if name in _ALWAYS or value != defaults[name]}
+    kept.pop("demonstrations", None)
     numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests
     own_sources = sources(spec)

@@ -215,7 +215,9 @@ def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]
 def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
     """Sentences about custom source files that have changed since the run was trained."""
     before = identity_of(content, spec)
-    return list(fingerprint.differences(before, {**before, "sources": fingerprint.sources(spec)}).values())
+    return list(
+        fingerprint.differences(before, {**before, "sources": {**content["sources"], **fingerprint.sources(spec)}}).values()
+    )
 
 
 def written_identity(path: Path) -> dict[str, Any] | None:

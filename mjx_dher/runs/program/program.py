@@ -19,6 +19,7 @@ from mjx_dher import context, learners, priorities, samplers, trainer
 from mjx_dher import evaluate as evaluate_lib
 from mjx_dher.config import HParams
 from mjx_dher.contrib import generators
+from mjx_dher.demonstrations import read_demonstrations
 from mjx_dher.learners import Learner
 from mjx_dher.parallel import mesh, sharded, split
 from mjx_dher.parallel.mesh import ONE, Layout
@@ -76,7 +77,7 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     config = config_lib.of_one_device(spec.config, layout.parts)
     distance = context.of_env(env, spec.hparams).goal_distance
     generator = generators.join([generators.make(name) for name in choices.generators])
-    return trainer.make_train(
+    train = trainer.make_train(
         env,
         config,
         sampler=samplers.join([samplers.make(*choice, goal_distance=distance) for choice in choices.samplers]),
@@ -85,6 +86,11 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
         learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
         axis_name=layout.axis_name,
     )
+    if not spec.demonstrations:
+        return train
+    capacity = config_lib.episodes_capacity(spec.config, env.episode_length)
+    episodes = read_demonstrations(spec.demonstrations, env, capacity)
+    return train._replace(init=lambda key, hparams: train.add(train.init(key, hparams), episodes))
 
 
 def compile_runs(

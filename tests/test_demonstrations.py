@@ -1,0 +1,160 @@
+"""Demonstrations: what a file may hold, and what a run does with it."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from configs import TINY, flags
+from conftest import EXAMPLES, refuses
+from flax import struct
+
+import mjx_dher
+from mjx_dher import HParams, Options, RunSpec, cli, trainer
+from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
+from mjx_dher.rollout import env_spec, rollout
+from mjx_dher.runs.folder import fingerprint, run_folder
+from point_mass import PointMass, PointState
+
+ENV = PointMass()
+
+
+@struct.dataclass
+class EndingState(PointState):
+    done: jax.Array
+
+
+class Ending(PointMass):
+    """PointMass whose episodes end at the goal."""
+
+    @property
+    def spec(self):
+        return dataclasses.replace(env_spec(PointMass()), ends=True)
+
+    def _state(self, position, goal):
+        state = super()._state(position, goal)
+        return EndingState(state.obs, state.reward, state.success, state.success > 0)
+
+
+def played(env=ENV, number=6):
+    """Episodes that walk towards the goal."""
+    towards = lambda _, obs: jnp.clip(10 * (obs["desired_goal"] - obs["achieved_goal"]), -1, 1)  # noqa: E731
+    return jax.tree.map(np.asarray, rollout(env, towards, jax.random.key(11), number)[0])
+
+
+@pytest.fixture
+def file(tmp_path):
+    write_demonstrations(tmp_path / "demos.npz", played())
+    return tmp_path / "demos.npz"
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.parametrize("env", [ENV, Ending()])
+def test_episodes_come_back_as_they_were_written(tmp_path, env):
+    episodes = played(env)
+    write_demonstrations(tmp_path / "demos.npz", episodes)
+    same(read_demonstrations(str(tmp_path / "demos.npz"), env, 6), episodes)
+    assert (episodes.length.min() < env.episode_length) == (env is not ENV)
+
+
+def test_shorter_episodes_are_padded_and_length_and_terminal_are_optional(tmp_path):
+    env = Ending()
+    episodes = played(env)
+    length = int(episodes.length.max())
+    arrays = {name: getattr(episodes, name) for name in ("observation", "achieved_goal", "desired_goal", "action")}
+    cut = {name: x if name == "desired_goal" else x[:, : length + (name != "action")] for name, x in arrays.items()}
+    np.savez(tmp_path / "demos.npz", **cut, length=episodes.length.astype(np.int64))
+    same(read_demonstrations(str(tmp_path / "demos.npz"), env, 6), episodes)
+    np.savez(tmp_path / "demos.npz", **{name: x[:1] for name, x in arrays.items()})
+    assert read_demonstrations(str(tmp_path / "demos.npz"), ENV, 6).length.tolist() == [10]
+
+
+BAD_ARRAYS = [
+    ({"action": None}, ("action", "[N, T, A]", "none")),
+    ({"action": np.zeros((6, 11, 2))}, ("action", "at most 10", "[6, 11, 2]")),
+    ({"action": np.full((6, 10, 2), 1.5)}, ("action", "[-1, 1]", "1.5")),
+    ({"action": np.zeros((6, 10, 3))}, ("action", "[6, 10, 2]", "[6, 10, 3]")),
+    ({"observation": np.zeros((6, 10, 2))}, ("observation", "[6, 11, 2]", "[6, 10, 2]")),
+    ({"observation": None, "desired_goal": np.zeros((6, 3))}, ("observation", "none", "desired_goal", "[6, 2]", "[6, 3]")),
+    ({"achieved_goal": np.full((6, 11, 2), np.nan)}, ("achieved_goal", "finite")),
+    ({"achieved_goal": np.full((6, 11, 2), "x")}, ("achieved_goal", "float32", "U1")),
+    ({"length": np.full(6, 9)}, ("length", "10", "9")),
+    ({"length": np.full(6, 9.0)}, ("length", "int32", "float64")),
+    ({"terminal": np.ones(6, bool)}, ("terminal", "False", "True")),
+    ({"rewards": np.ones(6)}, ("rewards", "observation, achieved_goal")),
+]
+
+
+def test_arrays_that_do_not_fit_are_refused(file):
+    with np.load(file) as arrays:
+        right = dict(arrays)
+    for change, words in BAD_ARRAYS:
+        np.savez(file, **{name: value for name, value in {**right, **change}.items() if value is not None})
+        with refuses("demonstrations", file, *words):
+            read_demonstrations(str(file), ENV, 6)
+
+
+def test_files_that_cannot_be_used_are_refused(file, tmp_path):
+    with refuses("1 to 5 episodes", "6"):
+        read_demonstrations(str(file), ENV, 5)
+    file.write_bytes(b"PK" + bytes(100))
+    with refuses("demonstrations", file, ".npz"):
+        read_demonstrations(str(file), ENV, 6)
+    for name in ("none.npz", "", str(tmp_path)):
+        with refuses("demonstrations", ".npz", "Minari", repr(name)):
+            read_demonstrations(name, ENV, 6)
+
+
+def test_the_ring_holds_them_and_the_normalizers_have_seen_them():
+    episodes = played()
+    train = trainer.make_train(ENV, TINY)
+    empty = train.init(jax.random.key(0), HParams())
+    state = train.add(empty, episodes)
+    assert (int(empty.replay.size), int(state.replay.size)) == (0, 6)
+    same(jax.tree.map(lambda x: np.asarray(x[:6]), state.replay.episodes), episodes)
+    np.testing.assert_allclose(state.learner.observation_norm.mean, episodes.observation.mean((0, 1)), rtol=1e-5)
+    same(*(jax.random.key_data(x.key) for x in (empty, state)))
+    assert int(jax.jit(train.epoch)(state)[0].replay.size) == 8  # of six and four, as many as the ring holds
+
+
+def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    command = [*flags(TINY), "--final-episodes", "4", "--no-curve", "--demonstrations", str(file)]
+    assert cli.main([*command, "--total-steps", "80", "--out", str(tmp_path / "run")]) == 0
+    content, spec = run_folder.read_run(tmp_path / "run")
+    assert spec.demonstrations == str(file)
+    assert content["sources"]["demonstrations"].startswith("demos.npz ")
+    (tmp_path / "moved").mkdir()
+    moved = file.rename(tmp_path / "moved" / "demos.npz")
+    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=str(moved))) == fingerprint.trial_name(spec)
+    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations="")) != fingerprint.trial_name(spec)
+    capsys.readouterr()
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--json"]) == 0  # the policy needs no file
+    assert json.loads(capsys.readouterr().out)["episodes"] == 2
+    assert cli.main([*command, "--out", str(tmp_path / "other")]) == 2
+    assert "demonstrations must be" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_stopped_run_ends_as_the_one_that_was_not(file, tmp_path):
+    config = dataclasses.replace(TINY, total_steps=120)
+    spec = RunSpec("point_mass:PointMass", config=config, demonstrations=str(file))
+    options, epochs = Options(final_episodes=4), []
+    train = lambda folder, stop: mjx_dher.train_runs(  # noqa: E731
+        ENV,
+        [spec],
+        [folder],
+        options=options,
+        on_epoch=lambda specs, progress: epochs.append(progress.epoch),
+        should_stop=lambda: epochs[-1] == stop,
+    )
+    train(tmp_path / "whole", 99)
+    train(tmp_path / "run", 1)
+    train(tmp_path / "run", 99)
+    first, second = (np.load(tmp_path / name / "policy.npz") for name in ("whole", "run"))
+    assert all(np.array_equal(first[name], second[name]) for name in first.files)
