@@ -249,7 +249,7 @@ def test_a_learner_that_cannot_be_split_is_refused():
 def test_layouts():
     devices = tuple(jax.devices())
     found = {runs: mesh.arrange(devices, runs) for runs in (1, 2, 3, 4, 40)}
-    assert {runs: (layout.lanes, layout.parts) for runs, layout in found.items()} == {
+    assert {runs: (layout.lanes, layout.shards) for runs, layout in found.items()} == {
         1: (1, 4),
         2: (2, 2),
         3: (4, 1),

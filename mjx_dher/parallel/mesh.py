@@ -1,7 +1,7 @@
 """Devices of a program: a mesh whose axis `lanes` shares out runs side by side, and whose axis `data` shares out each of them.
 
-Runs side by side exchange nothing. The parts of one run have equal shares of its environments, its ring and its batches; their
-learners are alike, because they average gradients (`split`).
+Runs side by side exchange nothing. The shards of one run have equal parts of its environments, its replay ring and its batches.
+They average gradients (`split`), so their learners stay equal.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ LANES, DATA = "lanes", "data"
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Devices of a program and how it lies on them; the default device where there are none."""
+    """Devices of a program, and its layout on them. Without devices it runs on the default device."""
 
     devices: tuple[Any, ...] = ()
     lanes: int = 1  # devices that share out runs side by side
-    parts: int = 1  # devices that share each of them
+    shards: int = 1  # devices that share each of them
 
     @property
     def axis_name(self) -> AxisName:
         """Axis of the devices that share one run; None if each run has one device."""
-        return DATA if self.parts > 1 else None
+        return DATA if self.shards > 1 else None
 
     @property
     def sharers(self) -> int:
-        """Devices of this process that have one memory: all where they are a CPU's."""
+        """Devices of this process that share one memory: all devices of a CPU, one GPU."""
         return len(self.own_devices) if self.devices and self.devices[0].platform == "cpu" else 1
 
     @property
@@ -48,10 +48,10 @@ class Layout:
     def mesh(self) -> jax.sharding.Mesh:
         """Mesh of JAX."""
         kinds = (jax.sharding.AxisType.Auto,) * 2
-        return jax.make_mesh((self.lanes, self.parts), (LANES, DATA), kinds, devices=self.devices)
+        return jax.make_mesh((self.lanes, self.shards), (LANES, DATA), kinds, devices=self.devices)
 
     def sharding(self, *axes: str) -> NamedSharding:
-        """Returns the sharding of arrays that lead with these axes of the mesh; the other axis has them alike."""
+        """Sharding of arrays that lead with these axes of the mesh, and are replicated along the other one."""
         return NamedSharding(self.mesh, PartitionSpec(*axes))
 
 
@@ -59,10 +59,10 @@ ONE = Layout()
 
 
 def find(devices: int | str) -> tuple[Any, ...]:
-    """Returns so many of JAX's devices, or "all"; none for one, which is the default device.
+    """The first `devices` JAX devices, or "all"; empty for one, which means the default device.
 
     Raises:
-      ValueError: neither a number nor "all", more than there are, or only some of those of several processes.
+      ValueError: neither a number nor "all", more than there are, or only some of the devices of several processes.
     """
     check_devices(devices)
     present = jax.devices()
@@ -82,7 +82,7 @@ def find(devices: int | str) -> tuple[Any, ...]:
 
 
 def arrange(devices: Sequence[Any], runs: int) -> Layout:
-    """Lays up to `runs` runs side by side on devices: apart as far as they go, the devices left over in parts of each run."""
+    """Lays up to `runs` runs side by side on devices. If there are more devices than runs, several share each run."""
     if not devices:
         return ONE
     number = len(devices)
@@ -91,10 +91,10 @@ def arrange(devices: Sequence[Any], runs: int) -> Layout:
 
 
 def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
-    """Returns how many runs lie side by side at most: `lanes`; where None, one for each CPU, and elsewhere what memory holds.
+    """Most runs side by side: `lanes`. By default one for each CPU, and on GPUs as many as memory holds (None).
 
     Raises:
-      ValueError: `lanes` is a number that the devices do not divide, nor it them.
+      ValueError: neither `lanes` is a multiple of the devices, nor they of `lanes`.
     """
     number = max(1, len(devices))
     if lanes is None:

@@ -65,7 +65,7 @@ def _place(
     donate: Sequence[int] = (),
 ) -> Any:
     """Places a function of one device. Arguments `of_host` are NumPy arrays, which every process has whole."""
-    if layout.parts == 1:
+    if layout.shards == 1:
         return _PerDevice(layout, [jax.jit(local, donate_argnums=donate)] * len(layout.own_devices))
 
     def with_counters(*arguments: Any) -> Any:

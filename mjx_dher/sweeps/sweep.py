@@ -1,7 +1,7 @@
-"""Trains the trials of a sweep, in as few compiled programs as there can be.
+"""Trains the trials of a sweep in as few compiled programs as possible.
 
-A trial is a run folder, named after its settings and a digest of them, with a result once it has ended. So a sweep that was cut
-short, or made larger, trains what is missing; runs that were side by side when it was cut short go on from their checkpoint.
+A trial is a run folder, named after its settings and their digest, with a result once it has ended. A sweep that was stopped or
+made larger trains the missing trials. Runs that were side by side when it was stopped resume from their checkpoint.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ def run(
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
 ) -> list[Result]:
-    """Trains trials into the folder of a sweep. Those that can share a program do, wherever they stand.
+    """Trains trials into the folder of a sweep. Trials that can share a program do, in any order.
 
     Args:
-      folder: of the sweep; it is made where it does not exist.
+      folder: of the sweep; made if it does not exist.
       specs: trials, in order.
       make_env: makes the environment of a trial.
       options: evaluation, checkpoints, logs.
@@ -46,8 +46,8 @@ def run(
       on_epoch: called after every epoch of those side by side.
 
     Returns:
-      A Result of each that was trained: not of those that have ended already, that another program is at work on, or whose
-      turn had not come when the sweep was stopped.
+      A Result for each trained trial. Trials that had ended before, that another program trains, or that were still waiting
+      when the sweep was stopped have none.
 
     Raises:
       ValueError: as `train_runs`.

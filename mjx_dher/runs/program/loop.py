@@ -88,8 +88,8 @@ def train(
     hparams = HParams() if hparams is None else hparams
     config_lib.validate(config, hparams, env.episode_length)
     layout = mesh.arrange(mesh.find(devices), 1)
-    config_lib.check_parts(config, env.episode_length, layout.parts)
-    program = make_train(env, config_lib.of_one_device(config, layout.parts), axis_name=layout.axis_name, **parts)
+    config_lib.check_parts(config, env.episode_length, layout.shards)
+    program = make_train(env, config_lib.of_one_device(config, layout.shards), axis_name=layout.axis_name, **parts)
     key = jax.random.key(seed)
     check_memory(program, config, layout.sharers)
     on_compile(None)

@@ -73,8 +73,8 @@ class Program(NamedTuple):
 
 def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -> Train:
     """Makes the training loop of runs that share a program, with the components that they name."""
-    config_lib.check_parts(spec.config, env.episode_length, layout.parts)
-    config = config_lib.of_one_device(spec.config, layout.parts)
+    config_lib.check_parts(spec.config, env.episode_length, layout.shards)
+    config = config_lib.of_one_device(spec.config, layout.shards)
     distance = context.of_env(env, spec.hparams).goal_distance
     generator = generators.join([generators.make(name) for name in choices.generators])
     train = trainer.make_train(
@@ -134,7 +134,7 @@ def compile_runs(
 
 def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout: Layout) -> str:
     apart = f"{layout.lanes} of them apart" if layout.lanes > 1 else ""
-    parts = f"{layout.parts} for each run" if layout.parts > 1 else ""
+    parts = f"{layout.shards} for each run" if layout.shards > 1 else ""
     number = f"{len(layout.devices)} devices ({', '.join(filter(None, (apart, parts)))}) of " if layout.devices else ""
     together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
     return (
@@ -170,7 +170,7 @@ def _compile_evaluation(
 
     Compiling takes memory, too, to try kernels in.
     """
-    episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.parts)
+    episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.shards)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
         outcome = trainer.evaluate_state(env, train.learner, state, key, episodes, train.axis_name)
