@@ -24,7 +24,9 @@ from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
 from mjx_dher.relabel import draw_batches
 from mjx_dher.trainer import MAX_TRANSITIONS_PER_DRAW
-from mjx_dher.types import Episode, Sizes
+from mjx_dher.types import EnvSpec, Episode
+
+SPEC = EnvSpec(jax.ShapeDtypeStruct((25,), jnp.float32), 3, 4, episode_length=50)  # of Push
 
 
 def compute_reward(achieved_goal, desired_goal):
@@ -135,7 +137,7 @@ def main() -> None:
             policy_delay=args.policy_delay,
         )
         try:
-            learner = learners.make(name, config, Sizes(25, 3, 4), args.networks)
+            learner = learners.make(name, config, SPEC, args.networks)
         except ValueError as error:
             parser.error(str(error))
         both, update, draw = Timed(learner, batch_size, seeds, samplers.make(args.sampler), args.updates).seconds()

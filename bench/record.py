@@ -86,11 +86,11 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
 
     from mjx_dher import learners, samplers
     from mjx_dher.envs.engines import resolve_engine
-    from mjx_dher.types import Sizes
+    from mjx_dher.types import EnvSpec
 
     engine = resolve_engine("auto")
     rates = [throughput.measure("push", engine, run.num_envs)[0] for _ in range(repeats)]
-    made = learners.make("ddpg", run, Sizes(25, 3, 4))
+    made = learners.make("ddpg", run, EnvSpec(jax.ShapeDtypeStruct((25,), jax.numpy.float32), 3, 4, episode_length=50))
     timed = learner_bench.Timed(made, run.batch_size, 1, samplers.make("future"), 200)
     updates = [1 / timed.seconds()[0] for _ in range(repeats)]
     medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]))

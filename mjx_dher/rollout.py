@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_dher import context
 from mjx_dher.config import HParams
-from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, Sizes, check_env_parts, check_size
+from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_env_parts, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
@@ -283,11 +283,6 @@ def _spec_and_shapes(env: Env) -> tuple[EnvSpec, Any]:
 
 def _say(leaf: Any) -> Any:
     return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
-
-
-def env_sizes(env: Env) -> Sizes:
-    """Sizes of an environment's observation, goal and action. Raises ValueError unless the observation is one vector."""
-    return env_spec(env).sizes
 
 
 def episode_template(env: Env) -> Episode:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypedDict
+from typing import Any, Protocol, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -77,14 +77,6 @@ class Batch:
     row: Array  # [B] ring row of the transition's episode, int32: equal rows are one episode
 
 
-class Sizes(NamedTuple):
-    """Numbers in an observation, a goal and an action: D, G and A."""
-
-    observation: int
-    goal: int
-    action: int
-
-
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
     """The contract of a task as data. `rollout.env_spec` gives an environment's."""
@@ -115,9 +107,10 @@ class EnvSpec:
         return int(leaves[0].shape[0])
 
     @property
-    def sizes(self) -> Sizes:
-        """Sizes D, G and A. Raises ValueError unless the observation is one vector."""
-        return Sizes(self.observation_size, self.goal_size, self.action_size)
+    def sizes(self) -> tuple[Any, int, int]:
+        """Sizes D, G and A. If the observation is no vector, the tree of its leaves' sizes, or shapes, replaces D."""
+        observation = jax.tree.map(lambda x: x.shape[0] if len(x.shape) == 1 else x.shape, self.observation)
+        return observation, self.goal_size, self.action_size
 
 
 # Scalars [] by name, for the log.

@@ -18,13 +18,13 @@ from mjx_dher.runs import driver
 from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program import loop
 from mjx_dher.system.files import FolderError
-from mjx_dher.types import Batch, Sizes
-from probes import Explodes, PointMass
+from mjx_dher.types import Batch
+from probes import Explodes, PointMass, spec_of
 
 ENV = PointMass()
 # Two epochs of 240 steps; rings of 40 episodes.
 CONFIG = dataclasses.replace(SMALL, num_envs=8, batch_size=32, replay_size=400, hidden_sizes=(16,), total_steps=480)
-SIZES = Sizes(observation=3, goal=2, action=2)
+SPEC = spec_of(3, 2, 2)
 DEVICES = (1, 2, 4)
 
 
@@ -59,7 +59,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3", "redq", "
 @pytest.mark.parametrize("name", ["ddpg", "sac", *SLOW])
 def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
     """By Adam's moments after one update, a tenth and a thousandth of the gradient and its square."""
-    learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SIZES)
+    learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SPEC)
     state = learner.init(jax.random.key(0))
 
     def update(axis_name, state, batch):
@@ -77,7 +77,7 @@ def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
 
 def test_parts_that_do_not_average_learn_something_else():
     """So that the test above can fail."""
-    learner = learners.make("ddpg", CONFIG, SIZES)
+    learner = learners.make("ddpg", CONFIG, SPEC)
     state = learner.init(jax.random.key(0))
     update = lambda axis_name, state, batch: learner.update(state, batch, trainer.as_arrays(HParams()))[0]  # noqa: E731
     one, two = (in_parts(n, update, (WHOLE, PARTED), WHOLE)(state, make_batch()) for n in (1, 2))

@@ -1,6 +1,8 @@
 """Observations that are trees: encoders, concatenation, and what is rejected."""
 
 import dataclasses
+import sys
+import types
 
 import flax.linen as nn
 import jax
@@ -8,8 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, learners, networks, trainer
+from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, rollout, testing, trainer
+from mjx_dher.policy import learner_policy
+from mjx_dher.policy.load import check_fits
+from mjx_dher.runs.program.loop import state_template
 from mjx_dher.types import Batch
+from point_mass import PointMass
 from probes import spec_of
 
 TASK = spec_of(2, 2, 2)
@@ -84,6 +90,49 @@ def test_a_tree_of_vectors_needs_no_encoder():
         return learner.update(state, batch, hparams)[0].params
 
     jax.tree.map(np.testing.assert_array_equal, learned(of_tree, {"a": x[:, :1], "b": x[:, 1:]}), learned(of_vector, x))
+
+
+class Camera(PointMass):
+    """PointMass that is seen as a bright pixel, beside its position."""
+
+    def _state(self, position, goal):
+        state = super()._state(position, goal)
+        cell = jnp.clip((position + 0.5) * 4.0, 0.0, 3.0).astype(jnp.int32)
+        image = jnp.zeros((4, 4, 1), jnp.uint8).at[cell[0], cell[1]].set(255)
+        vector = jnp.concatenate([position, jnp.ones(1)])
+        return state.replace(obs={**state.obs, "observation": {"image": image, "vector": vector}})
+
+
+def test_dicts_with_images_are_trained_on(tmp_path, monkeypatch):
+    """From the rollout to the stored policy, which acts as the learner does."""
+    monkeypatch.setitem(sys.modules, "mine", types.SimpleNamespace(networks=seeing))
+    env, config = Camera(), dataclasses.replace(SMALL, num_envs=4, eval_episodes=2, updates_per_cycle=2, target_period=1)
+    spec = rollout.env_spec(env)
+    assert spec.sizes == ({"image": (4, 4, 1), "vector": 3}, 2, 2)
+    learner = learners.make("ddpg", config, spec, "mine:networks")
+    program = make_train(env, config, learner=learner)
+    jax.eval_shape(program.epoch, state_template(program))
+    testing.check_learner("ddpg", env, config, networks=seeing)
+    state = learner.init(jax.random.key(0))
+    learner_policy.LearnerPolicy(learner, state, HP, spec).save(tmp_path / "policy.npz")
+    with np.load(tmp_path / "policy.npz") as arrays:
+        run = RunSpec(learner="ddpg", networks="mine:networks", config=config, hparams=HP)
+        policy = learner_policy.from_arrays(arrays, run)
+    assert policy.spec == spec
+    check_fits(policy, env)
+    with pytest.raises(ValueError, match="observations of"):
+        check_fits(policy, PointMass())
+    obs = {"observation": jax.device_get(random_tree(jax.random.key(1), 5)), "desired_goal": np.ones((5, 2), np.float32)}
+    np.testing.assert_allclose(policy(obs), learner.act(state, obs, HP), rtol=1e-5, atol=1e-6)
+
+
+def test_only_dicts_lists_and_tuples_can_be_stored():
+    nested = dataclasses.replace(
+        TASK, observation=({"b": [TASK.observation], "a": TASK.observation},), reward_range=(-np.inf, 1.0)
+    )
+    assert learner_policy.from_json(learner_policy.to_json(nested)) == nested
+    with pytest.raises(ValueError, match="observation must be made of dicts"):
+        learner_policy.to_json(dataclasses.replace(TASK, observation=networks.Networks(TASK.observation, TASK.observation)))
 
 
 def test_images_need_an_encoder():

@@ -258,7 +258,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
     run_folder.write_config(tmp_path / "run", SPEC, "none", {})
-    learner_policy.LearnerPolicy(learner, state, HP, TASK.sizes).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    learner_policy.LearnerPolicy(learner, state, HP, TASK).save(tmp_path / "run" / run_folder.POLICY_FILE)
     return tmp_path / "run"
 
 
@@ -279,7 +279,7 @@ def test_a_stored_policy_acts_as_the_learner_does(folder, trained):
 def test_its_numbers_come_back_to_the_bit(folder, trained):
     policy = mjx_dher.load_policy(folder)
     jax.tree.map(np.testing.assert_array_equal, policy.state, trained[2])
-    assert (policy.sizes, policy.hparams) == (TASK.sizes, HP)
+    assert (policy.spec, policy.hparams) == (TASK, HP)
     assert isinstance(policy.state.params, common.Params)
 
 

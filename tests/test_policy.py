@@ -13,10 +13,10 @@ from mjx_dher import RunSpec, learners
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.system.files import FolderError
-from mjx_dher.types import Sizes
+from probes import spec_of
 
 HP = HParams(norm_clip=3.0)
-DDPG = learners.make("ddpg", Config(), Sizes(25, 3, 4))
+DDPG = learners.make("ddpg", Config(), spec_of(25, 3, 4))
 SPEC = RunSpec(config=Config(hidden_sizes=(256, 256)), hparams=HP, seed=3, engine="native", sampler="closest", metric="a:b")
 
 

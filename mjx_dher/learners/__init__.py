@@ -14,7 +14,7 @@ from mjx_dher import check, components, networks
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Values
 from mjx_dher.networks import NetworksFn
-from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree, Sizes, check_size
+from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree, check_size
 
 # What the loop and the log call theirs: a learner's metrics have other names.
 RESERVED = frozenset(
@@ -22,6 +22,7 @@ RESERVED = frozenset(
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
         *("relabelled_share", "relabel_distance", "discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
         *("epoch", "env_steps", "updates", "wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes"),
+        "train_length_mean",
     )
 )
 
@@ -93,7 +94,7 @@ class Learner(Protocol):
 LearnerFn = Callable[[Config, EnvSpec, NetworksFn], Learner]
 
 
-def make(name: str | LearnerFn, config: Config, spec: EnvSpec | Sizes, network: str | NetworksFn = "mlp") -> Learner:
+def make(name: str | LearnerFn, config: Config, spec: EnvSpec, network: str | NetworksFn = "mlp") -> Learner:
     """Makes the learner called `name`.
 
     Args:
@@ -105,9 +106,6 @@ def make(name: str | LearnerFn, config: Config, spec: EnvSpec | Sizes, network: 
     Raises:
       ValueError: no such learner or networks, something that lacks a method of `Learner`, or parts that do not combine.
     """
-    if isinstance(spec, Sizes):
-        observation = jax.ShapeDtypeStruct((spec.observation,), jnp.float32)
-        spec = EnvSpec(observation, spec.goal, spec.action, episode_length=1)
     make_learner = components.load("learner", name, "config", "spec", "networks")
     learner = make_learner(config, spec, networks.make(network))
     check_methods(name, learner)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import atomic_write
-from mjx_dher.types import Array, PyTree, Sizes
+from mjx_dher.types import Array, EnvSpec, PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,11 +27,16 @@ class LearnerPolicy:
     learner: Learner
     state: PyTree  # the learner's
     hparams: HParams
-    sizes: Sizes
+    spec: EnvSpec
+
+    @property
+    def sizes(self) -> tuple[Any, int, int]:
+        """Sizes of observations, goals and actions, as `EnvSpec.sizes`."""
+        return self.spec.sizes
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
         """Computes the actions [..., A] for observations of one state or a batch."""
-        return np.asarray(self.forward(jnp.asarray(obs["observation"]), jnp.asarray(obs["desired_goal"])))
+        return np.asarray(self.forward(jax.tree.map(jnp.asarray, obs["observation"]), jnp.asarray(obs["desired_goal"])))
 
     def forward(self, observation: Any, goal: Any, xp: Any = jnp) -> Array:
         """Computes actions for observations [..., D] and goals [..., G]; `xp` is ignored."""
@@ -42,7 +48,7 @@ class LearnerPolicy:
         """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
-            np.savez(file, sizes=np.array(self.sizes), **arrays, **extra)
+            np.savez(file, env_spec=np.array(to_json(self.spec)), **arrays, **extra)
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:
@@ -51,11 +57,47 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolic
     Raises:
       ValueError: the arrays are not those of this learner.
     """
-    sizes = Sizes(*map(int, arrays["sizes"]))
-    learner = learners.make(spec.learner, spec.config, sizes, spec.networks)
+    if "env_spec" in arrays:
+        env_spec = from_json(str(arrays["env_spec"]))
+    else:  # older files have only the sizes D, G and A
+        size, goal_size, action_size = map(int, arrays["sizes"])
+        env_spec = EnvSpec(jax.ShapeDtypeStruct((size,), jnp.float32), goal_size, action_size, episode_length=1)
+    learner = learners.make(spec.learner, spec.config, env_spec, spec.networks)
     template = jax.eval_shape(learner.init, jax.random.key(0))
     leaves, treedef = jax.tree.flatten(template)
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
         raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
-    return LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, sizes)
+    return LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, env_spec)
+
+
+def to_json(spec: EnvSpec) -> str:
+    """Writes a spec as JSON. Raises ValueError if its observation is not made of dicts, lists and tuples."""
+
+    def of(tree: Any) -> Any:
+        if isinstance(tree, jax.ShapeDtypeStruct):
+            return {"shape": tree.shape, "dtype": tree.dtype.name}
+        if type(tree) is dict:
+            return {"dict": {name: of(child) for name, child in tree.items()}}
+        if type(tree) in (list, tuple):
+            return {type(tree).__name__: [of(child) for child in tree]}
+        raise ValueError(f"observation must be made of dicts, lists and tuples of arrays to be stored; it has a {type(tree)}")
+
+    fields = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
+    return json.dumps({**fields, "observation": of(spec.observation)})
+
+
+def from_json(text: str) -> EnvSpec:
+    """Reads what `to_json` wrote."""
+
+    def of(tree: dict[str, Any]) -> Any:
+        if "shape" in tree:
+            return jax.ShapeDtypeStruct(tuple(tree["shape"]), jnp.dtype(tree["dtype"]))
+        ((kind, children),) = tree.items()
+        if kind == "dict":
+            return {name: of(child) for name, child in children.items()}
+        return {"list": list, "tuple": tuple}[kind](map(of, children))
+
+    fields = json.loads(text)
+    fields |= {"observation": of(fields["observation"]), "reward_range": tuple(fields["reward_range"])}
+    return EnvSpec(**fields)

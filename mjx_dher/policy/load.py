@@ -34,7 +34,7 @@ def load_policy(run_dir: str | Path) -> TrainedPolicy:
     if not path.is_file():
         raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")
     arrays = _read(path)
-    if "sizes" not in arrays:
+    if not {"env_spec", "sizes"} & arrays.keys():
         try:
             return from_arrays(arrays)
         except ValueError as error:
@@ -67,9 +67,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def check_fits(policy: TrainedPolicy, env: Any) -> None:
     """Raises ValueError if the sizes of observations, goals or actions of a policy and an environment differ."""
-    from mjx_dher.rollout import env_sizes
+    from mjx_dher.rollout import env_spec
 
-    theirs, own = tuple(env_sizes(env)), tuple(policy.sizes)
+    theirs, own = env_spec(env).sizes, policy.sizes
     if theirs != own:
         raise ValueError(
             f"the policy takes observations of {own[0]} and goals of {own[1]} numbers and gives actions of {own[2]}; the"

@@ -19,7 +19,7 @@ class TrainedPolicy(Protocol):
     """A deterministic policy, as `load_policy` returns it: a `Policy`, or a `learner_policy.LearnerPolicy`."""
 
     @property
-    def sizes(self) -> tuple[int, int, int]: ...  # of observations, goals and actions: D, G, A
+    def sizes(self) -> tuple[Any, int, int]: ...  # of observations, goals and actions: D, G, A (`EnvSpec.sizes`)
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # observations of one state or a batch -> actions [..., A]
 

@@ -300,7 +300,7 @@ def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, ru
     if learner is None:
         return
     policy = program.learner.export(learner, spec.hparams)
-    stored = LearnerPolicy(program.learner, learner, spec.hparams, program.sizes) if policy is None else policy
+    stored = LearnerPolicy(program.learner, learner, spec.hparams, program.spec) if policy is None else policy
     stored.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
 
 

@@ -64,7 +64,7 @@ def check_learner(
     expect_finite("the state that learner.init gives", state)
     batch = _batch(env, episodes, numbers)
     valid = jnp.arange(EPISODES) > 0
-    observation = jnp.where(valid[:, None, None], episodes.observation, jnp.nan)
+    observation = jax.tree.map(lambda x: _invalid(x, valid), episodes.observation)
     normalize = lambda s, n: made.update_normalizers(s, observation, batch.desired_goal, n, valid)  # noqa: E731
     state = _step("update_normalizers", jax.jit(normalize), state, numbers)
     _check_acting(made, state, episodes, env, numbers)
@@ -75,6 +75,13 @@ def check_learner(
     learners.check_metrics("summary", summary, metrics)
     expect_finite("metrics of learner.summary", summary)
     _check_export(made, moved, episodes, hparams, numbers)
+
+
+def _invalid(x: jax.Array, valid: jax.Array) -> jax.Array:
+    """Floats [N, ...] with NaN where `valid` [N] is False; other numbers as they are."""
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return x
+    return jnp.where(jnp.expand_dims(valid, range(1, x.ndim)), x, jnp.nan)
 
 
 def _batch(env: Env, episodes: Episode, hparams: HParams) -> Batch:
@@ -94,7 +101,7 @@ def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
 
 def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparams: HParams) -> None:
     obs: Any = {
-        "observation": episodes.observation[:, 0],
+        "observation": jax.tree.map(lambda x: x[:, 0], episodes.observation),
         "achieved_goal": episodes.achieved_goal[:, 0],
         "desired_goal": episodes.desired_goal,
     }
@@ -111,7 +118,7 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparam
         raise PartError("learner.act of a batch must be that of each of its observations; it depends on the others")
     if hasattr(made, "value"):
         values = learners.values_of(made, state, hparams)
-        several = [jnp.stack([x, x]) for x in (obs["observation"], obs["desired_goal"], action)]
+        several = jax.tree.map(lambda x: jnp.stack([x, x]), (obs["observation"], obs["desired_goal"], action))
         expect_finite("numbers of learner.value", attempt("learner.value", jax.jit(values.value), *several))
 
 

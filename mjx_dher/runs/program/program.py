@@ -23,14 +23,14 @@ from mjx_dher.demonstrations import read_demonstrations
 from mjx_dher.learners import Learner
 from mjx_dher.parallel import mesh, sharded, split
 from mjx_dher.parallel.mesh import ONE, Layout
-from mjx_dher.rollout import Outcome, check_steps, env_sizes, env_spec
+from mjx_dher.rollout import Outcome, check_steps, env_spec
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program.loop import Compiled
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState
-from mjx_dher.types import Env, PRNGKey, Sizes
+from mjx_dher.types import Env, EnvSpec, PRNGKey
 
 # HParams, and which of a program's samplers, priorities and generators a lane uses; see `one_of` of each.
 Lane = collections.namedtuple("Lane", (*HParams._fields, "choice", "priority_choice", "generator_choice"))  # type: ignore[misc]
@@ -66,7 +66,7 @@ class Program(NamedTuple):
     layout: Layout
     choices: Choices
     learner: Learner
-    sizes: Sizes
+    spec: EnvSpec
     compiled: Compiled
     evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
 
@@ -128,7 +128,7 @@ def compile_runs(
             loop.check_program(compiled, spec.config, layout.sharers)
             beside = available is not None and compiled.nbytes <= available / 2
             evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside, layout)
-            return Program(lanes * layout.lanes, layout, choices, train.learner, env_sizes(env), compiled, evaluate)
+            return Program(lanes * layout.lanes, layout, choices, train.learner, env_spec(env), compiled, evaluate)
         lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
 
 
