@@ -294,7 +294,7 @@ def test_observations_that_are_no_vector_are_refused():
             state = super().reset(key)
             return state.replace(obs={**state.obs, "observation": jnp.zeros((2, 2))})
 
-    with pytest.raises(ValueError, match="observation must be a vector .*encoder"):
+    with pytest.raises(ValueError, match=r"observation must be a vector .*encoder"):
         make_train(Pixels(), SMALL)
 
 
