@@ -8,17 +8,18 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_dher.envs import Simulator
 from mjx_dher.envs.engines import Controls, Physics, make_engine
 
 SUBSTEPS = 10
 
 
-def arm(size="0.02 0.02 0.04"):
+def arm():
     """Six joints with position servos, a tool, and a cube on the floor; contacts by contype and conaffinity."""
     links = [("0 0 0.1", "0 0 1"), ("0 0 0.2", "0 1 0"), ("0.3 0 0", "0 1 0"), ("0.3 0 0", "1 0 0"), ("0.1 0 0", "0 1 0")]
     body = '<body pos="{}"><joint name="j{}" axis="{}" range="-2 2" damping="2" armature="0.1"/><geom fromto="0 0 0 0.08 0 0"/>'
     chain = "".join(body.format(pos, number, axis) for number, (pos, axis) in enumerate(links))
-    tool = f'<body pos="0.08 0 0"><joint name="j5" axis="1 0 0" damping="2"/><geom type="box" size="{size}" mass="0.1"/></body>'
+    tool = '<body pos="0.08 0 0"><joint name="j5" axis="1 0 0" damping="2"/><geom type="box" size=".02 .02 .04"/></body>'
     servos = "".join(f'<position joint="j{number}" kp="50" ctrlrange="-2 2"/>' for number in range(6))
     return f"""
 <mujoco>
@@ -116,7 +117,9 @@ def test_what_an_engine_cannot_do_is_rejected_when_it_is_made():
     for engine in ("native", "jax"):
         with pytest.raises(ValueError, match=r"delays.*Simulator"):
             make_engine(engine, model, SUBSTEPS)
-    cylinder = arm().replace('type="box" size="0.02 0.02 0.04"', 'type="cylinder" size="0.02 0.04" contype="1"')
+    with pytest.raises(ValueError, match="delays"):
+        Simulator(model).advance(*start(model))
+    cylinder = arm().replace('type="box" size=".02 .02 .04"', 'type="cylinder" size=".02 .04" contype="1"')
     with pytest.raises(ValueError, match=r"engine jax: MJX .*CYLINDER.*; use engine native"):
         make_engine("jax", mujoco.MjModel.from_xml_string(cylinder), SUBSTEPS)
 

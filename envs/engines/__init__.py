@@ -9,7 +9,7 @@ from typing import Any
 
 import mujoco
 
-from mjx_dher.envs.engines.base import Controls, Engine, Physics
+from mjx_dher.envs.engines.base import Controls, Engine, Physics, check_state
 from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.spec import ENGINES
 
@@ -53,8 +53,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
     """
     for option in options:
         check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
-    if model.nhistory or model.npluginstate:
-        raise ValueError("the model has delays or plugins, whose state `Physics` does not hold; use mjx_dher.envs.Simulator")
+    check_state(model)
     return _constructor(name)(model, substeps=substeps, **options)
 
 

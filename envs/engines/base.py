@@ -42,8 +42,15 @@ class Engine(Protocol):
         """Raises ValueError if earlier steps were wrong in a way that their results do not show."""
 
 
+def check_state(model: mujoco.MjModel) -> None:
+    """Raises ValueError if the model has state that `Physics` does not hold."""
+    if model.nhistory or model.npluginstate:
+        raise ValueError("the model has delays or plugins, whose state `Physics` does not hold; use mjx_dher.envs.Simulator")
+
+
 def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) -> None:
-    """Raises ValueError if an array has another shape than the model's."""
+    """Raises ValueError if an array has another shape than the model's, or the model has more state."""
+    check_state(model)
     for values, shapes in (
         (physics, {"qpos": (model.nq,), "qvel": (model.nv,), "warmstart": (model.nv,), "act": (model.na,)}),
         (controls, {"ctrl": (model.nu,), "mocap": (model.nmocap, 7)}),
