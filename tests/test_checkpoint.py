@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import orbax.checkpoint
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, cli, trainer
@@ -141,45 +141,45 @@ def change_manifest(path, **changes):
 
 
 @pytest.mark.parametrize(
-    ("damage", "why"),
+    ("damage", "parts"),
     [
-        (cut, "is not as it was written"),
-        (lambda path: (path / "manifest.json").unlink(), "it has no manifest.json"),
-        (lambda path: (path / "manifest.json").write_text('{"schema": 1'), "manifest.json cannot be read"),
-        (lambda path: (path / "manifest.json").write_text("[]"), r"schema 2 \(found None\)"),
-        (lambda path: shutil.rmtree(path / "state"), "cannot be read"),
-        (lambda path: change_manifest(path, schema=0), r"schema 2 \(found 0\)"),
-        (lambda path: change_manifest(path, leaves=[]), "does not fit this run"),
+        (cut, []),
+        (lambda path: (path / "manifest.json").unlink(), ["manifest.json"]),
+        (lambda path: (path / "manifest.json").write_text('{"schema": 1'), ["manifest.json"]),
+        (lambda path: (path / "manifest.json").write_text("[]"), ["schema", None]),
+        (lambda path: shutil.rmtree(path / "state"), []),
+        (lambda path: change_manifest(path, schema=0), ["schema", 0]),
+        (lambda path: change_manifest(path, leaves=[]), []),
     ],
 )
-def test_a_damaged_checkpoint_is_refused_by_name_and_the_one_before_it_is_used(program, copy, damage, why):
+def test_a_damaged_checkpoint_is_refused_by_name_and_the_one_before_it_is_used(program, copy, damage, parts):
     newest, older = run_folder.checkpoints(copy)
     damage(newest)
     found = restore(copy, program)
     assert (found.path, found.epoch) == (older, 2)
     shutil.rmtree(older)
-    with pytest.raises(CheckpointError, match=why):
+    with refuses(newest, *parts, error=CheckpointError):
         restore(copy, program)
 
 
 @pytest.mark.parametrize(
-    ("config", "why"),
+    ("config", "parts"),
     [
-        (dataclasses.replace(CONFIG, hidden_sizes=(16, 17)), r"float32\[16\] where .* float32\[17\] is needed"),
-        (dataclasses.replace(CONFIG, hidden_sizes=(16,)), "does not fit this run"),
-        (dataclasses.replace(CONFIG, replay_size=210), "where .* is needed"),
+        (dataclasses.replace(CONFIG, hidden_sizes=(16, 17)), ["float32[16]", "float32[17]"]),
+        (dataclasses.replace(CONFIG, hidden_sizes=(16,)), []),
+        (dataclasses.replace(CONFIG, replay_size=210), []),
     ],
 )
-def test_the_state_of_another_run_is_refused(saved, config, why):
+def test_the_state_of_another_run_is_refused(saved, config, parts):
     other = trainer.make_train(ENV, config)
-    with pytest.raises(CheckpointError, match=why):
+    with refuses(*parts, error=CheckpointError):
         checkpoint.restore(saved[0], loop.state_template(other))
 
 
 def test_another_dtype_is_refused(saved, program):
     template = loop.state_template(program[0])
     template = dataclasses.replace(template, env_steps=jax.ShapeDtypeStruct((), "float32"))
-    with pytest.raises(CheckpointError, match=r"env_steps int32\[\] where .*env_steps float32\[\] is needed"):
+    with refuses("env_steps", "int32[]", "float32[]", error=CheckpointError):
         checkpoint.restore(saved[0], template)
 
 
@@ -196,7 +196,7 @@ def test_a_checkpoint_in_orbax_s_default_format_is_read(saved, program, tmp_path
 def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch):
     read = checkpoint._read_arrays
     monkeypatch.setattr(checkpoint, "_read_arrays", lambda *args: [x.astype(np.float64) for x in read(*args)])
-    with pytest.raises(CheckpointError, match=r"was read as .* float64"):
+    with refuses("float64", error=CheckpointError):
         restore(saved[0], program)
 
 
@@ -209,7 +209,7 @@ def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeyp
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(checkpoint, "_write_arrays", fill)
-    with pytest.raises(CheckpointError, match=r"epoch-000004 \(.*No space left.*\); the last one is .*epoch-000003"):
+    with refuses("epoch-000004", "No space left", "epoch-000003", error=CheckpointError):
         checkpoint.save(copy, state, 4, 1.0, keep=1)
     assert sorted(path.name for path in (copy / "checkpoints").iterdir()) == ["epoch-000002", "epoch-000003"]
     assert restore(copy, program).epoch == 3
@@ -218,7 +218,7 @@ def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeyp
 def test_a_disk_with_too_little_left_is_refused_before_anything_is_written(program, copy, monkeypatch):
     state = restore(copy, program).state
     monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**6, 10**6 - 1000, 1000))
-    with pytest.raises(CheckpointError, match=r"epoch-000004 \(it can take .* kB, and 1.0 kB of the disk are free\); the last"):
+    with refuses("epoch-000004", "1.0 kB", error=CheckpointError):
         checkpoint.save(copy, state, 4, 1.0, keep=1)
     assert restore(copy, program).epoch == 3
 

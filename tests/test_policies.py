@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, names, refuses
 
 import mjx_dher
 from mjx_dher import cli
@@ -119,15 +119,15 @@ def test_a_folder_that_is_no_run_does_not(monkeypatch, tmp_path):
 def test_a_file_by_the_name_comes_first(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "push").write_text("something else")
-    with pytest.raises(FolderError, match="push is damaged or not a policy"):
+    with refuses("push", error=FolderError):
         mjx_dher.load_policy("push")
 
 
-@pytest.mark.parametrize("name", ["pusch", "Push", "", "nowhere/push", "../policies/push"])
-def test_another_name_is_refused(name, monkeypatch, tmp_path):
+def test_another_name_is_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(FolderError, match="is not a run folder"):
-        mjx_dher.load_policy(name)
+    for name in ("pusch", "Push", "", "nowhere/push", "../policies/push"):
+        with refuses(name, error=FolderError):
+            mjx_dher.load_policy(name)
 
 
 def test_a_wrong_name_is_told_the_nearest(capsys, monkeypatch, tmp_path):
@@ -135,8 +135,8 @@ def test_a_wrong_name_is_told_the_nearest(capsys, monkeypatch, tmp_path):
     for command in (["eval", "pusch"], ["view", "pusch"], ["export", "pusch", "--format", "onnx"], ["transfer", "pusch"]):
         assert cli.main(command) == 2
         error = capsys.readouterr().err
-        assert error.startswith("error: pusch is not a run folder: no such folder; and a policy of the package must be one of ")
-        assert error.endswith("got 'pusch' (did you mean 'push'?)\n")
+        assert error.startswith("error: ")
+        names(error, "pusch", "push")
 
 
 def new_facts(rate):
@@ -156,7 +156,7 @@ def test_a_better_policy_takes_the_place_of_the_one_before(tmp_path):
     PUBLISH["publish"](run, target, new_facts(0.75), anyway=False)
     assert "**0.750** (95 % interval 0.650 to 0.850, 500 episodes from seed 1)" in (target / "README.md").read_text()
     assert {path.name for path in target.iterdir()} == {path.name for path in run.iterdir()}
-    with pytest.raises(ValueError, match=r"the policy there scores 0\.750, this one 0\.500; see --anyway"):
+    with refuses("0.750", "0.500", "--anyway"):
         PUBLISH["publish"](run, target, new_facts(0.5), anyway=False)
     PUBLISH["publish"](run, target, new_facts(0.5), anyway=True)
     assert "**0.500**" in (target / "README.md").read_text()
@@ -166,7 +166,7 @@ def test_too_large_a_policy_leaves_what_is_there(tmp_path):
     run, target = bundled.FOLDER / "reach", tmp_path / "policies" / "reach"
     PUBLISH["publish"](run, target, new_facts(0.5), anyway=False)
     (tmp_path / "policies" / "other").write_bytes(bytes(4_900_000))
-    with pytest.raises(ValueError, match=r"all policies together would take .* bytes; the limit is 5,000,000"):
+    with refuses("5,000,000"):
         PUBLISH["publish"](run, target, new_facts(0.75), anyway=False)
     assert "**0.500**" in (target / "README.md").read_text()
 
@@ -174,16 +174,16 @@ def test_too_large_a_policy_leaves_what_is_there(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder: (folder / "result.json").unlink(), "result.json is damaged"),
-        (lambda folder: (folder / "metrics.csv").write_text(""), "has whole lines of 0 of"),
-        (lambda folder: (folder / "policy.npz").unlink(), "has no policy.npz"),
-        (lambda folder: edit(folder / "result.json", status="failed", epochs=3), "has failed"),
+        (lambda folder: (folder / "result.json").unlink(), "result.json"),
+        (lambda folder: (folder / "metrics.csv").write_text(""), "metrics.csv"),
+        (lambda folder: (folder / "policy.npz").unlink(), "policy.npz"),
+        (lambda folder: edit(folder / "result.json", status="failed", epochs=3), "failed"),
     ],
 )
 def test_a_run_that_is_not_whole_is_not_published(damage, message, tmp_path):
     shutil.copytree(bundled.FOLDER / "reach", tmp_path / "run")
     damage(tmp_path / "run")
-    with pytest.raises(ValueError, match=message):
+    with refuses(message):
         PUBLISH["check"](tmp_path / "run", run_folder.read_spec(bundled.FOLDER / "reach"))
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 
 import mjx_dher
 from mjx_dher import RunSpec, learners
@@ -83,20 +83,20 @@ assert not any(name.startswith("mjx_dher.envs") for name in sys.modules)
 
 
 @pytest.mark.parametrize(
-    ("obs", "message"),
+    ("obs", "parts"),
     [
-        ({"observation": np.zeros(25)}, "the policy needs 'desired_goal'; got .'observation'"),
+        ({"observation": np.zeros(25)}, ["desired_goal"]),
         (
             {"observation": np.zeros(24), "desired_goal": np.zeros(3)},
-            r"observation must end in an axis of 25; got shape \(24,\)",
+            ["observation", 25, "(24,)"],
         ),
-        ({"observation": np.zeros(25), "desired_goal": np.zeros(())}, r"desired_goal must end in an axis of 3; got shape \(\)"),
-        ({"observation": np.zeros((2, 25)), "desired_goal": np.zeros(3)}, "batch shapes differ"),
-        ({"observation": np.full(25, np.nan), "desired_goal": np.zeros(3)}, "observation must be finite"),
+        ({"observation": np.zeros(25), "desired_goal": np.zeros(())}, ["desired_goal", 3, "()"]),
+        ({"observation": np.zeros((2, 25)), "desired_goal": np.zeros(3)}, [(2,), ()]),
+        ({"observation": np.full(25, np.nan), "desired_goal": np.zeros(3)}, ["observation", "finite"]),
     ],
 )
-def test_bad_observations_are_refused(run_dir, obs, message):
-    with pytest.raises(ValueError, match=message):
+def test_bad_observations_are_refused(run_dir, obs, parts):
+    with refuses(*parts):
         mjx_dher.load_policy(run_dir)(obs)
 
 
@@ -127,26 +127,26 @@ def damage(run_dir, how):
 
 
 @pytest.mark.parametrize(
-    ("how", "message"),
+    ("how", "parts"),
     [
-        ("no config", "is not a run folder: it has no config.json"),
-        ("broken json", "config.json cannot be read"),
-        ("foreign json", "config.json is not of this program's schema 2 .found None"),
-        ("list", "config.json is not of this program's schema 2"),
-        ("newer schema", "config.json is not of this program's schema 2 .found 99"),
-        ("unknown field", "config.json does not describe a run"),
-        ("no policy", "policy.npz is missing: the run was stopped before its first epoch ended"),
-        ("truncated policy", "policy.npz is damaged"),
-        ("foreign policy", "policy.npz is damaged or not a policy"),
-        ("no policy file at all", "policy.npz is damaged or not a policy"),
+        ("no config", ["config.json"]),
+        ("broken json", ["config.json"]),
+        ("foreign json", ["config.json", "schema", None]),
+        ("list", ["config.json", "schema"]),
+        ("newer schema", ["config.json", "schema", 99]),
+        ("unknown field", ["config.json"]),
+        ("no policy", ["policy.npz", "missing"]),
+        ("truncated policy", ["policy.npz", "damaged"]),
+        ("foreign policy", ["policy.npz", "damaged"]),
+        ("no policy file at all", ["policy.npz", "damaged"]),
     ],
 )
-def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, message):
+def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, parts):
     damage(run_dir, how)
-    with pytest.raises(FolderError, match=message):
+    with refuses(*parts, error=FolderError):
         mjx_dher.load_policy(run_dir)
 
 
 def test_no_folder(tmp_path):
-    with pytest.raises(FolderError, match="nowhere is not a run folder: no such folder"):
+    with refuses("nowhere", error=FolderError):
         mjx_dher.load_policy(tmp_path / "nowhere")

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 from filelock import Timeout
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 
@@ -287,22 +288,22 @@ def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, m
 
 
 def test_what_is_no_sweep_is_named(tmp_path):
-    with pytest.raises(FolderError, match="holds no finished run of a sweep"):
+    with refuses(tmp_path, error=FolderError):
         tables.read(tmp_path)
     trials = make_grid(("future",), (0,), static=LONGER)
     run(tmp_path, trials)
     cell = grid.folder_of(tmp_path, trials[0])
-    for name, content, message in (
+    for name, content, part in (
         (
             "metrics.csv",
             "epoch,success_rate\n",
-            "whole lines of 0 of 5 epochs; the sweep's command trains it again",
+            "5 epochs",
         ),
-        ("config.json", json.dumps({"schema": 0}), "is not of this program's schema 2"),
-        ("result.json", "{", r"result\.json is damaged"),
+        ("config.json", json.dumps({"schema": 0}), "schema"),
+        ("result.json", "{", "damaged"),
     ):
         (cell / name).write_text(content)
-        with pytest.raises(FolderError, match=message):
+        with refuses(name, part, error=FolderError):
             tables.read(tmp_path)
     (cell / "result.json").unlink()  # as if the write had been cut short
     assert not grid.is_done(tmp_path, trials[0])

@@ -12,7 +12,7 @@ import webbrowser
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 
 from mjx_dher import cli, envs
 from mjx_dher.policy import bundled
@@ -44,28 +44,28 @@ def test_a_port_in_use_is_refused():
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         number = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=rf"port {number} of 127\.0\.0\.1 cannot be used \(.*in use.*--port, or 0"):
+        with refuses("port", number, "--port"):
             address.check("127.0.0.1", number)
 
 
 @pytest.mark.parametrize(
-    ("host", "port", "message"),
+    ("host", "port", "parts"),
     [
-        ("127.0.0.1", -1, r"port must lie in \[0, 65535\]; got -1"),
-        ("127.0.0.1", 65536, r"port must lie in \[0, 65535\]; got 65536"),
-        ("192.0.2.1", 0, "host '192.0.2.1' is no address of this machine"),
-        ("no such host", 0, "host 'no such host' is no address of this machine"),
-        ("a" * 300, 0, "is no address of this machine"),
+        ("127.0.0.1", -1, ["port", -1]),
+        ("127.0.0.1", 65536, ["port", 65536]),
+        ("192.0.2.1", 0, ["host", "192.0.2.1"]),
+        ("no such host", 0, ["host", "no such host"]),
+        ("a" * 300, 0, ["host"]),
     ],
 )
-def test_a_bad_address_is_refused(host, port, message):
-    with pytest.raises(ValueError, match=message):
+def test_a_bad_address_is_refused(host, port, parts):
+    with refuses(*parts):
         address.check(host, port)
 
 
 def test_the_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ValueError, match=r"the viewer needs viser.*\[view\]"):
+    with refuses("viser", "[view]"):
         address.check("127.0.0.1", 0)
 
 
@@ -113,7 +113,7 @@ def test_the_page_is_served_and_the_port_is_free_afterwards(port, capsys):
         with urllib.request.urlopen(viewer.address, timeout=10) as answer:
             assert answer.status == 200
             assert b"<html" in answer.read(2000).lower()
-        with pytest.raises(ValueError, match="cannot be used"):
+        with refuses("port"):
             address.check("127.0.0.1", port)
         ends = time.monotonic() + 0.2
         viewer.run(lambda: time.monotonic() > ends)
