@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_o
 
 from mjx_dher.lookup import check_name
 
-INT32_MAX = 2**31 - 1  # counters on the device are int32
-MAX_DEVICES = 1_000_000
+_INT32_MAX = 2**31 - 1  # counters on the device are int32
+_MAX_DEVICES = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,8 +175,8 @@ def check_devices(devices: Any) -> None:
     """Raises ValueError unless `devices` is a number of devices, or "all"; whether they are there, JAX knows."""
     if devices != "all":
         is_number = isinstance(devices, int) and not isinstance(devices, bool)
-        if not is_number or not 1 <= devices <= MAX_DEVICES:
-            raise ValueError(f"devices must be an integer in [1, {MAX_DEVICES}], or all; got {devices!r}")
+        if not is_number or not 1 <= devices <= _MAX_DEVICES:
+            raise ValueError(f"devices must be an integer in [1, {_MAX_DEVICES}], or all; got {devices!r}")
 
 
 def check_parts(config: Config, episode_length: int, parts: int) -> None:
@@ -321,9 +321,9 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
     period, delay = c.target_period, c.policy_delay
     at_once = max(period, delay)
-    if c.batch_size * at_once > INT32_MAX:
+    if c.batch_size * at_once > _INT32_MAX:
         yield (
-            f"batch_size must not exceed {INT32_MAX // at_once} with target_period {period} and policy_delay {delay}, because"
+            f"batch_size must not exceed {_INT32_MAX // at_once} with target_period {period} and policy_delay {delay}, because"
             f" the batches of {at_once} updates are drawn at once; got {c.batch_size}"
         )
     epochs = num_epochs(c, episode_length)
@@ -331,5 +331,5 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
         ("total_steps", epochs * steps_per_epoch(c, episode_length)),
         ("updates_per_cycle", epochs * c.cycles_per_epoch * c.updates_per_cycle),
     ):
-        if count > INT32_MAX:
-            yield f"{field} must not make a run of more than {INT32_MAX} steps or updates; got {count} in {epochs} epochs"
+        if count > _INT32_MAX:
+            yield f"{field} must not make a run of more than {_INT32_MAX} steps or updates; got {count} in {epochs} epochs"

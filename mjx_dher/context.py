@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from mjx_dher.config import HParams
 from mjx_dher.types import Array, Batch, DistanceFn, PyTree, ReachedFn, RewardFn
 
-ROWS_AT_ONCE = 256  # episodes that `of_each_episode` computes at a time: their activations need memory
+_ROWS_AT_ONCE = 256  # episodes that `of_each_episode` computes at a time: their activations need memory
 
 
 def euclidean(achieved: Array, desired: Array) -> Array:
@@ -95,7 +95,7 @@ def pick(results: Sequence[Any], number: Array) -> Array:
 def of_each_episode(function: Callable[[Any], Array], episodes: Any) -> Array:
     """Applies `function` to each episode (leaves lead with [E]), a few hundred at a time."""
     number = jax.tree.leaves(episodes)[0].shape[0]
-    return jax.lax.map(function, episodes, batch_size=min(number, ROWS_AT_ONCE))
+    return jax.lax.map(function, episodes, batch_size=min(number, _ROWS_AT_ONCE))
 
 
 def one_of(functions: Sequence[Callable[..., Any]], index: str) -> Callable[..., Array]:

@@ -218,7 +218,7 @@ def _error_size(sample: Sample, batch: Batch, context: Context) -> Array:
     return jnp.abs(context.td_error(batch))
 
 
-def mean_error(ring: ReplayState, context: Context) -> Array:
+def _mean_error(ring: ReplayState, context: Context) -> Array:
     """Mean size [E] of each episode's one-step errors, for the goal that it was played for."""
 
     def of_episode(episode: Episode) -> Array:
@@ -246,4 +246,4 @@ def mean_error(ring: ReplayState, context: Context) -> Array:
 
 
 # Luu & Yoo 2021 ("HGR"): episodes by their mean error, then hindsight goals by theirs.
-td_error = Priority(renew=mean_error, choose=by_weight(_error_size), uses_values=True, by_part=True)
+td_error = Priority(renew=_mean_error, choose=by_weight(_error_size), uses_values=True, by_part=True)

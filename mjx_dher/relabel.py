@@ -18,7 +18,7 @@ from mjx_dher.replay import Cumulative, Pool, ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey
 
-CHOOSE = 0x43686F69  # folded into a draw's key, for a choice among transitions; no index of `jax.random.split`
+_CHOOSE = 0x43686F69  # folded into a draw's key, for a choice among transitions; no index of `jax.random.split`
 
 
 class Hindsight(NamedTuple):
@@ -176,7 +176,7 @@ def draw_batches(
         sample, batch = draw(number)
     else:
         candidates = draw(priorities.CANDIDATES * number)
-        sample, batch = priorities.choose(priority, jax.random.fold_in(key, CHOOSE), *candidates, number, context)
+        sample, batch = priorities.choose(priority, jax.random.fold_in(key, _CHOOSE), *candidates, number, context)
     if n_step > 1:
         batch = look_ahead(ring, sample, batch, context, n_step)
     factor = hindsight_factor(sample, batch, context.hparams)

@@ -78,11 +78,11 @@ class RunSpec:
         table, default = COMPONENTS["priority"], RunSpec(env=self.env)
         group = table[self.priority].group if self.priority in table else None
         alike = next((name for name, component in table.items() if component.group == group), self.priority)
-        return dataclasses.replace(self, priority=alike, **{name: getattr(default, name) for name in LANE_FIELDS})
+        return dataclasses.replace(self, priority=alike, **{name: getattr(default, name) for name in _LANE_FIELDS})
 
 
 # Fields in which runs that share a compiled program can differ. Priorities can differ within a group.
-LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "generator", "seed", "hparams")
+_LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "generator", "seed", "hparams")
 
 
 def custom_components(spec: RunSpec) -> dict[str, str]:

@@ -33,13 +33,13 @@ class Generator:
         return self.generate(key, obs, ring, context)
 
 
-def own_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
+def _own_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
     """Returns the goals [N, G] that the reset drew."""
     del key, ring, context
     return obs["desired_goal"]
 
 
-reset = Generator(own_goals)
+reset = Generator(_own_goals)
 
 
 def make(name: str | Generator | GenerateFn) -> Generator:

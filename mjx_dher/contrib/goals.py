@@ -13,11 +13,11 @@ from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import future
 from mjx_dher.types import Array, GoalObs, PRNGKey
 
-START_WEIGHT = 3.0  # c of HGG
-LIPSCHITZ = 5.0  # L of HGG
+_START_WEIGHT = 3.0  # c of HGG
+_LIPSCHITZ = 5.0  # L of HGG
 STILL = 0.01  # m; an episode whose goals end within this of where they began offers none
-SOFTNESS = 0.05  # of the matching, as a fraction of the mean cost
-SINKHORN_ROUNDS = 50
+_SOFTNESS = 0.05  # of the matching, as a fraction of the mean cost
+_SINKHORN_ROUNDS = 50
 
 
 def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
@@ -30,7 +30,7 @@ def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) 
     return jnp.log(share * following + (1.0 - share) * jax.nn.softmax(future(achieved, desired, step, hparams)))
 
 
-def match(cost: Array, usable: Array, softness: Array | float = SOFTNESS, rounds: int = SINKHORN_ROUNDS) -> Array:
+def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, rounds: int = _SINKHORN_ROUNDS) -> Array:
     """Returns the log plan [N, P] of a soft matching of N rows to the usable of P columns: how likely a row takes each.
 
     Every row has the same mass and so has every usable column (Sinkhorn & Knopp 1967; Cuturi 2013), so that the plan makes the
@@ -88,8 +88,8 @@ def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Cont
     first = jax.tree.map(lambda x: jnp.broadcast_to(x[rows, :1], (*shape, *x.shape[2:])), ring.episodes.observation)
     diameter = jnp.max(jnp.linalg.norm(desired - start, axis=-1))
     value = jnp.clip(context.values.of_state(first, achieved), *context.bounds())
-    least, step = _nearest(achieved, value * (1.0 - context.hparams.gamma) * diameter / LIPSCHITZ, desired)
-    cost = least + START_WEIGHT * jnp.linalg.norm(start[:, None] - achieved[None, :, 0], axis=-1)
+    least, step = _nearest(achieved, value * (1.0 - context.hparams.gamma) * diameter / _LIPSCHITZ, desired)
+    cost = least + _START_WEIGHT * jnp.linalg.norm(start[:, None] - achieved[None, :, 0], axis=-1)
     moved = jnp.linalg.norm(achieved[:, -1] - achieved[:, 0], axis=-1) > STILL
     row = jax.random.categorical(match_key, match(cost, moved | ~jnp.any(moved)), axis=-1)
     goals = achieved[row, step[jnp.arange(number), row]]

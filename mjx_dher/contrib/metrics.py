@@ -16,7 +16,7 @@ from mjx_dher.priorities import GRAVITY, STEP_SECONDS, displacements
 from mjx_dher.samplers import LearnedMetric, position
 from mjx_dher.types import Array, Episode
 
-SPEED_STEPS = 5.0  # steps at its present velocity that count as much as the distance
+_SPEED_STEPS = 5.0  # steps at its present velocity that count as much as the distance
 
 
 def velocity(achieved: Array, desired: Array) -> Array:
@@ -25,11 +25,11 @@ def velocity(achieved: Array, desired: Array) -> Array:
     sqrt(|p_i - g|^2 + |5 v_i|^2), v_i the displacement of one step: an object that flies past a goal is not near to it.
     """
     distance = position(achieved, desired)
-    moving = position(SPEED_STEPS * displacements(achieved), jnp.zeros_like(desired))
+    moving = position(_SPEED_STEPS * displacements(achieved), jnp.zeros_like(desired))
     return jnp.sqrt(jnp.square(distance) + jnp.square(moving))
 
 
-def resting(achieved: Array, desired: Array, friction: float) -> Array:
+def _resting(achieved: Array, desired: Array, friction: float) -> Array:
     """Returns the distances [T+1] to the desired goal [G] of the points at which the object would come to rest.
 
     An object that slides at v m/s, held back by friction alone, stops after v^2 / (2 friction g): it comes to rest at
@@ -42,8 +42,8 @@ def resting(achieved: Array, desired: Array, friction: float) -> Array:
     return position(achieved + velocities * speed[:, None] / (2.0 * friction * GRAVITY), desired)
 
 
-resting_point = functools.partial(resting, friction=0.1)  # Slide's puck on its table
-resting_point_rough = functools.partial(resting, friction=1.0)  # the cube of Push and PickAndPlace
+resting_point = functools.partial(_resting, friction=0.1)  # Slide's puck on its table
+resting_point_rough = functools.partial(_resting, friction=1.0)  # the cube of Push and PickAndPlace
 
 
 def _steps_left(episode: Episode, context: Context) -> Array:

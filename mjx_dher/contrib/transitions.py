@@ -14,15 +14,15 @@ from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, by_weight
 from mjx_dher.replay import Sample
 from mjx_dher.types import Array, Batch, PRNGKey
 
-CURRICULUM_GROUP = 8  # transitions that `curriculum` chooses together, of four times as many
-DIVERSE_WIDTH = 0.5  # m, of the kernel by which `dpp` compares goals, as in its authors' code
-MOST_PROXIMITY = 10.0  # exp of this is the weight of proximity in `curriculum` at the end of a run
+_CURRICULUM_GROUP = 8  # transitions that `curriculum` chooses together, of four times as many
+_DIVERSE_WIDTH = 0.5  # m, of the kernel by which `dpp` compares goals, as in its authors' code
+_MOST_PROXIMITY = 10.0  # exp of this is the weight of proximity in `curriculum` at the end of a run
 
 # pick(key, sample, batch of one group [C], number, view) -> indices [number] within the group
 GroupFn = Callable[[PRNGKey, Sample, Batch, int, Context], Array]
 
 
-def in_groups(pick: GroupFn, size: int) -> ChooseFn:
+def _in_groups(pick: GroupFn, size: int) -> ChooseFn:
     """Returns a `choose` that makes groups of CANDIDATES * `size` transitions and keeps `size` of each by `pick`.
 
     Where `size` does not divide the number that is wanted, groups are smaller.
@@ -39,7 +39,7 @@ def in_groups(pick: GroupFn, size: int) -> ChooseFn:
     return choose
 
 
-def squared_distances(goals: Array) -> Array:
+def _squared_distances(goals: Array) -> Array:
     """Returns the squared distances [C, C] of goals [C, G] to one another."""
     return jnp.sum(jnp.square(goals[:, None] - goals[None]), axis=-1)
 
@@ -54,11 +54,11 @@ def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, con
     """
     del key
     goals, members = batch.desired_goal, jnp.arange(sample.step.shape[0])
-    squares = squared_distances(goals)
+    squares = _squared_distances(goals)
     mean = jnp.mean(jnp.sqrt(squares))
     alike = jnp.exp(-squares / jnp.maximum(jnp.square(mean), 1e-12))
     far = jnp.sqrt(jnp.sum(jnp.square(goals - sample.episode_goals[members, sample.step]), axis=-1))
-    strength = jnp.exp(MOST_PROXIMITY * jnp.asarray(context.progress, jnp.float32))
+    strength = jnp.exp(_MOST_PROXIMITY * jnp.asarray(context.progress, jnp.float32))
 
     def add(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
         covered, free = state  # [C] how well each goal is stood for, and which may still be chosen
@@ -82,7 +82,7 @@ def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, contex
         return jax.random.randint(key, (1,), 0, size)
     if number != 2:
         raise ValueError(f"pick_diverse draws one or two of a group; it was asked for {number}")
-    determinants = -jnp.expm1(-squared_distances(batch.desired_goal) / DIVERSE_WIDTH**2)
+    determinants = -jnp.expm1(-_squared_distances(batch.desired_goal) / _DIVERSE_WIDTH**2)
     apart = jnp.triu(jnp.ones((size, size), bool), 1)
     # Where all goals are the same, any pair is as good as another.
     log_weights = jnp.where(apart, jnp.log(jnp.maximum(determinants, 1e-12)), -jnp.inf).reshape(-1)
@@ -101,6 +101,6 @@ def not_misled(sample: Sample, batch: Batch, context: Context) -> Array:
     return 1.0 - (reached & replaced).astype(jnp.float32)
 
 
-dpp = Priority(weigh=diversity, choose=in_groups(pick_diverse, 2))
-curriculum = Priority(choose=in_groups(pick_curriculum, CURRICULUM_GROUP))
+dpp = Priority(weigh=diversity, choose=_in_groups(pick_diverse, 2))
+curriculum = Priority(choose=_in_groups(pick_curriculum, _CURRICULUM_GROUP))
 not_misleading = Priority(choose=by_weight(not_misled))

@@ -95,14 +95,14 @@ def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[Ru
       todo: those that have not ended.
     """
     by_name, waiting = {fingerprint.trial_name(spec): spec for spec in specs}, set(todo)
-    found = []
+    earlier = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():
         with contextlib.suppress(OSError, ValueError):  # damaged: its runs begin from the start
             chunk = tuple(by_name[name] for name in json.loads(path.read_text()) if name in by_name)
             if waiting & set(chunk):
                 waiting -= set(chunk)
-                found.append(chunk)
-    return found
+                earlier.append(chunk)
+    return earlier
 
 
 def make(

@@ -18,7 +18,7 @@ from mjx_dher.networks import Actor, GaussianActor
 from mjx_dher.types import Array, Metrics, PRNGKey, PyTree
 
 Judge = Callable[[Array], Array]
-LOG_STD_RANGE = (-20.0, 2.0)  # Haarnoja et al. 2018, their code
+_LOG_STD_RANGE = (-20.0, 2.0)  # Haarnoja et al. 2018, their code
 
 
 class Noise(NamedTuple):
@@ -201,7 +201,7 @@ def sample_action(network: Any, params: PyTree, observation: Array, goal: Array,
 
 def _moments(network: Any, params: PyTree, observation: Array, goal: Array) -> tuple[Array, Array]:
     mean, log_std = network.apply(params["network"], observation, goal)
-    return mean, jnp.clip(log_std, *LOG_STD_RANGE)
+    return mean, jnp.clip(log_std, *_LOG_STD_RANGE)
 
 
 def _alpha(params: PyTree, hparams: HParams) -> Array:
