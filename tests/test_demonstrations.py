@@ -158,3 +158,31 @@ def test_a_stopped_run_ends_as_the_one_that_was_not(file, tmp_path):
     train(tmp_path / "run", 99)
     first, second = (np.load(tmp_path / name / "policy.npz") for name in ("whole", "run"))
     assert all(np.array_equal(first[name], second[name]) for name in first.files)
+
+
+def test_a_minari_data_set_is_read(tmp_path, monkeypatch):
+    minari, gymnasium = pytest.importorskip("minari"), pytest.importorskip("gymnasium")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    box = lambda size: gymnasium.spaces.Box(-10, 10, (size,), np.float32)  # noqa: E731
+    space = gymnasium.spaces.Dict({name: box(2) for name in ("observation", "achieved_goal", "desired_goal")})
+    episodes, buffers = played(Ending(), 3), []
+    for number, length in enumerate(map(int, episodes.length)):
+        obs = {name: getattr(episodes, name)[number, : length + 1] for name in ("observation", "achieved_goal")}
+        obs["desired_goal"] = np.tile(episodes.desired_goal[number], (length + 1, 1))
+        ends = np.arange(length) == length - 1
+        buffer = minari.data_collector.EpisodeBuffer(
+            id=number,
+            observations=obs,
+            actions=episodes.action[number, :length],
+            rewards=list(np.zeros(length)),
+            terminations=list(np.zeros(length, bool)),
+            truncations=list(ends),
+        )
+        buffers.append(buffer)
+    spaces = {"observation_space": space, "action_space": gymnasium.spaces.Box(-1, 1, (2,), np.float32)}
+    minari.create_dataset_from_buffers("point/walk-v0", buffers, **spaces)
+    for source in ("point/walk-v0", str(tmp_path / "point" / "walk-v0")):
+        same(read_demonstrations(source, Ending(), 6), episodes)
+        assert fingerprint.sources(RunSpec(demonstrations=source))["demonstrations"].startswith("walk-v0 ")
+    with refuses("point/walk-v0", "length", "10"):
+        read_demonstrations("point/walk-v0", ENV, 6)
