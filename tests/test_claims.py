@@ -146,14 +146,13 @@ def test_a_finished_trial_with_a_short_curve_is_named_and_trained_again(tmp_path
         assert table(tmp_path) == whole
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"status": "finished"}', "\x00", "[" * 100_000])
-def test_a_damaged_result_is_named_and_the_trial_trained_again(tmp_path, text):
-    trials = make_grid(("future",), (0,))
+def test_a_damaged_result_is_named_and_the_trial_trained_again(tmp_path):
+    trials, told = make_grid(("future",), (0,)), []
     run(tmp_path, trials)
-    (grid.folder_of(tmp_path, trials[0]) / "result.json").write_text(text)
-    with refuses("result.json", error=FolderError):
-        tables.read(tmp_path)
-    told = []
+    for text in ("", "{", "[]", "\x00", "[" * 100_000, '{"status": "finished"}'):
+        (grid.folder_of(tmp_path, trials[0]) / "result.json").write_text(text)
+        with refuses("result.json", error=FolderError):
+            tables.read(tmp_path)
     assert len(run(tmp_path, trials, report=told.append)) == 1
     assert "result.json is damaged" in told[0]
     assert len(tables.read(tmp_path)) == 1

@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 import sys
 
@@ -82,22 +83,20 @@ assert not any(name.startswith("mjx_dher.envs") for name in sys.modules)
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-@pytest.mark.parametrize(
-    ("obs", "parts"),
-    [
-        ({"observation": np.zeros(25)}, ["desired_goal"]),
-        (
-            {"observation": np.zeros(24), "desired_goal": np.zeros(3)},
-            ["observation", 25, "(24,)"],
-        ),
-        ({"observation": np.zeros(25), "desired_goal": np.zeros(())}, ["desired_goal", 3, "()"]),
-        ({"observation": np.zeros((2, 25)), "desired_goal": np.zeros(3)}, [(2,), ()]),
-        ({"observation": np.full(25, np.nan), "desired_goal": np.zeros(3)}, ["observation", "finite"]),
-    ],
-)
-def test_bad_observations_are_refused(run_dir, obs, parts):
-    with refuses(*parts):
-        mjx_dher.load_policy(run_dir)(obs)
+BAD_OBSERVATIONS = [
+    ({"observation": np.zeros(25)}, ["desired_goal"]),
+    ({"observation": np.zeros(24), "desired_goal": np.zeros(3)}, ["observation", 25, "(24,)"]),
+    ({"observation": np.zeros(25), "desired_goal": np.zeros(())}, ["desired_goal", 3, "()"]),
+    ({"observation": np.zeros((2, 25)), "desired_goal": np.zeros(3)}, ["observation", (2, 25), "desired_goal", (3,)]),
+    ({"observation": np.full(25, np.nan), "desired_goal": np.zeros(3)}, ["observation", "finite"]),
+]
+
+
+def test_bad_observations_are_refused(run_dir):
+    policy = mjx_dher.load_policy(run_dir)
+    for obs, parts in BAD_OBSERVATIONS:
+        with refuses(*parts):
+            policy(obs)
 
 
 def damage(run_dir, how):
@@ -126,25 +125,26 @@ def damage(run_dir, how):
         policy_file.write_text("hello")
 
 
-@pytest.mark.parametrize(
-    ("how", "parts"),
-    [
-        ("no config", ["config.json"]),
-        ("broken json", ["config.json"]),
-        ("foreign json", ["config.json", "schema", None]),
-        ("list", ["config.json", "schema"]),
-        ("newer schema", ["config.json", "schema", 99]),
-        ("unknown field", ["config.json"]),
-        ("no policy", ["policy.npz", "missing"]),
-        ("truncated policy", ["policy.npz", "damaged"]),
-        ("foreign policy", ["policy.npz", "damaged"]),
-        ("no policy file at all", ["policy.npz", "damaged"]),
-    ],
-)
-def test_unreadable_and_foreign_run_folders_are_refused(run_dir, how, parts):
-    damage(run_dir, how)
-    with refuses(*parts, error=FolderError):
-        mjx_dher.load_policy(run_dir)
+DAMAGES = {
+    "no config": ["config.json"],
+    "broken json": ["config.json"],
+    "foreign json": ["config.json", "schema", None],
+    "list": ["config.json", "schema"],
+    "newer schema": ["config.json", "schema", 99],
+    "unknown field": ["config.json"],
+    "no policy": ["policy.npz", "missing"],
+    "truncated policy": ["policy.npz", "damaged"],
+    "foreign policy": ["policy.npz", "damaged"],
+    "no policy file at all": ["policy.npz", "damaged"],
+}
+
+
+def test_unreadable_and_foreign_run_folders_are_refused(run_dir, tmp_path_factory):
+    for how, parts in DAMAGES.items():
+        copy = shutil.copytree(run_dir, tmp_path_factory.mktemp("damaged") / "run")
+        damage(copy, how)
+        with refuses(*parts, error=FolderError):
+            mjx_dher.load_policy(copy)
 
 
 def test_no_folder(tmp_path):

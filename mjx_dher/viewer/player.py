@@ -193,7 +193,7 @@ class Player:
 
     def _look(self) -> None:
         """Notes what is to be seen of the state."""
-        self.obs = {name: np.asarray(x, np.float32) for name, x in self._state.obs.items()}
+        self.obs = jax.tree.map(np.asarray, dict(self._state.obs))
         value = float("nan") if self.value is None else self.value(self.obs, self.act(self.obs))
         now = self._steps * SECONDS_PER_STEP
         if self.history and self.history[-1][0] == now:  # moved, or begun anew, since the last step
