@@ -18,7 +18,7 @@ from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.program.loop import state_template
 from mjx_dher.samplers import LearnedMetric
-from mjx_dher.testing import PartError
+from mjx_dher.testing import ComponentError
 from point_mass import PointMass
 
 ENV = PointMass()
@@ -164,18 +164,18 @@ def test_trials_name_what_is_wrong():
         (lambda key, obs, ring, context: jnp.full((16, 2), jnp.nan), "no goal is finite"),
         (lambda key, obs, ring, context: 1 / 0, "ZeroDivisionError"),
     ):
-        with pytest.raises(PartError, match=message):
+        with pytest.raises(ComponentError, match=message):
             testing.check_generator(wrong, ENV, None, episodes)
-    with pytest.raises(PartError, match="with_goal"):
+    with pytest.raises(ComponentError, match="with_goal"):
         testing.check_generator(corner, WithoutGoals())
     assert "100% of the goals" in testing.check_generator(corner, ENV, None, episodes)
-    with pytest.raises(PartError, match="negative"):
+    with pytest.raises(ComponentError, match="negative"):
         testing.check_priority(Priority(renew=lambda ring, context: -ring.priority - 1.0), ENV, None, episodes)
-    with pytest.raises(PartError, match="indices"):
+    with pytest.raises(ComponentError, match="indices"):
         testing.check_priority(
             Priority(choose=lambda key, sample, batch, number, context: 99 + jnp.arange(number)), ENV, None, episodes
         )
-    with pytest.raises(PartError, match="negative"):
+    with pytest.raises(ComponentError, match="negative"):
         testing.check_metric(LearnedMetric(lambda episode, context: -jnp.ones(11)), ENV, episodes)
 
 
@@ -196,9 +196,9 @@ def test_a_task_that_changes_more_than_the_goal_is_named():
         def with_goal(self, state, goal):
             return state
 
-    with pytest.raises(testing.EnvError, match="changed observation"):
+    with pytest.raises(testing.ComponentError, match="changed observation"):
         testing.check_env(Moves())
-    with pytest.raises(testing.EnvError, match="handed in"):
+    with pytest.raises(testing.ComponentError, match="handed in"):
         testing.check_env(Ignores())
 
 

@@ -38,8 +38,8 @@ def check_command(argv: list[str], console: Console) -> int:
     if not spec.custom_components(run):
         raise ValueError("check takes one or more components as module:attribute; all of these are built in")
     prepare()
-    from mjx_dher.testing import check_parts
+    from mjx_dher.testing import check_components
 
-    for line in check_parts(make_env(run), run):
+    for line in check_components(make_env(run), run):
         console.print(line)
     return 0

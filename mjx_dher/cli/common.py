@@ -74,7 +74,7 @@ def settle_compiler(engine: str) -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_enable_concurrency_optimized_scheduler=false".strip()
 
 
-def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
+def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
     """Tries out what is the user's own in runs of an environment, before anything is compiled or written.
 
     Raises:
@@ -83,9 +83,9 @@ def try_parts(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
     tried: set[str] = set()
     for spec in specs:
         if custom_components(spec):
-            from mjx_dher.testing import check_parts
+            from mjx_dher.testing import check_components
 
-            for line in check_parts(env, dataclasses.replace(spec, seed=0)):
+            for line in check_components(env, dataclasses.replace(spec, seed=0)):
                 if line not in tried:
                     tried.add(line)
                     console.print(line)

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mjx_dher import spec
-from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_parts
+from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_components
 from mjx_dher.fleet import chunks, cluster, driver, worker
 from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.fleet.options import LOCAL, FleetOptions
@@ -127,7 +127,7 @@ def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.custom_components, own)):
             settle_compiler(engine)
-            try_parts(make_env(own[0], "native" if own[0].engine == "warp" else None), own, console)
+            try_components(make_env(own[0], "native" if own[0].engine == "warp" else None), own, console)
 
 
 class _Screen:

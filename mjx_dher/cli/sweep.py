@@ -13,7 +13,7 @@ from rich.console import Console
 from mjx_dher import presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_parts
+from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_components
 from mjx_dher.cli.processes import join
 from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
 from mjx_dher.fleet.options import FleetOptions
@@ -280,7 +280,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
     for _, group in itertools.groupby(todo, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.custom_components, own)):
-            try_parts(make_env(own[0]), own, console)
+            try_components(make_env(own[0]), own, console)
     stop, screen = Stop(console, args.out), Screen(console, todo)
     try:
         with stop:

@@ -23,7 +23,7 @@ from mjx_dher.cli.common import (
     make_env,
     print_summary,
     settle_compiler,
-    try_parts,
+    try_components,
     warn_of_tau,
 )
 from mjx_dher.cli.processes import check_out, claim, join
@@ -124,7 +124,7 @@ def train_command(argv: list[str], console: Console) -> int:
         folder = Path(processes.broadcast(lambda: str(claim(stack, args.out, args.spec, resumes=args.distributed))))
         prepare()
         env = make_env(args.spec)
-        try_parts(env, [args.spec], screen)
+        try_components(env, [args.spec], screen)
         beside = stack.enter_context(Beside(folder, port if processes.leads() else None, screen))
         return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, beside.after_epoch)
 

@@ -1,4 +1,4 @@
-"""Conformance tests: `check_env` for environments, and one for every other part of one's own.
+"""Conformance tests for custom components: one function for each kind.
 
 In a test:
 
@@ -8,29 +8,28 @@ In a test:
     check_sampler(my_sampler, MyTask())
 """
 
-from mjx_dher.testing.env import EnvError, check_env
-from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.methods import check_generator
-from mjx_dher.testing.parts import (
-    PartError,
+from mjx_dher.testing.components import (
+    check_components,
     check_kernel,
     check_metric,
     check_normalization,
-    check_parts,
     check_priority,
     check_sampler,
 )
+from mjx_dher.testing.env import check_env
+from mjx_dher.testing.learner import check_learner
+from mjx_dher.testing.methods import check_generator
+from mjx_dher.testing.trial import ComponentError
 
 __all__ = [
-    "EnvError",
-    "PartError",
+    "ComponentError",
+    "check_components",
     "check_env",
     "check_generator",
     "check_kernel",
     "check_learner",
     "check_metric",
     "check_normalization",
-    "check_parts",
     "check_priority",
     "check_sampler",
 ]
