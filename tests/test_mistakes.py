@@ -79,7 +79,7 @@ def test_what_is_right_passes(capsys):
     assert "point_mass:PointMass" in lines[0]
     assert [line.partition(" ")[0] for line in lines] == ["env", "metric", "weighted:", "priority", "learner"]
     assert cli.main(["check"]) == 2
-    assert "one or more parts as module:attribute" in capsys.readouterr().err
+    assert "one or more components as module:attribute" in capsys.readouterr().err
 
 
 def within(achieved, desired, step, hparams):

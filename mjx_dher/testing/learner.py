@@ -76,11 +76,15 @@ def check_learner(
     summary = attempt("learner.summary", jax.jit(made.summary), moved)
     learners.check_metrics("summary", summary, metrics)
     expect_finite("metrics of learner.summary", summary)
-    policy = attempt("learner.export", made.export, jax.device_get(moved), hparams)
+    _check_export(made, moved, obs, hparams)
+
+
+def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> None:
+    policy = attempt("learner.export", made.export, jax.device_get(state), hparams)
     if policy is not None:
         what = f"learner.export must give a policy.Policy or None; it gives a {type(policy).__name__}"
         expect(isinstance(policy, Policy), what)
-        theirs, ours = attempt("the policy of learner.export", policy, obs), made.act(moved, obs, numbers)
+        theirs, ours = attempt("the policy of learner.export", policy, obs), made.act(state, obs, as_arrays(hparams))
         same = theirs.shape == ours.shape and bool(jnp.allclose(theirs, ours, atol=TOLERANCE))
         expect(same, "the policy of learner.export must act as learner.act does; it does not")
 
