@@ -14,7 +14,7 @@ import resource
 import apart
 
 from mjx_dher import presets
-from mjx_dher.rollout import env_spec
+from mjx_dher.contract import env_spec
 
 
 def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:

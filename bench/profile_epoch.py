@@ -22,7 +22,7 @@ import jax
 from timing import print_table
 
 from mjx_dher import envs, learners, presets, samplers
-from mjx_dher.rollout import env_spec
+from mjx_dher.contract import env_spec
 from mjx_dher.trainer import make_train
 
 

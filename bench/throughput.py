@@ -15,7 +15,8 @@ import jax
 from timing import median_seconds, print_table
 
 from mjx_dher import Config, HParams, envs, learners
-from mjx_dher.rollout import env_spec, rollout
+from mjx_dher.contract import env_spec
+from mjx_dher.rollout import rollout
 
 
 def measure(task: str, engine: str, num_envs: int, repeats: int = 5) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from mjx_dher import lookup
-from mjx_dher.rollout import env_spec, episode_template
+from mjx_dher.contract import env_spec, episode_template
 from mjx_dher.spec import find_demonstrations
 from mjx_dher.types import Env, Episode
 

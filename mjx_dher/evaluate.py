@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import stats
+from mjx_dher.contract import check_steps
 from mjx_dher.policy import TrainedPolicy
-from mjx_dher.rollout import Outcome, check_steps, rollout
+from mjx_dher.rollout import Outcome, rollout
 from mjx_dher.types import Array, Env, GoalObs, PRNGKey
 
 CHUNK = 500  # episodes at once

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +12,8 @@ import numpy as np
 
 from mjx_dher import context
 from mjx_dher.config import HParams
-from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_env_parts, check_size
+from mjx_dher.contract import check_first, check_same_shapes, check_with_goal, env_spec
+from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
@@ -117,7 +118,7 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
     if np.shape(action) != (num_envs, env.action_size):
         raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
     following = jax.vmap(env.step)(state, action)
-    _check_same_shapes(state, following)
+    check_same_shapes(state, following)
     reward = following.reward
     if spec.ends:
         following = where_each(playing.over, state, following)
@@ -178,17 +179,11 @@ def _check_inputs(inputs: PyTree, num_steps: int) -> None:
             raise ValueError(f"inputs{name} must lead with [T] = [{num_steps}], one for each step; got {shape}")
 
 
-def check_with_goal(env: Any) -> None:
-    """Raises ValueError for an environment whose goals cannot be set."""
-    if not callable(getattr(env, "with_goal", None)):
-        raise ValueError(f"a goal generator needs an environment with with_goal(state, goal) -> state; {env!r} has none")
-
-
 def _with_goals(env: Any, first: Any, goals: Array) -> Any:
     """The first states of N episodes with other goals [N, G]."""
     check_with_goal(env)
     changed = jax.vmap(env.with_goal)(first, goals)
-    _check_same_shapes(first, changed, "with_goal")
+    check_same_shapes(first, changed, "with_goal")
     return changed
 
 
@@ -196,106 +191,3 @@ def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
     """Returns `num_envs` keys, of one key or as they are given; a key that `jax.random.PRNGKey` made is two numbers."""
     one = 0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1
     return key if key.ndim > one else jax.random.split(key, num_envs)
-
-
-FLAGS = ("failed", "done", "terminal")  # optional fields of a state, [] bool
-
-
-def check_first(state: Any, leading: tuple[int, ...]) -> None:
-    """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
-    for name in ("obs", "reward", "success"):
-        if not hasattr(state, name):
-            raise ValueError(f"reset must give a state with obs, reward and success; this {type(state).__name__} has no {name}")
-    for name in ("observation", "achieved_goal", "desired_goal"):
-        if not isinstance(state.obs, Mapping) or name not in state.obs:
-            raise ValueError(f"reset: obs must be a dict of observation, achieved_goal and desired_goal; it has no {name}")
-    for name in ("reward", "success", *(flag for flag in FLAGS if hasattr(state, flag))):
-        value = getattr(state, name)
-        if not hasattr(value, "shape"):
-            raise ValueError(f"reset: {name} must be a scalar, []; it is a {type(value).__name__}")
-        if value.shape != leading:
-            raise ValueError(f"reset: {name} must be a scalar, []; it has shape {value.shape[len(leading) :]}")
-        if name in FLAGS and value.dtype != bool:
-            raise ValueError(f"reset: {name} must be bool; it is {value.dtype}")
-        if jnp.issubdtype(value.dtype, jnp.complexfloating):
-            raise ValueError(f"reset: {name} must be a real number; it is {value.dtype}")
-    achieved, desired = (jnp.shape(state.obs[name])[len(leading) :] for name in ("achieved_goal", "desired_goal"))
-    if len(achieved) != 1 or achieved != desired:
-        raise ValueError(
-            f"reset: achieved_goal and desired_goal must be vectors [G]; they have shapes {achieved} and {desired}"
-        )
-
-
-def _check_same_shapes(before: Any, after: Any, method: str = "step") -> None:
-    """Raises ValueError unless a method keeps the state's structure, shapes and types, as `lax.scan` needs."""
-    old, new = (dict(jax.tree_util.tree_leaves_with_path(state)) for state in (before, after))
-    structure: Any = jax.tree.structure(before)
-    if structure != jax.tree.structure(after):
-        differing = [jax.tree_util.keystr(path) for path in {**old, **new} if (path in old) != (path in new)]
-        raise ValueError(
-            f"reset and {method} must give states of one structure; only one has {', '.join(differing) or 'its type'}"
-        )
-    for path, leaf in old.items():
-        kept, changed = ((jnp.shape(x)[1:], jnp.result_type(x)) for x in (leaf, new[path]))
-        if kept != changed:
-            raise ValueError(
-                f"{method} must keep shapes and types; the state's {jax.tree_util.keystr(path)} is {kept[1]}{list(kept[0])} and"
-                f" becomes {changed[1]}{list(changed[0])}"
-            )
-
-
-def check_steps(env: Env) -> None:
-    """Calls `env.check()`, where the environment has one: it raises if steps so far were silently wrong."""
-    if (check := getattr(env, "check", None)) is not None:
-        check()
-
-
-def env_spec(env: Env) -> EnvSpec:
-    """The spec of an environment, which is not run: its own `spec`, or one that follows from its attributes and arrays.
-
-    Raises:
-      ValueError: `env` is no environment, or its spec disagrees with its arrays; the message names the field.
-    """
-    return _spec_and_shapes(env)[0]
-
-
-def _spec_and_shapes(env: Env) -> tuple[EnvSpec, Any]:
-    check_env_parts(env)
-    first = jax.eval_shape(env.reset, jax.random.key(0))
-    check_first(first, ())
-    observation, goal_size = first.obs["observation"], first.obs["achieved_goal"].shape[0]
-    sizes = {"goal_size": goal_size, "action_size": env.action_size, "episode_length": env.episode_length}
-    own = getattr(env, "spec", None)
-    spec = EnvSpec(observation=observation, **sizes) if own is None else own
-    if not isinstance(spec, EnvSpec):
-        raise ValueError(f"spec of an environment must be an EnvSpec; it is {spec!r}")
-    for name, value in {**sizes, "observation": observation}.items():
-        given, needed = (jax.tree.map(_say, x) for x in (getattr(spec, name), value))
-        if given != needed:
-            raise ValueError(f"spec: {name} must be {needed}, as the environment has it; got {given}")
-    flags = [name for name in ("done", "terminal") if hasattr(first, name)]
-    if flags and not spec.ends:
-        raise ValueError(f"spec: ends must be True, because the environment's state has {flags[0]}; got False")
-    if spec.ends and not flags and not spec.ends_at_goal:
-        raise ValueError("spec: ends must be False for a state without done and terminal, unless ends_at_goal; got True")
-    return spec, first
-
-
-def _say(leaf: Any) -> Any:
-    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
-
-
-def episode_template(env: Env) -> Episode:
-    """Shapes and dtypes of one episode of `env`, which is not run. Raises ValueError if `env` is no environment."""
-    spec, first = _spec_and_shapes(env)
-
-    def repeat(x: Any, times: int) -> Any:
-        return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
-
-    num_steps = spec.episode_length
-    return Episode(
-        observation=jax.tree.map(lambda x: repeat(x, num_steps + 1), first.obs["observation"]),
-        achieved_goal=repeat(first.obs["achieved_goal"], num_steps + 1),
-        desired_goal=first.obs["desired_goal"],
-        action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
-    ).filled()

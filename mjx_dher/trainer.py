@@ -21,6 +21,7 @@ from mjx_dher import config as config_lib
 from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Context
+from mjx_dher.contract import check_with_goal, env_spec, episode_template
 from mjx_dher.learners import Learner
 from mjx_dher.learners.updates import update_round
 from mjx_dher.parallel import split
@@ -28,7 +29,7 @@ from mjx_dher.parallel.split import AxisName
 from mjx_dher.priorities import Priority, PriorityFn
 from mjx_dher.relabel import add_choices, draw_batches, relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import check_with_goal, env_spec, episode_template, rollout
+from mjx_dher.rollout import rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGKey, PyTree
 

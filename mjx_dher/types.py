@@ -79,7 +79,7 @@ class Batch:
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
-    """The contract of a task as data. `rollout.env_spec` gives an environment's."""
+    """The contract of a task as data. `contract.env_spec` gives an environment's."""
 
     observation: PyTree  # tree of `jax.ShapeDtypeStruct`s of one observation
     goal_size: int  # G
@@ -174,14 +174,3 @@ def check_size(name: str, value: Any) -> None:
     """Raises ValueError unless `value` is an integer of at least 1, of Python or NumPy."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1; it is {value!r}")
-
-
-def check_env_parts(env: Any) -> None:
-    """Raises ValueError unless `env` has the methods and the two numbers of an `Env`. It is not run."""
-    if isinstance(env, type):
-        raise ValueError(f"an environment is an object, not a class: {env.__name__}(...) instead of {env.__name__}")
-    for name in ("reset", "step", "compute_reward"):
-        if not callable(getattr(env, name, None)):
-            raise ValueError(f"an environment has reset, step and compute_reward; {env!r} has no {name}")
-    for name in ("action_size", "episode_length"):
-        check_size(name, getattr(env, name, None))

@@ -11,9 +11,9 @@ from jax.sharding import PartitionSpec
 from test_trainer import SMALL
 
 from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trainer
+from mjx_dher.contract import env_spec
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel import split as split_lib
-from mjx_dher.rollout import env_spec
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program import loop

@@ -11,7 +11,8 @@ import pytest
 from mjx_dher import Config, HParams, learners, make_train, priorities, relabel, replay, samplers
 from mjx_dher import context as context_lib
 from mjx_dher.components import COMPONENTS
-from mjx_dher.rollout import env_spec, episode_template, rollout
+from mjx_dher.contract import env_spec, episode_template
+from mjx_dher.rollout import rollout
 from mjx_dher.types import Batch, EnvSpec
 from probes import Corridor, Walk
 

@@ -13,8 +13,9 @@ from flax import struct
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli, trainer
+from mjx_dher.contract import env_spec
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
-from mjx_dher.rollout import env_spec, rollout
+from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint, run_folder
 from point_mass import PointMass, PointState
 

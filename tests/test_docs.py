@@ -124,8 +124,8 @@ def test_each_command_line_is_one(monkeypatch, capsys):
         name = arguments[0] if arguments and arguments[0] in cli.COMMANDS else "train"
         if "--help" in arguments:
             arguments.remove("--help")
-        if "--config" in arguments:  # there is no such run here
-            at = arguments.index("--config")
+        for option in {"--config", "--demonstrations"} & set(arguments):  # there is no such run or file here
+            at = arguments.index(option)
             del arguments[at : at + 2]
         if "module:attribute" not in line and name in ("train", "sweep"):  # values and all
             parse_train_args(arguments) if name == "train" else parse_sweep_args([*arguments[1:], *_out(arguments)])

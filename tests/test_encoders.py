@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, rollout, testing, trainer
+from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, testing, trainer
+from mjx_dher.contract import env_spec
 from mjx_dher.policy import learner_policy
 from mjx_dher.policy.load import check_fits
 from mjx_dher.runs.program.loop import state_template
@@ -107,7 +108,7 @@ def test_dicts_with_images_are_trained_on(tmp_path, monkeypatch):
     """From the rollout to the stored policy, which acts as the learner does."""
     monkeypatch.setitem(sys.modules, "mine", types.SimpleNamespace(networks=seeing))
     env, config = Camera(), dataclasses.replace(SMALL, num_envs=4, eval_episodes=2, updates_per_cycle=2, target_period=1)
-    spec = rollout.env_spec(env)
+    spec = env_spec(env)
     assert spec.sizes == ({"image": (4, 4, 1), "vector": 3}, 2, 2)
     learner = learners.make("ddpg", config, spec, "mine:networks")
     program = make_train(env, config, learner=learner)

@@ -5,9 +5,9 @@ import pytest
 from conftest import load_recorded
 
 from mjx_dher import envs
+from mjx_dher.contract import env_spec
 from mjx_dher.envs import arm_kinematics, fetch
 from mjx_dher.envs.engines import Physics, resolve_engine
-from mjx_dher.rollout import env_spec
 
 ENGINES = ("native", "jax")
 RECORDED = ("push", "pick_and_place", "slide")

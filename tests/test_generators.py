@@ -9,9 +9,9 @@ import pytest
 from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, learners, make_train, priorities, replay, samplers, testing
-from mjx_dher import rollout as rollout_lib
 from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
+from mjx_dher.contract import env_spec
 from mjx_dher.contrib import generators, goals, metrics
 from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
@@ -105,7 +105,7 @@ def test_a_generator_needs_an_environment_that_takes_goals():
 
 
 def test_what_asks_the_learner_needs_one_that_answers():
-    made = learners.make("ddpg", SMALL, rollout_lib.env_spec(ENV))
+    made = learners.make("ddpg", SMALL, env_spec(ENV))
     silent = dataclasses.make_dataclass("Silent", [])()
     for name in (method for method in vars(learners.Learner) if not method.startswith("_")):
         object.__setattr__(silent, name, getattr(made, name))

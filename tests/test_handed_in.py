@@ -13,8 +13,9 @@ from conftest import refuses
 
 from mjx_dher import HParams, make_train, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.context import Context
+from mjx_dher.contract import env_spec
 from mjx_dher.learners import RESERVED, ddpg
-from mjx_dher.rollout import env_spec, rollout
+from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program.loop import Progress
 from mjx_dher.samplers import Sampler, future

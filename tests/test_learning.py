@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from mjx_dher import envs, learners, presets, samplers
+from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
-from mjx_dher.rollout import env_spec
 from mjx_dher.runs.program.loop import train
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_dher import Config, HParams, learners, make_train, relabel, replay, samplers, trainer
-from mjx_dher.rollout import env_spec, rollout
+from mjx_dher.contract import env_spec
+from mjx_dher.rollout import rollout
 from mjx_dher.runs.program import loop
 from mjx_dher.system import memory
 from probes import Explodes, PointMass

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 
 from mjx_dher import HParams, relabel, replay, rollout, samplers
+from mjx_dher.contract import episode_template
 from mjx_dher.networks import Actor
 from point_mass import PointMass
 
@@ -22,7 +23,7 @@ def main(argv=None):
     parser.add_argument("--updates", type=int, default=100, help="a round, after 64 episodes; of 256 transitions each")
     args = parser.parse_args(argv)
     env, actor, adam, weighted = PointMass(), Actor(2, (64, 64)), optax.adam(1e-3), samplers.make("weighted")
-    ring = replay.init(rollout.episode_template(env), num_episodes=1000)
+    ring = replay.init(episode_template(env), num_episodes=1000)
     params = actor.init(jax.random.key(0), jnp.zeros(2), jnp.zeros(2))
     moments = adam.init(params)
 

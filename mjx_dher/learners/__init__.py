@@ -100,7 +100,7 @@ def make(name: str | LearnerFn, config: Config, spec: EnvSpec, network: str | Ne
     Args:
       name: a built-in name, "module:attribute", or a function (config, spec, networks) -> Learner.
       config: sizes of the networks, dtype and kernels.
-      spec: of the environment (`rollout.env_spec`).
+      spec: of the environment (`contract.env_spec`).
       network: what `networks.make` takes.
 
     Raises:

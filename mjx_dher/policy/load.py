@@ -67,7 +67,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def check_fits(policy: TrainedPolicy, env: Any) -> None:
     """Raises ValueError if the sizes of observations, goals or actions of a policy and an environment differ."""
-    from mjx_dher.rollout import env_spec
+    from mjx_dher.contract import env_spec
 
     theirs, own = env_spec(env).sizes, policy.sizes
     if theirs != own:

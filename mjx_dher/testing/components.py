@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from mjx_dher import check, components, learners, priorities, samplers
 from mjx_dher.components import reads
 from mjx_dher.config import HParams
+from mjx_dher.contract import env_spec
 from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
 from mjx_dher.lookup import is_import_path
 from mjx_dher.priorities import Priority, PriorityFn
-from mjx_dher.rollout import env_spec
 from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import check, context, rollout
+from mjx_dher import check, context, contract
 from mjx_dher.config import HParams
 from mjx_dher.testing.trial import TOLERANCE, attempt, expect
 from mjx_dher.types import Env, EnvSpec
@@ -21,7 +21,7 @@ STARTS = 8  # episodes in a batch
 def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     """Plays `env` with random actions and raises at the first violation of `types.Env`.
 
-    - The spec agrees with the arrays (`rollout.env_spec`). States keep structure, shapes and dtypes, as `lax.scan` requires.
+    - The spec agrees with the arrays (`contract.env_spec`). States keep structure, shapes and dtypes, as `lax.scan` requires.
     - Observations are float32 or uint8. Goals [G], reward [] and success [] are float32. All are finite; success is 0 or 1.
     - `reset` and `step` are pure: the same arguments give the same results, alone and under `jax.jit` and `jax.vmap`, and stay
       unchanged.
@@ -42,7 +42,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     Raises:
       ComponentError: names the first violation and what is expected.
     """
-    spec: EnvSpec = attempt("reset", rollout.env_spec, env)
+    spec: EnvSpec = attempt("reset", contract.env_spec, env)
     reset_key, action_key = jax.random.split(jax.random.key(seed))
     keys = jax.random.split(reset_key, STARTS)
     shape = (spec.episode_length, STARTS, spec.action_size)
@@ -59,12 +59,12 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     beyond = "step with an action of +-3"
     _check_state(attempt(beyond, env.step, first, 3.0 * jnp.sign(actions[0, 0])), beyond)
     _check_reward(env, spec, played, valid, tolerance)
-    rollout.check_steps(env)
+    contract.check_steps(env)
 
 
 def _outputs(state: Any) -> dict[str, Any]:
     """The arrays of a state that the library reads, by name; each leaf of the observation has its own."""
-    flags = {name: getattr(state, name) for name in rollout.FLAGS if hasattr(state, name)}
+    flags = {name: getattr(state, name) for name in contract.FLAGS if hasattr(state, name)}
     obs = {name: state.obs[name] for name in ("observation", *GOALS)}
     named = {**obs, "reward": state.reward, "success": state.success, **flags}
     paths = {name: jax.tree_util.tree_leaves_with_path(value) for name, value in named.items()}
@@ -74,7 +74,7 @@ def _outputs(state: Any) -> dict[str, Any]:
 def _check_state(state: Any, source: str) -> None:
     """Checks dtypes and values of a state that `source` returned."""
     for name, value in _outputs(state).items():
-        if name not in rollout.FLAGS:
+        if name not in contract.FLAGS:
             allowed = ("float32", "uint8") if name.startswith("observation") else ("float32",)
             dtype = str(jnp.result_type(value))
             expect(dtype in allowed, f"{source}: {name} must be {' or '.join(allowed)}; it is {dtype}")

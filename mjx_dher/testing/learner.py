@@ -9,11 +9,11 @@ import jax.numpy as jnp
 
 from mjx_dher import check, context, learners, replay
 from mjx_dher.config import Config, HParams
+from mjx_dher.contract import env_spec
 from mjx_dher.learners import Learner, LearnerFn
 from mjx_dher.networks import NetworksFn
 from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
-from mjx_dher.rollout import env_spec
 from mjx_dher.samplers import future
 from mjx_dher.testing.methods import as_arrays
 from mjx_dher.testing.trial import EPISODES, TOLERANCE, attempt, expect, expect_finite, random_episodes

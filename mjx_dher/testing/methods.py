@@ -13,13 +13,13 @@ from mjx_dher import check, learners, priorities, replay
 from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Context
+from mjx_dher.contract import check_with_goal, env_spec
 from mjx_dher.contrib import generators
 from mjx_dher.contrib.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
 from mjx_dher.priorities import CANDIDATES, Priority
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.rollout import check_with_goal, env_spec
 from mjx_dher.samplers import future
 from mjx_dher.testing.trial import EPISODES, attempt, expect, expect_range, random_episodes
 from mjx_dher.types import Env, Episode, GoalObs

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from mjx_dher.contract import check_env_parts
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Env, Episode, check_env_parts
+from mjx_dher.types import Env, Episode
 
 EPISODES = 16
 TOLERANCE = 1e-3

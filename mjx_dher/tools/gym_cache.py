@@ -67,9 +67,10 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
 
     from mjx_dher import context, rollout
     from mjx_dher.config import HParams
+    from mjx_dher.contract import env_spec
 
     env = envs.make(name, **dict(options))
-    spec = rollout.env_spec(env)
+    spec = env_spec(env)
 
     def reset(seed):
         return env.reset(jax.random.key(seed))

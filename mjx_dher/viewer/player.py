@@ -133,10 +133,10 @@ class Player:
         self.clock += 1
         self._steps += 1
         self._look()
-        failed = self._failed
-        if failed or self.clock == self.length:
+        failed, ended = self._failed, self._flag("done") or self._flag("terminal")
+        if failed or ended or self.clock == self.length:
             (self.own if self.is_own else self.episodes).add(self.success)
-            self._held = HOLD if failed or self.renew else 0
+            self._held = HOLD if failed or ended or self.renew else 0
         if failed:
             self.note = "The physics blew up; a new episode begins."
 
@@ -189,7 +189,10 @@ class Player:
 
     @property
     def _failed(self) -> bool:
-        return bool(np.any(getattr(self._state, "failed", False)))
+        return self._flag("failed")
+
+    def _flag(self, name: str) -> bool:
+        return bool(np.any(getattr(self._state, name, False)))
 
     def _look(self) -> None:
         """Notes what is to be seen of the state."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams
+from mjx_dher.contract import check_steps
 from mjx_dher.parallel import mesh, sharded
 from mjx_dher.parallel.mesh import ONE, Layout
-from mjx_dher.rollout import check_steps
 from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
 from mjx_dher.types import Array, Env, Metrics, PRNGKey

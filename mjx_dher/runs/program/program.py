@@ -18,12 +18,13 @@ from mjx_dher import config as config_lib
 from mjx_dher import context, learners, priorities, samplers, trainer
 from mjx_dher import evaluate as evaluate_lib
 from mjx_dher.config import HParams
+from mjx_dher.contract import check_steps, env_spec
 from mjx_dher.contrib import generators
 from mjx_dher.demonstrations import read_demonstrations
 from mjx_dher.learners import Learner
 from mjx_dher.parallel import mesh, sharded, split
 from mjx_dher.parallel.mesh import ONE, Layout
-from mjx_dher.rollout import Outcome, check_steps, env_spec
+from mjx_dher.rollout import Outcome
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program.loop import Compiled
