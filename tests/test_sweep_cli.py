@@ -91,7 +91,7 @@ def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path
     assert cli.main(command) == 128 + number
     said = capsys.readouterr().out
     assert "stopping when this epoch has ended" in said
-    assert "stopped; 2 runs are done, and the same command goes on with the other 2" in said
+    assert "stopped; 2 runs are done; run the same command again for the other 2" in said
     assert seen == [1, 2, 3, 4, 1]
     assert signal.getsignal(number) == handler
     assert len(table(tmp_path, tables.FINALS)) == 2
@@ -111,7 +111,7 @@ def test_a_signal_in_the_last_epoch_loses_nothing(tmp_path, point_mass, monkeypa
     assert len(list(tmp_path.glob("cells/*/result.json"))) == done
     assert (tmp_path / tables.FINALS).exists() == (status == 0)
     assert not (tmp_path / "unfinished").exists()
-    assert ("the same command goes on with the other 2" in capsys.readouterr().out) == (done == 2)
+    assert ("run the same command again for the other 2" in capsys.readouterr().out) == (done == 2)
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 from rich.console import Console
+from typing_extensions import Doc
 
-from mjx_dher import presets, spec
+from mjx_dher import components, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_components
@@ -26,10 +27,14 @@ from mjx_dher.system import files
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
 
-if TYPE_CHECKING:
-    pass
-
 GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "priority", "generator", "learner", "networks")
+
+
+SAMPLERS = ("future", "closest", "epsilon_closest", "weighted")  # by default
+
+
+def _doc(field: str, text: str) -> Doc:
+    return Doc(components.help_text(field, text))
 
 
 def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
@@ -58,10 +63,10 @@ else:  # every number, and every size, by its own name
 
 @dataclasses.dataclass(frozen=True)
 class SweepArgs:
-    """Train every combination of environments, parts, numbers and seeds, and compare them.
+    """Train every combination of environments, components, numbers and seeds, and compare them.
 
     Runs that differ in sampler, numbers or seed are trained side by side in one compiled program. Each trial is a run folder
-    in cells/: the same command again goes on where a sweep was stopped, and a larger one trains what is new.
+    in cells/. Run the same command again to resume a sweep, or a larger one to add trials.
     """
 
     out: Path
@@ -70,30 +75,19 @@ class SweepArgs:
     sweep: _Axes
     """Numbers to try: --sweep.her-k 2 4 8."""
     options: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    env: tuple[str, ...] = ("push",)
-    """Environments, by name or as module:attribute."""
+    env: Annotated[tuple[str, ...], _doc("env", "Environments")] = ("push",)
     engine: Engine = "auto"
     """Physics: native, warp, jax or auto."""
     env_kwargs: tuple[str, ...] = ()
     """Arguments of the environments, NAME=VALUE each."""
-    sampler: tuple[str, ...] = ("future", "closest", "epsilon_closest", "weighted")
-    """Samplers of hindsight goals, by name or as module:attribute."""
-    weight_kernel: tuple[str, ...] = ("linear",)
-    """Kernels for weighted: linear, inverse, softmax, or module:attribute."""
-    weight_normalization: tuple[str, ...] = ("mean",)
-    """Normalizations of distances for weighted: mean, sum, max, minmax, none, far, or module:attribute."""
-    metric: tuple[str, ...] = ("position",)
-    """Distances that closest, epsilon_closest and weighted go by: position, velocity, resting_point, resting_point_rough,
-    time_to_goal, or module:attribute."""
-    priority: tuple[str, ...] | None = None
-    """Priorities in replay; the preset's for the learner unless given: eventful, energy, max_entropy, diversity, dpp,
-    td_error, curriculum, not_misleading, or module:attribute."""
-    generator: tuple[str, ...] = ("reset",)
-    """Generators of the goals that training episodes are played for: reset, hgg, or module:attribute."""
-    learner: tuple[str, ...] | None = None
-    """Learners; the preset's unless given: ddpg, td3, sac, redq, tqc, dtqc, or module:attribute."""
-    networks: tuple[str, ...] | None = None
-    """Networks; the preset's for the learner unless given: mlp, layer_norm, fan_in, or module:attribute."""
+    sampler: Annotated[tuple[str, ...], _doc("sampler", "Samplers of hindsight goals")] = SAMPLERS
+    weight_kernel: Annotated[tuple[str, ...], _doc("weight_kernel", "Kernels")] = ("linear",)
+    weight_normalization: Annotated[tuple[str, ...], _doc("weight_normalization", "Normalizations of distances")] = ("mean",)
+    metric: Annotated[tuple[str, ...], _doc("metric", "Distances between goals")] = ("position",)
+    priority: Annotated[tuple[str, ...] | None, _doc("priority", "Priorities in replay; the preset's by default")] = None
+    generator: Annotated[tuple[str, ...], _doc("generator", "Generators of the goals of training episodes")] = ("reset",)
+    learner: Annotated[tuple[str, ...] | None, _doc("learner", "Learners; the preset's by default")] = None
+    networks: Annotated[tuple[str, ...] | None, _doc("networks", "Networks; the preset's by default")] = None
     seeds: int = 10
     """Runs of each setting; every setting has the same seeds, and so the same first networks and resets."""
     first_seed: int = 0
@@ -101,11 +95,11 @@ class SweepArgs:
     preset: Literal["auto", presets.Preset] = "auto"
     """Settings that other options override: cpu, gpu, frugal, paper, or auto, the one for this machine."""
     lanes: int | None = None
-    """Runs side by side, at most; by default 1 on a CPU, whose cores one fills, and on a GPU as many as its memory holds."""
+    """Runs side by side, at most; by default 1 on a CPU, whose cores a run fills, and on a GPU as many as memory holds."""
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     devices: Devices = 1
-    """Devices to train on, or all: runs side by side are shared out among them; where they are more, several share each run."""
+    """Devices to train on, or all. They share the runs side by side; with more devices than runs, several share each run."""
     fleet: Annotated[FleetOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetOptions)
     threshold: float = 0.9
     """Success rate for the time that it takes to get there."""
@@ -116,7 +110,7 @@ class SweepArgs:
 
 
 def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
-    """Returns the arguments of `sweep` and the trials that they ask for, checked before JAX or MuJoCo is loaded.
+    """Returns the arguments of `sweep` and the trials in them, checked before JAX or MuJoCo is loaded.
 
     Raises:
       ValueError: one or more of them cannot be used.
@@ -223,7 +217,7 @@ def _sweep_fleet(args: SweepArgs, console: Console) -> int:
 
 
 def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
-    """Prints what there is to do, and returns the trials that have not ended."""
+    """Prints the number of runs, and returns the trials that have not ended."""
     for text in grid.changed_files(args.out, trials):
         console.print(text, soft_wrap=True)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
@@ -233,11 +227,11 @@ def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[
 
 
 def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], signum: int | None, console: Console) -> int:
-    """Writes the tables of what has ended, and says what is left."""
+    """Writes the tables of the trials that have ended, and reports the others."""
     left = [trial for trial in todo if not grid.is_done(args.out, trial)]
     if left and signum is not None:
         ended = len(trials) - len(left)
-        console.print(f"stopped; {ended} runs are done, and the same command goes on with the other {len(left)}")
+        console.print(f"stopped; {ended} runs are done; run the same command again for the other {len(left)}")
         return 128 + signum
     if len(left) == len(trials):
         raise files.BusyError(f"{args.out}: all {len(left)} runs are being trained by another program")
@@ -251,7 +245,7 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], signum: in
 
 
 def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
-    """Says what would be trained. The environments are made, and nothing is compiled or written."""
+    """Prints the programs and runs of a sweep. Environments are made, and nothing is compiled or written."""
     settings.check_writable(args.out)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     console.print(f"{len(trials)} runs, {len(trials) - len(todo)} of them done already")
@@ -273,7 +267,7 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
 
 
 def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None:
-    """Trains what is left; returns the signal that asked for a stop, or None."""
+    """Trains trials; returns the signal that asked for a stop, or None."""
     from mjx_dher.sweeps import sweep
 
     prepare()
