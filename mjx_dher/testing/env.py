@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import check, context, contract
+from mjx_dher import check, context, contract, rollout
 from mjx_dher.config import HParams
 from mjx_dher.testing.trial import TOLERANCE, attempt, expect
 from mjx_dher.types import Env, EnvSpec
