@@ -1,7 +1,7 @@
 """The run driver: trains one run, or many side by side, into run folders.
 
-Runs that differ in seed, sampler, weight kernel, metric or HParams are *lanes* of one vmapped program. A lane follows the same
-draws as that run alone. `train`, `resume` and `sweep` all call `train_runs`.
+Runs that differ only in `spec.LANE_FIELDS` are *lanes* of one vmapped program. A lane computes what the run computes alone.
+`train`, `resume` and `sweep` all call `train_runs`.
 """
 
 from __future__ import annotations
@@ -83,33 +83,34 @@ def train_runs(
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
     make_sinks: Callable[[RunSpec, Path], Sequence[Sink]] = _no_sinks,
 ) -> list[Result]:
-    """Trains runs that can share a program, as many side by side as can be, each into a folder of its own.
+    """Trains runs that share a program, as many side by side as possible, each into its own folder.
 
-    A run whose folder has a checkpoint goes on from it. A run that goes bad (`diagnostics.failure`) ends there,
-    alone, and its result says why.
+    A run whose folder has a checkpoint resumes from it. A run that fails (`diagnostics.failure`) ends alone, and its result
+    has the reason.
 
     Args:
-      env: the environment that all of them play in.
+      env: the environment of all runs.
       specs: descriptions; all must agree in `RunSpec.program`.
-      folders: run folders, one each; they are made where they do not exist.
-      options: evaluation, checkpoints, logs; the defaults where None.
-      lanes: runs side by side, at most; by default one on a CPU, whose cores one run fills, and elsewhere what memory holds.
-      devices: to train on, or "all"; runs side by side are shared out among them, and fewer runs than devices are in parts.
-      shared: folder for the checkpoints of runs side by side; "unfinished" beside the first run's folder where None.
-      sweep: whether runs that have ended, or that another program is at work on, are left out, and runs whose checkpoints
-        cannot be used begin anew, instead of raising.
-      should_stop: asked after every epoch; True ends training, with a checkpoint.
+      folders: run folders, one each; missing ones are made.
+      options: evaluation, checkpoints, logs. None: the defaults.
+      lanes: most runs side by side. None: one on a CPU, whose cores one run fills, and elsewhere as many as memory holds.
+      devices: to train on, or "all". Runs side by side are distributed among them; several devices share a run if there are
+        fewer runs than devices.
+      shared: folder for the checkpoints of runs side by side. None: "unfinished" beside the first run's folder.
+      sweep: whether to skip runs that have ended or that another process trains, and to start runs over whose checkpoints
+        cannot be used, instead of raising.
+      should_stop: called after every epoch; True ends training, with a checkpoint.
       report: called with a line about each program and checkpoint.
-      on_epoch: called after every epoch of those side by side, after the last one when their results are written.
+      on_epoch: called after every epoch of runs side by side; after their last epoch, when their results are written.
       make_sinks: makes further sinks for a run's metrics.
 
     Returns:
-      A Result each; fewer than `specs` where training was stopped before their turn, or runs were left out.
+      A Result each; fewer than `specs` if training was stopped or runs were skipped.
 
     Raises:
-      ValueError: a run that cannot be trained, memory or devices that do not suffice for it, sizes that the devices do not
-        divide, or `stop_at` or `keep_end` for several runs.
-      FolderError: a run that has ended, that another program is at work on, or whose folder cannot be written to.
+      ValueError: a run that cannot be trained, too little memory or too few devices, sizes that the devices do not divide, or
+        `stop_at` or `keep_end` for several runs.
+      FolderError: a run that has ended, that another process trains, or whose folder is not writable.
     """
     options = options or Options()
     _check_runs(env, specs, folders, options, sweep)
@@ -129,7 +130,7 @@ def train_runs(
 
 
 def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], options: Options, sweep: bool) -> None:
-    """Raises ValueError for options that cannot be used, and for runs that cannot be trained, or not by one program."""
+    """Raises ValueError for invalid options, and for runs that cannot be trained or do not share a program."""
     options.check()
     if sweep or len(specs) > 1:
         options.check_many()
@@ -140,7 +141,7 @@ def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], opt
 
 
 def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting: Sequence[Run]) -> list[Result]:
-    """Trains runs, as many side by side as the program has lanes, until none is left or a stop is asked for."""
+    """Trains runs, as many side by side as the program has lanes, until all are trained or a stop is requested."""
     results: list[Result] = []
     while waiting and not (results and session.should_stop()):
         with contextlib.ExitStack() as stack:
@@ -164,7 +165,7 @@ def _claim(
 
 
 def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folders: Sequence[Path]) -> list[Result]:
-    """Trains runs side by side, from their start or their checkpoint, to their end or until a stop is asked for."""
+    """Trains runs side by side, from their start or checkpoint, to their end or until a stop is requested."""
     options = session.options
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
@@ -213,7 +214,7 @@ def _success_rates(folder: Path) -> list[float]:
 
 
 def _refuse_ended(env: Env, spec: RunSpec, start: Start) -> None:
-    """Raises ValueError where the epochs that have ended are all that `total_steps` takes."""
+    """Raises ValueError if all epochs of `total_steps` have ended."""
     num_epochs = config_lib.num_epochs(spec.config, env.episode_length)
     if start.epoch >= num_epochs:
         raise ValueError(
@@ -231,7 +232,7 @@ def _open(
     folder: Path,
     run: dict[str, Any],
 ) -> list[Sink]:
-    """Writes config.json of a run that begins, or goes on with other settings, and opens the sinks for its metrics.
+    """Writes config.json of a run that starts, or resumes with other settings, and opens the sinks for its metrics.
 
     `ended` is the number of epochs that its metrics have.
     """
@@ -248,7 +249,7 @@ def _open(
 
 
 class Watch:
-    """What has gone wrong with runs side by side."""
+    """Failures and warnings of runs side by side."""
 
     def __init__(
         self,
@@ -263,7 +264,7 @@ class Watch:
         self._warned: set[tuple[int, str]] = set()
 
     def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
-        """Notes the lanes that have failed in an epoch, and reports each kind of trouble once."""
+        """Records the lanes that failed in an epoch, and reports each kind of warning once."""
         finite = np.atleast_1d(progress.finite)
         for lane, (spec, row) in enumerate(zip(self._specs, rows)):
             if lane in self.failed:
@@ -279,7 +280,7 @@ class Watch:
 
 
 def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:
-    """Returns an epoch's metrics of each run."""
+    """An epoch's metrics of each run."""
     metrics = {name: np.atleast_1d(values) for name, values in progress.metrics.items()}
     return [loggers.metrics_row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
 
@@ -293,7 +294,7 @@ def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], faile
 
 
 def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:
-    """Writes the policy of a run's learner, given as NumPy arrays; as the learner's state where NumPy cannot compute it.
+    """Writes the policy of a run's learner, as NumPy arrays if possible, or else as the learner's state.
 
     The learner is None in processes that do not write.
     """
@@ -313,7 +314,7 @@ def _finish(
     runs: Sequence[dict[str, Any]],
     failed: dict[int, tuple[int, str]],
 ) -> list[Result]:
-    """Writes what runs leave that have ended: policies and results. result.json comes last: with it a run is done."""
+    """Writes the policies and results of runs that have ended. result.json comes last: it marks a run as done."""
     outcome: Any = None
     learners = processes.collect(progress.state.learner)
     if len(failed) < len(specs):

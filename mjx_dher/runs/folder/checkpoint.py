@@ -1,4 +1,4 @@
-"""A run in progress on disk: written whole or not at all, restored as it was or not at all.
+"""Checkpoints of a run: written whole or not at all, and restored only if they are undamaged.
 
 A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, the leaves of the TrainState as orbax stores arrays, and
 manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype. Orbax alone does not
@@ -32,7 +32,7 @@ _EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # arrays th
 
 
 class CheckpointError(FolderError):
-    """A checkpoint that cannot be written, or must not be used."""
+    """A checkpoint that cannot be written or used."""
 
 
 class Restored(NamedTuple):
@@ -59,20 +59,20 @@ def save(
 ) -> Path:
     """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
 
-    Those of later epochs go, too: the run did not go on from them.
+    Checkpoints of later epochs are deleted, too.
 
     Args:
       folder: of the run.
       state: a TrainState, or any pytree of arrays.
       epoch: epochs that have ended.
-      wall_seconds: of training, so far.
+      wall_seconds: of training so far.
       keep: at least 1.
       runs: `fingerprint.identity` of the run, or of each of those side by side.
-      refused: checkpoints that cannot be used, which go.
-      failed: of runs side by side, those that have failed: in which epoch, and why.
+      refused: checkpoints that cannot be used, to be deleted.
+      failed: epoch and reason of each failed run, by lane.
 
     Raises:
-      CheckpointError: it cannot be written; earlier ones are as they were.
+      CheckpointError: it cannot be written; earlier checkpoints stay as they were.
     """
     parent = folder / CHECKPOINTS
     target, partial = parent / f"epoch-{epoch:06d}", parent / f"{_PARTIAL}{epoch:06d}"
@@ -90,7 +90,7 @@ def save(
         whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
         for old in set(checkpoints(folder)) - {target, *whole[: keep - 1]}:
             files.remove(old)
-    except Exception as error:  # orbax raises errors of its own, of many kinds
+    except Exception as error:  # orbax raises many kinds of errors
         shutil.rmtree(partial, ignore_errors=True)
         kept = checkpoints(folder)
         last = f"the last one is {kept[0]}" if kept else "there is none before it"
@@ -101,7 +101,7 @@ def save(
 
 
 def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
-    """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and what tells damage."""
+    """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and the digests of all files."""
     leaves = _to_arrays(state)
     needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(partial.parent).free
     if needed > free:
@@ -117,38 +117,31 @@ def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
 
 
 def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
-    """Returns the newest checkpoint of the run in `folder` that is whole.
-
-    `read` and `place` do the same in two steps.
+    """Restores the newest undamaged checkpoint of the run in `folder`.
 
     Args:
       folder: of the run.
       template: the state's structure; leaves have shape and dtype, and on several devices a sharding (`jax.ShapeDtypeStruct`).
-      lines: up to which epoch metrics.csv of each run goes; later checkpoints are not used.
+      lines: number of epochs in metrics.csv of each run; checkpoints of later epochs are not used.
 
     Raises:
       FolderError: there is none.
-      CheckpointError: says why each that is there cannot be used.
+      CheckpointError: no checkpoint can be used; gives the reason for each.
     """
-    restored = read(folder, template, lines)
-    return restored._replace(state=place(restored.state, template))
-
-
-def read(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
-    """Returns what `restore` returns, but the leaves of the state as a list of NumPy arrays; raises what `restore` raises."""
     refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
         try:
             failed = _check_lines(path, lines)
             manifest, arrays = _load(path, template)
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], arrays, manifest["runs"], refused, failed)
+            state = _place(arrays, template)
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
 
 
 def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
-    """Returns the runs that had failed; raises CheckpointError where one's metrics.csv lacks epochs that had ended."""
+    """The failed runs; raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
     manifest = _read_manifest(path)
     failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
     for lane, whole in enumerate(lines):
@@ -203,7 +196,7 @@ def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping
 
 
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
-    """Returns the arrays in the order of `shapes`.
+    """Arrays in the order of `shapes`.
 
     HParams that the checkpoint lacks are 0, and those that it has too many are left out: a run takes them from its settings.
 
@@ -272,12 +265,12 @@ def _to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def without_keys(state: Any) -> Any:
-    """Returns a state with the data of keys in place of the keys: `save` writes the same for it."""
+    """A state with the data of its keys in place of the keys; `save` writes the same for it."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
 
 
-def place(arrays: Sequence[np.ndarray], template: Any) -> Any:
-    """Returns the state whose leaves `read` gave, where `template` says: on its shardings, or else the default device."""
+def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
+    """Makes a state of its leaves, with the shardings of `template`, or else on the default device."""
     leaves, treedef = jax.tree.flatten(template)
 
     def put(array: np.ndarray, leaf: Any) -> Any:

@@ -26,13 +26,13 @@ NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
 
 @dataclasses.dataclass(frozen=True)
 class LaneCheckpoints:
-    """Checkpoints of runs side by side: in a folder named after them in `shared`, or, of one run, in its own."""
+    """Checkpoints of runs side by side, in a folder of theirs in `shared`; those of a single run are in its own folder."""
 
     folders: Sequence[Path]  # of the runs
     lanes: int
     shared: Path
     keep: int
-    restart: bool  # begin anew where no checkpoint can be used, rather than raise
+    restart: bool  # start over if no checkpoint can be used, instead of raising
     report: Callable[[str], None]
     runs: Sequence[dict[str, Any]]  # `fingerprint.identity` of each
     refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
@@ -47,7 +47,7 @@ class LaneCheckpoints:
 
     @property
     def folder(self) -> Path:
-        """Folder that holds `checkpoints/`: one that these runs, side by side, have had before, with any number of lanes."""
+        """Folder that holds `checkpoints/`: an existing one of these runs, with any number of lanes, or a new one."""
         shared = self.shared / fingerprint.sha256_of([self.lanes, *self.names])[:10]
         if not shared.exists():
             others = (path.parent for path in sorted(self.shared.glob(f"*/{NAMES_FILE}")) if _names(path) == self.names)
@@ -55,10 +55,10 @@ class LaneCheckpoints:
         return shared if self.lanes > 1 or shared.exists() else self.folders[0]
 
     def restore(self, init: Callable[[], TrainState]) -> Start:
-        """Returns the point from which the runs go on: what `init` makes, if there is no checkpoint.
+        """Restores the newest checkpoint; without one, the runs start with what `init` makes.
 
         Raises:
-          FolderError: no checkpoint can be used, unless `restart`.
+          FolderError: no checkpoint can be used, and not `restart`.
         """
         state = init()
         if not processes.broadcast(lambda: len(run_folder.checkpoints(self.folder))):
@@ -100,7 +100,7 @@ class LaneCheckpoints:
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
     def _compare(self, restored: Restored) -> None:
-        """Reports settings that have changed since the checkpoint was made and may; raises FolderError for others."""
+        """Reports changes of settings since the checkpoint. Raises FolderError for those that must not change."""
         changed: dict[str, str] = {}
         for before, now in zip(restored.runs, self.runs):
             changed |= fingerprint.differences(before, now)
@@ -130,16 +130,16 @@ class LaneCheckpoints:
         return path
 
     def try_save(self, progress: Progress) -> None:
-        """Writes a checkpoint. One that cannot be written is reported, and costs nothing else."""
+        """Writes a checkpoint, or reports that it cannot be written."""
         try:
             self.save(progress)
         except (OSError, checkpoint.CheckpointError) as error:
             self.report(str(error))
 
     def clear(self, keep_end: bool = False) -> None:
-        """Removes the checkpoints, and those in `shared` of any runs that have all ended. Those of others stay.
+        """Removes the checkpoints of these runs, and those in `shared` of runs that have all ended.
 
-        With `keep_end` the newest stays that is in the run's own folder.
+        With `keep_end`, the newest checkpoint in a run's own folder stays.
         """
         if not processes.leads():
             return
@@ -157,7 +157,7 @@ class LaneCheckpoints:
 
 
 def _names(path: Path) -> list[str]:
-    """Returns the names of the runs that share a checkpoint; none where another program has just removed it."""
+    """Names of the runs that share a checkpoint; none if another process has just removed it."""
     try:
         return list(json.loads(path.read_text())["cells"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""The host's side of a training loop: compile it, call it epoch by epoch, see that it fits into memory."""
+"""Running a training loop: compile it, check that it fits into memory, call it epoch by epoch."""
 
 from __future__ import annotations
 
@@ -67,23 +67,23 @@ def train(
     devices: int | str = 1,
     **parts: Any,
 ) -> Iterator[Progress]:
-    """Trains one run without a folder, yielding after every epoch. Stop by not asking for more.
+    """Trains one run without a folder, yielding after every epoch.
 
     `train_runs` adds folders, checkpoints, logs and runs side by side.
 
     Args:
       env: the environment.
       config: sizes.
-      hparams: numbers; the defaults where None.
+      hparams: numbers. None: the defaults.
       seed: random seed.
       on_compile: called with None when compilation begins and with its seconds when it has ended.
-      start: point to go on from, as `checkpoint.restore` gives it; a new run where None.
+      start: point to resume from, as `checkpoint.restore` returns it. None: a new run.
       devices: that share the run, or "all": each has an equal share of environments, ring and batches.
       **parts: sampler, priority and learner, as `make_train` takes them.
 
     Raises:
-      ValueError: a Config or HParams that cannot run, memory that does not suffice, devices that are not there, or what
-        `env.check` raises, where the environment has one, before the first epoch or after any.
+      ValueError: invalid Config or HParams, too little memory, missing devices, or an error of `env.check`, before the first
+        epoch or after any.
     """
     hparams = HParams() if hparams is None else hparams
     config_lib.validate(config, hparams, env.episode_length)
@@ -111,7 +111,7 @@ def run(
     arrays as NumPy's.
 
     Raises:
-      ValueError: what `env.check` raises, where the environment has one, after an epoch.
+      ValueError: an error of `env.check` after an epoch.
     """
     num_epochs = config_lib.num_epochs(config, env.episode_length)
     state = jax.block_until_ready(start.state)
@@ -211,7 +211,7 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
 
 
 def state_template(program: Train) -> TrainState:
-    """Returns the shapes and types of a run's TrainState, for `checkpoint.restore`."""
+    """Shapes and dtypes of a run's TrainState, for `checkpoint.restore`."""
     return jax.eval_shape(program.init, jax.random.key(0), as_arrays(HParams()))
 
 
@@ -253,5 +253,5 @@ def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
 
 
 def to_float(value: Any) -> float:
-    """Returns a float32 to the digits that it has: 95 of 100 are 0.95, which float(float32) is not."""
+    """A float32 rounded to six digits: 0.95, where float() of a float32 is 0.949999988..."""
     return float(f"{value:.6g}")

@@ -39,14 +39,14 @@ EvaluateFn = Callable[[TrainState, Any], Outcome]
 
 
 class Choices(NamedTuple):
-    """What lanes of one program may differ in beside numbers: each list once, in the order of the runs."""
+    """Components in which the lanes of a program differ, each once, in the order of the runs."""
 
     samplers: list[tuple[str, str, str, str]]  # arguments of samplers.make
     priorities: list[str]
     generators: list[str]
 
     def of(self, spec: RunSpec) -> tuple[int, int, int]:
-        """Returns the numbers of a run's sampler, priority and generator."""
+        """Indices of a run's sampler, priority and generator."""
         sampler, priority, generator = _parts(spec)
         return self.samplers.index(sampler), self.priorities.index(priority), self.generators.index(generator)
 
@@ -56,7 +56,7 @@ def _parts(spec: RunSpec) -> tuple[tuple[str, str, str, str], str, str]:
 
 
 def choices_of(specs: Sequence[RunSpec]) -> Choices:
-    """Returns what the runs of a program choose from."""
+    """Components that the runs of a program use."""
     return Choices(*(list(dict.fromkeys(values)) for values in zip(*map(_parts, specs))))
 
 
@@ -102,12 +102,12 @@ def compile_runs(
     report: Callable[[str], None],
     devices: Sequence[Any] = (),
 ) -> Program:
-    """Compiles for as many lanes as there may be and memory holds, by the compiler's figure.
+    """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate.
 
     The last evaluation may still be compiling, in a thread, while the runs are trained.
 
     Raises:
-      ValueError: memory does not suffice for one run, or sizes that the devices do not divide.
+      ValueError: too little memory for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
     most = min(len(specs), max_lanes or len(specs))
@@ -167,10 +167,7 @@ def _compile(
 def _compile_evaluation(
     env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
 ) -> concurrent.futures.Future[EvaluateFn]:
-    """Compiles the last evaluation, which is not needed before the runs have ended: `beside` their training, in a thread.
-
-    Compiling takes memory, too, to try kernels in.
-    """
+    """Compiles the last evaluation; with `beside`, in a thread while the runs are trained, which takes memory."""
     episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.shards)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
@@ -194,7 +191,7 @@ def _compile_evaluation(
 
 
 def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGKey, Any]:
-    """Returns the keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
+    """Keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
     padded = [specs[min(i, len(specs) - 1)] for i in range(lanes)]
     numbers: list[Any] = [spec.hparams for spec in padded]
     if any(len(own) > 1 for own in choices):
@@ -206,7 +203,7 @@ def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGK
 
 
 def lane_of(tree: Any, lane: int, lanes: int) -> Any:
-    """Returns one run's part of a pytree that `lanes` runs share; one lane has no axis."""
+    """One run's slice of a pytree of `lanes` runs; a single lane has no axis."""
     return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
 
 
