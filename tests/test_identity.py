@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import math
 import shutil
 
 import numpy as np
@@ -312,3 +313,9 @@ def test_lanes_share_a_checkpoint_of_their_own_settings(tmp_path):
     run(tmp_path, trials, lanes=2)
     assert [path.name for path in (tmp_path / "unfinished").iterdir()] == ["stray"]
     assert len(tables.read(tmp_path)) == 2
+
+
+def test_an_infinite_number_survives_config_json(tmp_path):
+    spec = RunSpec(env="reach", hparams=HParams(her_k=math.inf))
+    run_folder.write_config(tmp_path / "run", spec, "native", {})
+    assert run_folder.read_run(tmp_path / "run")[1] == spec

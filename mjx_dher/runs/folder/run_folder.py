@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import datetime
 import json
+import math
 import platform
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ POLICY_FILE = "policy.npz"
 RESULT_FILE = "result.json"
 CHECKPOINTS = "checkpoints"
 MANIFEST = "manifest.json"  # of a checkpoint
+INFINITE = "inf"  # in place of an infinite number, which JSON lacks
 
 # Statuses in result.json.
 FINISHED = "finished"
@@ -79,7 +81,7 @@ def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) 
       engine: the physics that runs (`spec.engine` may be auto).
       extra: further entries, for the reader and for `resume`.
     """
-    hparams = {name: float(value) for name, value in spec.hparams._asdict().items()}
+    hparams = {name: INFINITE if value == math.inf else float(value) for name, value in spec.hparams._asdict().items()}
     description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     description |= {"config": dataclasses.asdict(spec.config), "hparams": hparams}
     own = fingerprint.sources(spec)
@@ -251,7 +253,7 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
             raise KeyError("total_steps")
         spec = RunSpec(
             config=Config(**config),
-            hparams=HParams(**content["hparams"]),
+            hparams=HParams(**{name: math.inf if x == INFINITE else x for name, x in content["hparams"].items()}),
             **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
             env_kwargs=tuple(content["env_kwargs"]),
         )
