@@ -1,12 +1,16 @@
 """docs/examples/ddpg_her.py: its samplers equal the library's, and it learns Reach as the trainer does."""
 
+import dataclasses
+
 import ddpg_her
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
-from mjx_dher import Config, HParams, envs, make_train, samplers
+from mjx_dher import Config, HParams, envs, learners, make_train, rollout, samplers
+from mjx_dher.types import Batch
 
 SETTINGS = ddpg_her.Settings(
     env="reach",
@@ -64,6 +68,38 @@ def test_the_buffer_is_a_ring():
         buffer = ddpg_her.add_episodes(buffer, episodes(first))
     assert buffer.count == 6
     np.testing.assert_array_equal(buffer.episodes.desired_goal, [4, 5, 6])
+
+
+def test_an_update_is_the_library_s():
+    """Two updates, from parameters, targets and statistics that all differ."""
+    env, settings = envs.make("reach"), SETTINGS._replace(hidden_size=16)
+    hparams = HParams(gamma=settings.gamma, polyak=1 - settings.tau)
+    ours = learners.make("ddpg", Config(hidden_sizes=(16, 16, 16)), rollout.env_spec(env))
+    state, other = ours.init(jax.random.key(0)), ours.init(jax.random.key(1))
+    norms = [norm.replace(mean=norm.mean + 0.1, var=2.0 * norm.var) for norm in (state.observation_norm, state.goal_norm)]
+    state = dataclasses.replace(state, target=other.params, observation_norm=norms[0], goal_norm=norms[1])
+    params, target = (ddpg_her.Networks(p.actor, p.critic) for p in (state.params, state.target))
+    nets = ddpg_her.Networks(ddpg_her.MLP(16, env.action_size), ddpg_her.MLP(16, 1))
+    static = ddpg_her.Static(env, settings, nets, optax.adam(settings.learning_rate))
+    moments = (ddpg_her.Moments(norm.count, norm.mean, norm.var) for norm in norms)
+    learner = ddpg_her.Learner(params, target, static.optimizer.init(params), *moments)
+    keys = jax.random.split(jax.random.key(2), 5)
+    observation, following, goal, action = (jax.random.normal(k, (64, n)) for k, n in zip(keys, (10, 10, 3, 4), strict=False))
+    reward = -jax.random.bernoulli(keys[4], 0.5, (64,)).astype(jnp.float32)
+    batch = ddpg_her.Batch(observation, following, goal, action, reward)
+    discount, row = jnp.full(64, settings.gamma), jnp.arange(64)
+    theirs = Batch(observation, following, goal, action, reward, discount=discount, row=row)
+
+    @jax.jit
+    def update(learner, state):
+        updated, _ = ours.update(state, theirs, hparams)
+        return ddpg_her.update(static, learner, batch), ours.update_target(updated, hparams)
+
+    for _ in range(2):
+        learner, state = update(learner, state)
+    for mine, other in ((learner.params, state.params), (learner.target, state.target)):
+        for a, b in zip(jax.tree.leaves([mine.actor, mine.critic]), jax.tree.leaves([other.actor, other.critic]), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 def trainer_curve():

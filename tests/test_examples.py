@@ -3,6 +3,8 @@
 import re
 
 import any_model
+import contrastive
+import image_reach
 import jax
 import many_copies
 import many_seeds
@@ -10,11 +12,12 @@ import numpy as np
 import own_episodes
 import own_learner
 import pytest
+import trap
 from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli, testing
 from mjx_dher.cli.train import parse_train_args
-from mjx_dher.rollout import rollout
+from mjx_dher.rollout import env_spec, rollout
 from point_mass import PointMass
 
 TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
@@ -23,7 +26,7 @@ TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text()
 def test_each_is_short():
     lengths = {path.name: len(path.read_text().splitlines()) for path in EXAMPLES.glob("*.py")}
     assert lengths.pop("ddpg_her.py") < 350
-    assert max(lengths.values()) < 80
+    assert max(lengths.values()) < 150
     assert lengths["own_methods.py"] < 25
 
 
@@ -59,6 +62,38 @@ def test_figures_of_any_model_fall(capsys):
         r"after 1.00 s the centre of mass is ([\d.]+) m high, ([\d.]+) m at most\n", capsys.readouterr().out
     ).groups()
     assert 0.1 < float(found[0]) < float(found[1]) < 0.8
+
+
+@pytest.mark.parametrize(
+    ("example", "arguments", "least"),
+    [
+        (contrastive, ["--epochs", "2"], 0.9),
+        (image_reach, ["--epochs", "3"], 0.8),
+        (trap, ["--epochs", "4"], 0.6),
+        pytest.param(trap, ["--epochs", "12", "--dense"], 0.6, marks=pytest.mark.slow),
+    ],
+)
+def test_extensions_learn(example, arguments, least, capsys):
+    """Each is one file of a custom task or learner: terminal states, other rewards, images, InfoNCE."""
+    example.main(arguments)
+    success = [float(number) for number in re.findall(r"success ([\d.]+)", capsys.readouterr().out)]
+    assert success[-1] >= least
+    assert success[0] < success[-1] or success[0] > 0.9
+
+
+def test_what_the_extensions_declare():
+    """Falling ends the episode for any goal; rewards and observations are as the spec says."""
+    for dense, highest in ((False, 1.0), (True, 5.0)):
+        env = trap.Trap(dense=dense)
+        actions = jax.random.uniform(jax.random.key(1), (env.episode_length, 64, 2), minval=-1, maxval=1)
+        episodes, outcome = rollout(env, lambda action, obs: action, jax.random.key(0), 64, actions)
+        last = np.take_along_axis(np.array(episodes.observation), np.array(episodes.length)[:, None, None], axis=1)[:, 0]
+        np.testing.assert_array_equal(episodes.terminal, np.linalg.norm(last, axis=-1) < trap.TRAP)
+        assert 0 < episodes.terminal.sum() < 64
+        assert np.all(outcome.bad_rewards == 0)
+        assert env_spec(env).reward_range == (0.0, highest)
+    image = env_spec(image_reach.ImageReach()).observation["image"]
+    assert (image.shape, image.dtype) == ((12, 12, 1), np.uint8)
 
 
 @pytest.mark.slow

@@ -1,10 +1,11 @@
 """DDPG with hindsight experience replay (HER) in one file, to be read from top to bottom.
 
     python docs/examples/ddpg_her.py --env reach --sampler weighted --seed 0
-    python docs/examples/ddpg_her.py
+    python docs/examples/ddpg_her.py --sampler weighted
 
-The first command reaches success 1.00 on Reach after 8,000 steps, in 23 s of processor time with compilation. The second
-learns Push. The file needs jax, flax, optax and, from this library, only the tasks.
+The first command reaches success 1.00 on Reach after 8,000 steps. The second reaches 0.92 on Push after 240,000 steps. With
+compilation they take 23 s and about 6 minutes of processor time, on two cores of an Intel Xeon (seed 0, 2026-11-25). The file
+needs jax, flax, optax and, from this library, only the tasks.
 
 Papers that the comments name:
   DDPG       Lillicrap et al. 2016, arXiv 1509.02971
