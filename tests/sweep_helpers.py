@@ -5,7 +5,7 @@ import dataclasses
 import math
 
 import pytest
-from test_trainer import SMALL
+from configs import SMALL
 
 from mjx_dher import HParams, Options, RunSpec
 from mjx_dher.runs import driver

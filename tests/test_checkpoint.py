@@ -13,8 +13,8 @@ import jax
 import numpy as np
 import orbax.checkpoint
 import pytest
+from configs import SMALL
 from conftest import ROOT, refuses
-from test_trainer import SMALL
 
 from mjx_dher import HParams, RunSpec, cli, trainer
 from mjx_dher.learners import ddpg

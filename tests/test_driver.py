@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from configs import SHORT, flags
 from conftest import EXAMPLES, refuses
 
 import mjx_dher
@@ -20,23 +21,9 @@ from mjx_dher.system.files import FolderError
 from point_mass import PointMass
 from probes import held
 
-CONFIG = mjx_dher.Config(
-    num_envs=2,
-    cycles_per_epoch=2,
-    updates_per_cycle=4,
-    target_period=1,
-    batch_size=16,
-    total_steps=120,
-    replay_size=100,
-    hidden_sizes=(8,),
-    eval_episodes=4,
-)
+CONFIG = SHORT
 SPEC = RunSpec(env="point_mass:PointMass", config=CONFIG)
-FLAGS = [
-    *("--env", "point_mass:PointMass", "--sampler", "weighted", "--preset", "cpu", "--num-envs", "2", "--hidden-sizes", "8"),
-    *("--cycles-per-epoch", "2", "--updates-per-cycle", "4", "--batch-size", "16", "--total-steps", "120"),
-    *("--replay-size", "100", "--eval-episodes", "4", "--final-episodes", "600"),
-]
+FLAGS = [*flags(SHORT), "--sampler", "weighted", "--final-episodes", "600"]
 TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
 
 

@@ -8,8 +8,9 @@ import shutil
 
 import numpy as np
 import pytest
+from configs import SHORT as CONFIG
 from sweep_helpers import LONGER, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
-from test_driver import CONFIG, rows_of
+from test_driver import rows_of
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, cli, envs

@@ -8,7 +8,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import pytest
-from test_trainer import SMALL
+from configs import SMALL
 
 from mjx_dher import envs, make_train, priorities, replay, samplers
 from mjx_dher.components import COMPONENTS

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_trainer import SMALL
+from configs import SMALL
 
 from mjx_dher import HParams, make_train, priorities, replay, testing
 from mjx_dher.context import Context

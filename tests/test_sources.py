@@ -4,8 +4,8 @@ import dataclasses
 import sys
 
 import pytest
+from configs import SHORT, flags
 from sweep_helpers import compile_once  # noqa: F401
-from test_driver import FLAGS
 from test_identity import SPEC, resume, train
 
 from mjx_dher import cli
@@ -39,8 +39,8 @@ def own(tmp_path, monkeypatch):
 
 
 def flags_of(out):
-    own = ["--env", "own_task:Mine", "--sampler", "closest", "--metric", "own_task:near"]
-    return [*own, *FLAGS[4:], "--total-steps", "80", "--final-episodes", "4", "--out", str(out)]
+    own = [*flags(SHORT, "own_task:Mine"), "--sampler", "closest", "--metric", "own_task:near"]
+    return [*own, "--total-steps", "80", "--final-episodes", "4", "--out", str(out)]
 
 
 def test_a_sweep_of_own_code_that_changed_trains_it_anew_and_says_so(own, tmp_path, capsys):

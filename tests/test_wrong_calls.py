@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import pytest
 import wrong_calls
+from configs import SHORT as CONFIG
 from conftest import ROOT, refuses
-from test_driver import CONFIG
 
 import mjx_dher
 from mjx_dher import Options, cli, envs
