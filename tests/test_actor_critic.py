@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import Config, HParams, learners, make_train, networks
 from mjx_dher.learners import critics
@@ -315,20 +316,20 @@ def seven(action_size, hidden_sizes, dtype, heads=networks.PLAIN):
 def test_what_does_not_combine_is_refused_by_name():
     hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
     for name in NAMES:
-        with pytest.raises(ValueError, match=f"learner_kernels hopper computes learner ddpg; it is {name}"):
+        with refuses("learner_kernels", "hopper", "ddpg", name):
             learners.make(name, hopper, SPEC)
-        with pytest.raises(ValueError, match=rf"learner {name} needs networks that are a function .*heads"):
+        with refuses("learner", name, "networks", "heads"):
             learners.make(name, SMALL, SPEC, lambda action_size, hidden_sizes, dtype: networks.mlp(2, (8,)))
-        with pytest.raises(ValueError, match=f"for learner {name} the critic must give"):
+        with refuses("learner", name, "critic"):
             learners.make(name, SMALL, SPEC, seven)
-    with pytest.raises(ValueError, match=r"dropped_quantiles must be less than num_quantiles \(5\); got 5"):
+    with refuses("dropped_quantiles", "num_quantiles", 5):
         made("tqc", dropped_quantiles=5)
-    with pytest.raises(ValueError, match=r"subset_critics must be at most num_critics \(3\); got 4"):
+    with refuses("subset_critics", "num_critics", 3, 4):
         made("redq", subset_critics=4)
 
 
 @pytest.mark.parametrize(("delay", "period"), [(3, 2), (40, 1), (3, 4)])
 def test_a_delay_that_no_round_has_is_refused(delay, period):
     config = dataclasses.replace(SMALL, policy_delay=delay, target_period=period)
-    with pytest.raises(ValueError, match=f"policy_delay must divide target_period .*got {delay}"):
+    with refuses("policy_delay", "target_period", delay):
         make_train(PointMass(), config)

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import load_recorded
+from conftest import load_recorded, refuses
 
 from mjx_dher import envs
 from mjx_dher.contract import env_spec
@@ -119,28 +119,28 @@ def test_actions_are_clipped(task):
 def test_bad_actions_are_rejected(native, task):
     state = task("push").reset(jax.random.key(6))
     cases = [
-        (np.zeros(3), r"action has shape \(3,\); push takes \(4,\)"),
-        (np.zeros((2, 4)), r"action has shape \(2, 4\); push takes \(4,\).*use jax.vmap"),
-        (np.array([0, np.nan, 0, 0]), "action must be finite; got"),
-        (np.array([0, 0, np.inf, 0]), "action must be finite; got"),
+        (np.zeros(3), ["action", "(3,)", "(4,)"]),
+        (np.zeros((2, 4)), ["action", "(2, 4)", "(4,)", "jax.vmap"]),
+        (np.array([0, np.nan, 0, 0]), ["action", "nan"]),
+        (np.array([0, 0, np.inf, 0]), ["action", "inf"]),
     ]
-    for action, message in cases:
-        with pytest.raises(ValueError, match=message):
+    for action, parts in cases:
+        with refuses(*parts):
             native.step(state, action)
 
 
 def test_bad_names_and_overrides_are_rejected():
     cases = [
-        ({"name": "pusch"}, r"env must be one of .*push.*got 'pusch' .did you mean 'push'"),
-        ({"engine": "natve"}, "engine must be one of auto, native, jax, warp; got 'natve' .did you mean 'native'"),
-        ({"reward_type": "sprase"}, "reward_type must be 'sparse' or 'dense'; got 'sprase'"),
-        ({"distance_threshold": 0}, r"distance_threshold must lie in \(0, inf\); got 0"),
-        ({"episode_length": 0}, r"episode_length must lie in \[1, 1000000\]; got 0"),
-        ({"colour": 1}, "argument of env push must be one of engine, reward_type, .*, num_threads; got 'colour'"),
-        ({"engine": "jax", "num_threads": 1}, "must be one of .*iterations, ls_iterations; got 'num_threads'"),
+        ({"name": "pusch"}, ["env", "pusch", "push"]),
+        ({"engine": "natve"}, ["engine", "natve", "native"]),
+        ({"reward_type": "sprase"}, ["reward_type", "sprase", "sparse"]),
+        ({"distance_threshold": 0}, ["distance_threshold", 0]),
+        ({"episode_length": 0}, ["episode_length", 0]),
+        ({"colour": 1}, ["argument", "colour", "num_threads"]),
+        ({"engine": "jax", "num_threads": 1}, ["num_threads", "ls_iterations"]),
     ]
-    for arguments, message in cases:
-        with pytest.raises(ValueError, match=message):
+    for arguments, parts in cases:
+        with refuses(*parts):
             envs.make(**{"name": "push", **arguments})
 
 

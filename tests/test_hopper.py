@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import HParams, envs, learners, presets
 from mjx_dher.hopper import gradients as hopper
@@ -252,7 +253,7 @@ def test_they_lack_nothing_on_such_a_gpu(monkeypatch):
 @pytest.mark.skipif(HOPPER, reason="can use them")
 def test_kernels_that_cannot_be_used_are_refused_at_once():
     env = envs.make("push", engine="native")
-    with pytest.raises(ValueError, match=r"learner_kernels hopper needs .*H100 or H200; .* cpu here"):
+    with refuses("learner_kernels", "hopper", "H100", "cpu"):
         make_train(env, STATIC)
     make_train(env, dataclasses.replace(STATIC, learner_kernels="auto"))
 
@@ -270,7 +271,7 @@ class Bounded(nn.Module):
 def own_networks(action_size, hidden_sizes, dtype):
     """An actor of one's own, and the default critic."""
 
-    _, critic = mlp(action_size, hidden_sizes, dtype)
+    critic = mlp(action_size, hidden_sizes, dtype).critic
     return Networks(Bounded(action_size), critic)
 
 
@@ -278,7 +279,7 @@ def test_networks_of_one_s_own_are_refused_and_auto_takes_xla_for_them(monkeypat
     """They know the default networks alone."""
     monkeypatch.setattr(hopper, "unsupported_reason", lambda *args: None)
     sizes = spec_of(OBSERVATION, GOAL, 4)
-    with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
+    with refuses("learner_kernels", "hopper", "mlp"):
         learners.make("ddpg", STATIC, sizes, own_networks)
     auto = dataclasses.replace(STATIC, learner_kernels="auto")
     assert learners.make("ddpg", auto, sizes, own_networks).compute_gradients is ddpg.compute_gradients

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher.envs.engines import host_call
 
@@ -62,14 +63,14 @@ def test_the_last_function_of_a_name_is_called_also_by_what_is_compiled():
 
 def test_an_error_ends_the_program_with_its_message():
     cases = [
-        (lambda rows: 1 / 0, "ZeroDivisionError: division by zero"),
-        (lambda rows: rows[:2], r"must give \[4\]; it gives \(2,\)"),
-        (lambda rows: None, r"must give \[4\]; it gives \(\)"),
+        (lambda rows: 1 / 0, "ZeroDivisionError"),
+        (lambda rows: rows[:2], "(2,)"),
+        (lambda rows: None, "()"),
     ]
     call = jax.jit(lambda row: host_call.call("test_error", (4,), row))
     for function, message in cases:
         host_call.register("test_error", function)
-        with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match=message):
+        with refuses(message, error=(jax.errors.JaxRuntimeError, ValueError)):
             jax.block_until_ready(call(ROWS[0]))
 
 

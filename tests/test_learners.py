@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
@@ -118,28 +119,25 @@ def test_networks_are_a_function_or_a_place(mine):
 def test_names_and_functions_that_cannot_be_used_are_refused(mine, field, make, parameters):
     known = {"learner": "ddpg", "networks": "mlp"}[field]
     for name, parts in {
-        known[:-1]: [repr(known[:-1]), f"did you mean {known!r}", "module:attribute"],
-        f"mine:{field}s": [f"'mine:{field}s'", "mine", f"did you mean {field!r}"],
-        "mine:two": [parameters, " 2"],
-        "no_such_module:x": ["'no_such_module'", "no module"],
+        known[:-1]: [known[:-1], known, "module:attribute"],
+        f"mine:{field}s": [f"mine:{field}s", field],
+        "mine:two": [parameters, 2],
+        "no_such_module:x": ["no_such_module"],
     }.items():
-        with pytest.raises(ValueError, match=field) as error:
+        with refuses(field, *parts):
             make(name)
-        assert all(part in str(error.value) for part in parts), error.value
-    with pytest.raises(ValueError, match=field) as error:
+    with refuses(field, parameters):
         make(lambda one: one)
-    assert parameters in str(error.value)
 
 
 def test_a_learner_without_methods_is_rejected_by_their_names(mine):
-    with pytest.raises(ValueError, match=f"it has no {', '.join(METHODS)} "):
+    with refuses(*METHODS):
         learners.make(lambda config, sizes, networks: object(), SMALL, TASK)
     methods = {name: (lambda *args: None) for name in METHODS} | {"act": 3}
     mine.part = lambda config, sizes, networks: types.SimpleNamespace(**methods)
     for name in ("mine:part", mine.part):
-        with pytest.raises(ValueError, match="it has no act ") as error:
+        with refuses("act", repr(name)):
             learners.make(name, SMALL, TASK)
-        assert repr(name) in str(error.value)
 
 
 class Walk(learners.Learner):
@@ -174,7 +172,7 @@ def test_a_delay_needs_updates_without_the_actor():
     methods = {name: (lambda *args: None) for name in METHODS}
     for delay in (3, 0, 2.0):
         made = types.SimpleNamespace(**methods, policy_delay=delay)
-        with pytest.raises(ValueError, match="policy_delay"):
+        with refuses("policy_delay"):
             learners.make(lambda config, sizes, networks, made=made: made, SMALL, TASK)
 
 
@@ -204,7 +202,7 @@ def test_networks_of_the_wrong_output_shape_are_refused(made, parts):
 
 def test_kernels_know_the_default_networks_alone():
     hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
-    with pytest.raises(ValueError, match="learner_kernels hopper needs networks mlp"):
+    with refuses("learner_kernels", "hopper", "mlp"):
         learners.make("ddpg", hopper, TASK, own_networks)
     auto = dataclasses.replace(hopper, learner_kernels="auto")
     assert learners.make("ddpg", auto, TASK, own_networks).compute_gradients is ddpg.compute_gradients
@@ -286,13 +284,11 @@ def test_its_numbers_come_back_to_the_bit(folder, trained):
 @pytest.mark.parametrize("changes", [{"networks": "mlp"}, {"config": dataclasses.replace(SMALL, hidden_sizes=(16,))}])
 def test_a_stored_policy_of_other_networks_is_refused(folder, changes, mine):
     run_folder.write_config(folder, dataclasses.replace(SPEC, **changes), "none", {})
-    with pytest.raises(ValueError, match=r"policy\.npz") as error:
+    with refuses("policy.npz", changes.get("networks", "mine:networks"), "mine:learner"):
         mjx_dher.load_policy(folder)
-    assert repr(changes.get("networks", "mine:networks")) in str(error.value)
-    assert "'mine:learner'" in str(error.value)
 
 
 def test_a_stored_policy_needs_its_module(folder, monkeypatch):
     monkeypatch.delitem(sys.modules, "mine")
-    with pytest.raises(ValueError, match="there is no module 'mine'"):
+    with refuses("mine"):
         mjx_dher.load_policy(folder)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from any_model import FIGURE
+from conftest import refuses
 
 from mjx_dher.envs import Simulator, make
 from mjx_dher.envs.engines import Controls, native
@@ -147,24 +148,21 @@ def test_step_and_advance_are_the_same_physics():
 
 
 def test_bad_arguments_are_rejected():
-    cases = [
-        (lambda model: Simulator("figure.xml"), "model must be a mujoco.MjModel; got a str"),
-        (lambda model: Simulator(model, derived="xpos"), "derived must be a list of names; got 'xpos'"),
-        (lambda model: Simulator(model, derived=["xposs"]), "derived must be one of .*; got 'xposs' .*'xpos'"),
-        (lambda model: Simulator(model, derived=["qpos"]), "derived must be one of"),
-        (lambda model: Simulator(model, substeps=0), r"substeps must lie in \[1, 1000000\]; got 0"),
-        (lambda model: Simulator(model, num_threads=0), r"num_threads must lie in \[1, 4096\]; got 0"),
-        (lambda model: Simulator(model).make_data("down"), "keyframe 'down' is none of the model's 0"),
-        (lambda model: Simulator(model).make_data(3), "keyframe 3 is none of the model's 0"),
-        (
-            lambda model: Simulator(model).step(Simulator(model).make_data(), jnp.ones(3)),
-            r"ctrl has shape \[3\]; the model's is \[4\]",
-        ),
-        (lambda model: Simulator(model).step(None), "data must be a Data, as make_data gives it; got a NoneType"),
-        (lambda model: Simulator(asleep(model)), "sleep and IPC require a persistent batch"),
+    cases = [  # a call, and what the error must name
+        (lambda model: Simulator("figure.xml"), ["model", "mujoco.MjModel", "str"]),
+        (lambda model: Simulator(model, derived="xpos"), ["derived", "xpos"]),
+        (lambda model: Simulator(model, derived=["xposs"]), ["derived", "xposs", "xpos"]),
+        (lambda model: Simulator(model, derived=["qpos"]), ["derived", "qpos"]),
+        (lambda model: Simulator(model, substeps=0), ["substeps", 0]),
+        (lambda model: Simulator(model, num_threads=0), ["num_threads", 0]),
+        (lambda model: Simulator(model).make_data("down"), ["keyframe", "down"]),
+        (lambda model: Simulator(model).make_data(3), ["keyframe", 3]),
+        (lambda model: Simulator(model).step(Simulator(model).make_data(), jnp.ones(3)), ["ctrl", "[3]", "[4]"]),
+        (lambda model: Simulator(model).step(None), ["data", "NoneType"]),
+        (lambda model: Simulator(asleep(model)), ["sleep", "IPC"]),
     ]
-    for call, message in cases:
-        with pytest.raises(ValueError, match=message):
+    for call, parts in cases:
+        with refuses(*parts):
             call(mujoco.MjModel.from_xml_string(FIGURE))
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import envs
 from mjx_dher.envs import engines
@@ -93,17 +94,17 @@ def test_a_step_depends_on_nothing_that_came_before(warp):
 
 
 def test_where_it_cannot_run_it_says_why_and_names_the_extra(monkeypatch):
-    with pytest.raises(ValueError, match=r"engine warp needs JAX on an NVIDIA GPU, and JAX runs on cpu here: .*\[cuda\]"):
+    with refuses("engine", "warp", "cpu", "[cuda]"):
         envs.make("push", engine="warp")
     monkeypatch.setattr(engines, "_has_warp", lambda: False)
-    with pytest.raises(ValueError, match=r'engine warp needs warp-lang, which the extra "cuda" installs'):
+    with refuses("engine", "warp", "warp-lang", "cuda"):
         envs.make("push", engine="warp")
 
 
 def test_a_driver_that_is_too_old_for_warp_is_named(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(warp_engine.wp, "is_cuda_available", lambda: False)
-    with pytest.raises(ValueError, match=r"Warp \d.* cannot use this machine's NVIDIA driver, though JAX can"):
+    with refuses("Warp", "driver"):
         envs.make("push", engine="warp")
 
 
