@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from configs import SMALL
 from jax.sharding import PartitionSpec
-from test_trainer import SMALL
 
 from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trainer
 from mjx_dher.contract import env_spec

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from configs import LEARNS
 from conftest import refuses
 
-from mjx_dher import Config, HParams, learners, make_train, networks
+from mjx_dher import HParams, learners, make_train, networks
 from mjx_dher.learners import critics
 from mjx_dher.learners.actor_critic import ActorCritic
 from mjx_dher.learners.actors import Deterministic, Gaussian
@@ -30,20 +31,7 @@ def at_night(*names):
 
 
 SPEC = spec_of(2, 2, 2)
-SMALL = Config(
-    num_envs=16,
-    cycles_per_epoch=5,
-    updates_per_cycle=20,
-    target_period=1,
-    batch_size=128,
-    replay_size=20_000,
-    hidden_sizes=(32, 32),
-    num_critics=3,
-    num_quantiles=5,
-    dropped_quantiles=1,
-    eval_episodes=100,
-    total_steps=8_000,
-)
+SMALL = dataclasses.replace(LEARNS, num_critics=3, num_quantiles=5, dropped_quantiles=1, eval_episodes=100)
 HP = HParams(gamma=0.5, action_l2=0.0, target_noise=0.0, entropy_weight=0.25)
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_trainer import SMALL
+from configs import SMALL
 
 from mjx_dher import HParams, RunSpec, learners, make_train, priorities, replay, samplers, testing
 from mjx_dher.components import COMPONENTS

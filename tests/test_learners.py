@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from configs import LEARNS as SMALL
 from conftest import refuses
 
 import mjx_dher
-from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks
+from mjx_dher import HParams, RunSpec, learners, make_train, networks
 from mjx_dher.learners import common, ddpg
 from mjx_dher.networks import Actor, Critic, Networks
 from mjx_dher.policy import Policy, learner_policy
@@ -21,17 +22,6 @@ from point_mass import PointMass
 from probes import spec_of
 
 TASK = spec_of(2, 2, 2)
-SMALL = Config(
-    num_envs=16,
-    cycles_per_epoch=5,
-    updates_per_cycle=20,
-    target_period=1,
-    batch_size=128,
-    replay_size=20_000,
-    hidden_sizes=(32, 32),
-    eval_episodes=200,
-    total_steps=8_000,
-)
 HP = HParams(gamma=0.9, polyak=0.9, action_l2=0.1)
 METHODS = ("init", "act", "explore", "update", "noise", "update_normalizers", "update_target", "summary", "export")
 

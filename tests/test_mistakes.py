@@ -2,15 +2,17 @@
 
 import re
 
+import configs
 import jax
 import jax.numpy as jnp
 import mistakes
 import numpy as np
 import pytest
+from configs import TINY as SMALL
 from conftest import refuses
 
 import mjx_dher
-from mjx_dher import Config, HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
+from mjx_dher import HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
 from mjx_dher.rollout import rollout
@@ -27,17 +29,6 @@ from mjx_dher.testing import (
 from point_mass import PointMass, soon
 
 ENV = PointMass()
-SMALL = Config(
-    num_envs=4,
-    cycles_per_epoch=1,
-    updates_per_cycle=2,
-    target_period=1,
-    batch_size=16,
-    total_steps=40,
-    replay_size=80,
-    hidden_sizes=(8,),
-    eval_episodes=4,
-)
 CHECKS = {
     "sampler": (mistakes.SAMPLERS, lambda part: check_sampler(part, ENV)),
     "metric": (mistakes.METRICS, lambda part: check_metric(part, ENV)),
@@ -96,10 +87,7 @@ def alike(episode, context):
     return jnp.ones(())
 
 
-FLAGS = [
-    *("--num-envs", "4", "--cycles-per-epoch", "1", "--updates-per-cycle", "2", "--target-period", "1", "--batch-size", "16"),
-    *("--total-steps", "40", "--replay-size", "80", "--hidden-sizes", "8", "--eval-episodes", "4", "--preset", "cpu"),
-]
+FLAGS = configs.flags(SMALL)[2:]  # all but the environment
 # On the command line, one of each kind, and each way in which the message can come about.
 THROUGH = [
     ("sampler", "nan_late", []),
