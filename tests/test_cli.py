@@ -59,7 +59,7 @@ def test_a_run_says_what_it_does(finished):
     lines = done.stdout.splitlines()
     assert lines[0] == f"push, sampler weighted, seed 0; writing to {out}"
     assert lines[1].startswith("push: compiling for one run; physics native, learner on")
-    assert "replay ring 130.5 kB" in lines[1]
+    assert "replay ring 130.6 kB" in lines[1]
     assert lines[2].startswith("push: compiled in ")
     for number in (1, 2):
         line = lines[2 + number]

@@ -20,15 +20,17 @@ from rich.table import Column, Table
 from mjx_dher import envs
 from mjx_dher.config import check_count, check_number
 from mjx_dher.lookup import check_name
-from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
+
+VIEW_PORT = 8080  # of the viewer's page
 
 if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
 CURVE_WIDTH = 24  # characters of the live curve
 Devices = int | Literal["all"]  # of the option --devices
+VIEW_PORT = 8080  # of the viewer's page
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
 
 LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
@@ -97,6 +99,8 @@ def find_run(run: Path, console: Console) -> Path:
     Raises:
       FolderError: there is none.
     """
+    from mjx_dher.policy import bundled
+
     path = bundled.find(run)
     if bundled.is_shipped(path):
         console.print(f"{run}: the policy of the package; its card is {path / bundled.CARD}")

@@ -17,6 +17,7 @@ from mjx_dher import lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import (
+    VIEW_PORT,
     Devices,
     Screen,
     check_engine,
@@ -27,7 +28,6 @@ from mjx_dher.cli.common import (
     warn_of_tau,
 )
 from mjx_dher.cli.processes import check_out, claim, join
-from mjx_dher.cli.view import PORT, Beside, Page
 from mjx_dher.config import check_all, check_devices
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
@@ -38,8 +38,6 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
-from mjx_dher.tools import curves, figures
-from mjx_dher.viewer import address
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +65,7 @@ class TrainArgs:
     """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
     view: bool = False
     """Show in the browser how the run learns: the policy after each epoch, at play. Needs the extra view."""
-    view_port: int = PORT
+    view_port: int = VIEW_PORT
     """Port of that page; 0: any that is free."""
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
@@ -113,7 +111,7 @@ def train_command(argv: list[str], console: Console) -> int:
     args = parse_train_args(argv, console.print)
     if args.dry_run:
         return _dry_run(args, console)
-    port = address.check(Page().host, args.view_port) if args.view else None
+    viewer = _viewer(args.view_port) if args.view else None
     settle_compiler(args.spec.engine)
     own = {"seed": args.spec.seed, "sources": fingerprint.sources(args.spec), "devices": args.devices}
     described = {**fingerprint.settings(args.spec), **dataclasses.asdict(args.options), **own}
@@ -125,8 +123,18 @@ def train_command(argv: list[str], console: Console) -> int:
         prepare()
         env = make_env(args.spec)
         try_components(env, [args.spec], screen)
-        beside = stack.enter_context(Beside(folder, port if processes.leads() else None, screen))
-        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, beside.after_epoch)
+        beside = stack.enter_context(viewer(folder, screen)) if viewer and processes.leads() else None
+        after_epoch = (lambda: None) if beside is None else beside.after_epoch
+        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, after_epoch)
+
+
+def _viewer(port: int) -> Callable[[Path, Console], Any]:
+    """Makes the viewer of a run that is being trained. Raises ValueError if the page cannot be served."""
+    from mjx_dher.cli.view import Beside, Page
+    from mjx_dher.viewer import address
+
+    free = address.check(Page().host, port)
+    return lambda folder, console: Beside(folder, free, console)
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
@@ -285,6 +293,8 @@ def _train(
     def on_epoch(specs: Any, progress: Any) -> None:
         screen.show(specs, progress)
         if curve:
+            from mjx_dher.tools import figures
+
             figures.preload()
         after_epoch()
 
@@ -320,7 +330,11 @@ def _train(
 
 def _draw(folder: Path, curve: bool, console: Console) -> None:
     """Draws the curve of a run that has ended. A picture that cannot be drawn costs a line, and nothing else."""
-    if not (curve and figures.is_there() and loggers.whole_epochs(folder)):
+    if not curve:
+        return
+    from mjx_dher.tools import curves, figures
+
+    if not (figures.is_there() and loggers.whole_epochs(folder)):
         return
     picture = folder / f"{curves.CURVE}.png"
     try:

@@ -18,14 +18,13 @@ from rich.console import Console
 
 from mjx_dher import envs
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import check_engine, check_episodes, find_run, read_run
+from mjx_dher.cli.common import VIEW_PORT, check_engine, check_episodes, find_run, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments
 from mjx_dher.system import subprocesses
 from mjx_dher.system.caches import keep_compiled_programs
 
-PORT = 8080
 PARENT = "MJX_DHER_VIEWER_OF"  # variable with the number of the process that a viewer ends with, where one has started it
 
 
@@ -35,7 +34,7 @@ class Page:
 
     host: str = "127.0.0.1"
     """Address to serve the page at. Any other than this machine's own is open to all who reach it."""
-    port: int = PORT
+    port: int = VIEW_PORT
     """Port; 0: any that is free."""
     open: bool = True
     """Open the page in a browser, where there is one; its address is printed in any case."""

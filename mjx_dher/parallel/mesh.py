@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from mjx_dher.config import check_devices
 from mjx_dher.parallel.split import AxisName
+from mjx_dher.types import PRNGKey
 
 LANES, DATA = "lanes", "data"
 
@@ -103,3 +105,8 @@ def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
         fewer = [str(n) for n in range(1, number) if number % n == 0]
         raise ValueError(f"lanes must be a multiple of {number}, the devices, or {', '.join(fewer)}; got {lanes}")
     return lanes
+
+
+def to_host(key: PRNGKey, hparams: Any = None) -> tuple[np.ndarray, Any]:
+    """Returns keys, as their data, and numbers as the functions here take them, the same in every process: NumPy arrays."""
+    return np.asarray(jax.random.key_data(key)), jax.tree.map(np.asarray, hparams)

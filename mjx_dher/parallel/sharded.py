@@ -14,7 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, SingleDeviceSharding
 
 from mjx_dher.parallel.mesh import DATA, LANES, Layout
@@ -23,11 +22,6 @@ from mjx_dher.types import Array, PRNGKey
 
 InitFn = Callable[[PRNGKey, Any], TrainState]
 EpochFn = Callable[[TrainState], tuple[TrainState, Any, Any]]
-
-
-def to_host(key: PRNGKey, hparams: Any = None) -> tuple[np.ndarray, Any]:
-    """Returns keys, as their data, and numbers as the functions here take them, the same in every process: NumPy arrays."""
-    return np.asarray(jax.random.key_data(key)), jax.tree.map(np.asarray, hparams)
 
 
 def place_init(layout: Layout, init: InitFn, batched: bool) -> Any:

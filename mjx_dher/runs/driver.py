@@ -20,7 +20,6 @@ from mjx_dher import config as config_lib
 from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.parallel import mesh, processes
-from mjx_dher.policy.learner_policy import LearnerPolicy
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
@@ -301,8 +300,11 @@ def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, ru
     if learner is None:
         return
     policy = program.learner.export(learner, spec.hparams)
-    stored = LearnerPolicy(program.learner, learner, spec.hparams, program.spec) if policy is None else policy
-    stored.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
+    if policy is None:
+        from mjx_dher.policy.learner_policy import LearnerPolicy
+
+        policy = LearnerPolicy(program.learner, learner, spec.hparams, program.spec)
+    policy.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
 
 
 def _finish(

@@ -14,7 +14,7 @@ import numpy as np
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.contract import check_steps
-from mjx_dher.parallel import mesh, sharded
+from mjx_dher.parallel import mesh
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
@@ -154,8 +154,10 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     init, epoch = (jax.vmap(program.init), jax.vmap(epoch_and_check)) if key.ndim else (program.init, epoch_and_check)
     arguments: tuple[Any, Any] = key, as_arrays(hparams)
     if layout.devices:
+        from mjx_dher.parallel import sharded
+
         init, epoch = sharded.place_init(layout, init, bool(key.ndim)), sharded.place_epoch(layout, epoch, bool(key.ndim))
-        arguments = sharded.to_host(*arguments)
+        arguments = mesh.to_host(*arguments)
         state = init.eval_shape(*arguments)
     else:
         state = jax.eval_shape(init, *arguments)
@@ -175,7 +177,7 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     memory.release()
 
     def start(key: PRNGKey, hparams: HParams) -> TrainState:
-        return compiled_init(*(sharded.to_host(key, as_arrays(hparams)) if layout.devices else (key, as_arrays(hparams))))
+        return compiled_init(*(mesh.to_host(key, as_arrays(hparams)) if layout.devices else (key, as_arrays(hparams))))
 
     return Compiled(init=start, epoch=compiled, nbytes=nbytes)
 

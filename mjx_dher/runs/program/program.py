@@ -19,10 +19,8 @@ from mjx_dher import context, learners, priorities, samplers, trainer
 from mjx_dher import evaluate as evaluate_lib
 from mjx_dher.config import HParams
 from mjx_dher.contract import check_steps, env_spec
-from mjx_dher.contrib import generators
-from mjx_dher.demonstrations import read_demonstrations
 from mjx_dher.learners import Learner
-from mjx_dher.parallel import mesh, sharded, split
+from mjx_dher.parallel import mesh, split
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.rollout import Outcome
 from mjx_dher.runs.folder import run_folder
@@ -77,21 +75,31 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     config_lib.check_parts(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
     distance = context.of_env(env, spec.hparams).goal_distance
-    generator = generators.join([generators.make(name) for name in choices.generators])
     train = trainer.make_train(
         env,
         config,
         sampler=samplers.join([samplers.make(*choice, goal_distance=distance) for choice in choices.samplers]),
         priority=priorities.join([priorities.make(name) for name in choices.priorities]),
-        generator=None if generator is generators.reset else generator,
+        generator=_join_generators(choices.generators),
         learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
         axis_name=layout.axis_name,
     )
     if not spec.demonstrations:
         return train
+    from mjx_dher.demonstrations import read_demonstrations
+
     capacity = config_lib.episodes_capacity(spec.config, env.episode_length)
     episodes = read_demonstrations(spec.demonstrations, env, capacity)
     return train._replace(init=lambda key, hparams: train.add(train.init(key, hparams), episodes))
+
+
+def _join_generators(names: Sequence[str]) -> trainer.GoalsFn | None:
+    """The generators of these names, joined; None if all of them are the reset's own goals."""
+    if set(names) == {"reset"}:
+        return None
+    from mjx_dher.contrib import generators
+
+    return generators.join([generators.make(name) for name in names])
 
 
 def compile_runs(
@@ -177,9 +185,11 @@ def _compile_evaluation(
     init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
     arguments: tuple[Any, Any] = keys, hparams
     if layout.devices:
+        from mjx_dher.parallel import sharded
+
         batched = bool(keys.ndim)
         init, evaluate_all = sharded.place_init(layout, init, batched), sharded.place_evaluate(layout, evaluate_all, batched)
-        arguments = sharded.to_host(keys, hparams)
+        arguments = mesh.to_host(keys, hparams)
         state = init.eval_shape(*arguments)
     else:
         state, evaluate_all = jax.eval_shape(init, keys, hparams), jax.jit(evaluate_all)
@@ -224,7 +234,7 @@ def evaluate(
     def key_of(number: int) -> Any:
         fold_in = functools.partial(jax.random.fold_in, data=number)
         own = jax.vmap(fold_in)(keys) if keys.ndim else fold_in(keys)
-        return sharded.to_host(own)[0] if program.layout.devices else own
+        return mesh.to_host(own)[0] if program.layout.devices else own
 
     chunks = map(key_of, range(1, 1 + math.ceil(episodes / evaluate_lib.CHUNK)))
     outcome = evaluate_lib.in_chunks(functools.partial(program.evaluate.result(), state), chunks, episodes, fetch)
