@@ -20,7 +20,7 @@ TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (2: the arguments were refused)."""
+    """Runs the command line; returns the exit status (2: invalid arguments)."""
     # Else Python looks for cycles among all objects before it ends, which takes half a second after a run.
     atexit.register(gc.freeze)
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -58,7 +58,7 @@ def _run(name: str, argv: list[str]) -> int:
 
 
 def sentence(error: Exception) -> str | None:
-    """Returns what a user is told of an error that comes of what was asked for, or of the machine; None for others."""
+    """Message for a user or system error; None for a bug."""
     if isinstance(error, ValueError):
         return str(error)
     if isinstance(error, OSError):

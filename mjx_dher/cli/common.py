@@ -37,7 +37,7 @@ LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
 
 
 def warn_of_tau(polyak: float, console: Console) -> None:
-    """Prints what a small polyak means, which is more likely meant as the tau of other libraries."""
+    """Explains a small polyak, which was likely meant as the tau of other libraries."""
     if polyak < LEAST_LIKELY_POLYAK:
         console.print(
             f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries"
@@ -67,7 +67,7 @@ def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
 
 
 def settle_compiler(engine: str) -> None:
-    """Keeps a CPU from waiting for ever in programs of MJX; call it before JAX has started.
+    """Avoids a deadlock of MJX programs on a CPU; call it before JAX starts.
 
     With jaxlib 0.10.2 some 300 environments of `jax` that have objects make XLA's CPU backend lose a task. Its older order of
     operations does not (https://github.com/openxla/xla; no upstream issue known).
@@ -77,10 +77,10 @@ def settle_compiler(engine: str) -> None:
 
 
 def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
-    """Tries out what is the user's own in runs of an environment, before anything is compiled or written.
+    """Tests the custom components of runs of an environment, before anything is compiled or written.
 
     Raises:
-      ValueError: names the part, and what is wrong with it.
+      ValueError: names the component and the first violation.
     """
     tried: set[str] = set()
     for spec in specs:
@@ -94,7 +94,7 @@ def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None
 
 
 def find_run(run: Path, console: Console) -> Path:
-    """Returns the run folder that `run` names, and prints which it is where the name is that of a policy of the package.
+    """Finds the run folder or bundled policy that `run` names, and prints which it is if the name could be either.
 
     Raises:
       FolderError: there is none.
@@ -110,10 +110,10 @@ def find_run(run: Path, console: Console) -> Path:
 
 
 def read_run(path: Path, console: Console) -> RunSpec:
-    """Returns the description of the run in `path`, and prints which files of its own code have changed since.
+    """Reads the description of the run in `path`, and prints which custom source files have changed since.
 
     Raises:
-      FolderError: no run folder, or one that cannot be believed.
+      FolderError: no run folder, or a damaged one.
     """
     content, spec = run_folder.read_run(path)
     for text in run_folder.changed_code(content, spec):
@@ -131,7 +131,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> None:
-    """Prints a table whole: as wide as it is where there is no terminal, and row by row on a terminal that is narrower."""
+    """Prints a whole table; row by row on a terminal that is narrower than it."""
     table = Table(*head)
     for row in rows:
         table.add_row(*row)
@@ -162,7 +162,7 @@ def compare(
 
 
 class Screen:
-    """Progress over one run or many: a live bar and curve on a terminal; elsewhere lines, of a sweep one now and then.
+    """Progress of one run or many: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s.
 
     Args:
       console: to print to.

@@ -72,7 +72,7 @@ def guarded() -> Iterator[Guarded]:
 
 
 def status(stream: Guarded, ended: int, trains: bool) -> int:
-    """Returns the exit status of a command that ended with `ended`, and tells of output that was lost.
+    """Exit status of a command that ended with `ended`; reports output that was lost.
 
     One that trains has done what it was to do; to another, whose output is its purpose, the loss is an error, or, where the
     reader has gone (`| head`), what SIGPIPE would have been.

@@ -20,7 +20,7 @@ from mjx_dher.system.files import FolderError
 
 
 def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
-    """Returns the settings and options in the config.json of a run, and what a reader is told of them.
+    """Reads the settings and options in the config.json of a run, and lines about their origin.
 
     Args:
       path: a run folder, or a config.json, wherever it lies; it may have been edited.
@@ -42,7 +42,7 @@ def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
 
 
 def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
-    """Returns where settings come from: the run, the version that wrote them, and whether they were edited since."""
+    """Origin of settings: the run, the version that wrote them, and whether they were edited since."""
     versions = content.get("versions", {})
     version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
     now = fingerprint.digest(run_folder.identity_of(content, run))
@@ -54,7 +54,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
 
 
 def changes(before: RunSpec, now: RunSpec) -> str:
-    """Returns which settings were given beside those of a file: "gamma 0.9 (0.98 in the file)"."""
+    """Settings that differ from those of a file: "gamma 0.9 (0.98 in the file)"."""
     old, new = ({**fingerprint.settings(spec), "seed": spec.seed} for spec in (before, now))
     told = [f"{name} {text(new[name])} ({text(old[name])} in the file)" for name in new if new[name] != old[name]]
     return "given beside it: " + (", ".join(told) or "nothing")
@@ -87,7 +87,7 @@ def check_writable(out: Path) -> None:
 
 
 def amount(config: Config, episode_length: int, runs: int = 1) -> str:
-    """Returns how much `runs` runs play and learn, in a sentence."""
+    """How much `runs` runs play and learn, as a line."""
     epochs = config_lib.num_epochs(config, episode_length)
     steps = epochs * config_lib.steps_per_epoch(config, episode_length)
     updates = config_lib.num_updates(config, episode_length)
@@ -100,7 +100,7 @@ def amount(config: Config, episode_length: int, runs: int = 1) -> str:
 
 
 def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
-    """Returns what runs of one program hold in memory, without compiling it.
+    """Lines on the memory of runs of one program, without compiling it.
 
     Raises:
       ValueError: the parts do not fit together, or one run alone is more than memory holds.

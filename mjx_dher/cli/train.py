@@ -44,11 +44,11 @@ from mjx_dher.system.files import FolderError
 class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
-    Other commands: `resume RUN` goes on with a run that was stopped, `eval RUN` evaluates runs again, `view RUN` shows one in
-    the browser, `demo` a policy of the package, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch
-    task, `export RUN` writes its policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves,
-    `report DIR` writes a page about a run or a sweep, `list` names all tasks and parts, `check` tries out parts of your own,
-    `doctor` says what works on this machine, `completion SHELL` is for your shell (see `eval --help` and so on); `--version`.
+    Other commands: `resume RUN` resumes a run, `eval RUN` evaluates runs again, `view RUN` shows one in the browser, `demo` a
+    bundled policy, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch task, `export RUN` writes its
+    policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a page about
+    a run or a sweep, `list` lists all tasks and components, `check` tests custom components, `doctor` tries what works on this
+    machine, `completion SHELL` is for your shell (see `eval --help` and so on); `--version`.
     """
 
     spec: RunSpec
@@ -138,7 +138,7 @@ def _viewer(port: int) -> Callable[[Path, Console], Any]:
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
-    """Says what would be trained. The environment is made, and nothing is compiled or written."""
+    """Prints what would be trained. The environment is made; nothing is compiled or written."""
     settings.check_out(args.out)
     settle_compiler(args.spec.engine)
     check_platform()
