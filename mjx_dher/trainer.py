@@ -292,13 +292,15 @@ def _update_normalizers(
     batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, context.hparams, valid)
     learners.check_kept("update_normalizers", learner, updated)
-    distance = context.goal_distance(batch.desired_goal, sample.desired_goal)
-    replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1).astype(jnp.float32)
-    return updated, {
-        "relabelled_share": jnp.mean(replaced),
-        "relabel_distance": jnp.sum(distance) / jnp.maximum(jnp.sum(replaced), 1.0),
-        "no_goal_share": no_goal_share,
-    }
+    metrics = _relabel_metrics(context, sample.desired_goal, batch.desired_goal)
+    return updated, {**metrics, "no_goal_share": no_goal_share}
+
+
+def _relabel_metrics(context: Context, goal: Array, hindsight: Array) -> Metrics:
+    """Fraction of goals [B, G] that were replaced, and the mean distance to their hindsight goals."""
+    replaced = jnp.any(hindsight != goal, axis=-1).astype(jnp.float32)
+    distance = jnp.sum(context.goal_distance(hindsight, goal)) / jnp.maximum(jnp.sum(replaced), 1.0)
+    return {"relabelled_share": jnp.mean(replaced), "relabel_distance": distance}
 
 
 def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key: PRNGKey) -> tuple[PyTree, Metrics]:

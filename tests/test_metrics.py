@@ -10,6 +10,7 @@ from configs import SMALL
 from conftest import refuses
 
 from mjx_dher import HParams, RunSpec, trainer
+from mjx_dher.context import Context
 from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.system import memory
@@ -115,9 +116,10 @@ def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):
 def test_what_was_relabelled_by_hand():
     goal = jnp.zeros((4, 2))
     hindsight = jnp.array([[0.0, 0.0], [3.0, 4.0], [0.0, 1.0], [0.0, 0.0]])
-    found = trainer._relabel_metrics(goal, hindsight)
+    context = Context(PointMass().compute_reward, HParams())
+    found = trainer._relabel_metrics(context, goal, hindsight)
     assert found == {"relabelled_share": 0.5, "relabel_distance": 3.0}
-    assert trainer._relabel_metrics(goal, goal) == {"relabelled_share": 0.0, "relabel_distance": 0.0}
+    assert trainer._relabel_metrics(context, goal, goal) == {"relabelled_share": 0.0, "relabel_distance": 0.0}
 
 
 def test_memory_in_use_is_known_and_plausible():
