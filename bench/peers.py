@@ -38,13 +38,13 @@ from typing import Any
 from peers_worker import EPISODE_LENGTH, FIRST_SEED, PEERS, ZOO, usable_cores
 
 from mjx_dher.components import COMPONENTS
-from mjx_dher.config import check_count, check_number
 from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.stats import wilson_interval
 from mjx_dher.system import subprocesses
 from mjx_dher.system.caches import user_cache
 from mjx_dher.tools import transfer
+from mjx_dher.validation import check_count, check_number
 
 HERE = Path(__file__).resolve().parent
 REQUIREMENTS = (*transfer.REQUIREMENTS, "stable-baselines3==2.9.2", "sb3-contrib==2.9.2", "torch==2.13.0")

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.config import check_count, check_number
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Controls, Physics, make_engine
 from mjx_dher.types import Array, EnvSpec, GoalObs, PRNGKey
+from mjx_dher.validation import check_count, check_number
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
 # Beyond either speed the physics has blown up.

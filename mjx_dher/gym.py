@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_dher.config import check_count
 from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.tools import render
 from mjx_dher.tools.gym_cache import Programs, programs
+from mjx_dher.validation import check_count
 
 try:
     import gymnasium

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from typing_extensions import Doc
 
-from mjx_dher import config as config_lib
+from mjx_dher import validation
 from mjx_dher.components import COMPONENTS, help_text
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name, is_import_path
@@ -131,7 +131,7 @@ def validate_values(spec: RunSpec) -> None:
     Raises:
       ValueError: names every invalid field, its value and what is allowed.
     """
-    config_lib.check_all(
+    validation.check_all(
         *((_check_text, name, getattr(spec, name)) for name in (*COMPONENTS, "demonstrations")), *_checks(spec, 1)
     )
 
@@ -153,7 +153,7 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
     else:
         del names[0]
     files = [(find_demonstrations, spec.demonstrations)] if spec.demonstrations else []
-    config_lib.check_all(*names, *files, *_checks(spec, episode_length))
+    validation.check_all(*names, *files, *_checks(spec, episode_length))
 
 
 def find_demonstrations(source: str) -> Path:
@@ -177,8 +177,8 @@ def _episode_length(spec: RunSpec) -> Any:
 def _checks(spec: RunSpec, episode_length: Any) -> list[tuple[Any, ...]]:
     return [
         (to_arguments, spec.env_kwargs),
-        (config_lib.validate, spec.config, spec.hparams, episode_length),
-        (config_lib.check_number, "seed", spec.seed, "[0, 4294967295]"),
+        (validation.validate, spec.config, spec.hparams, episode_length),
+        (validation.check_number, "seed", spec.seed, "[0, 4294967295]"),
         (check_name, "engine", spec.engine, ENGINES),
     ]
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import check, evaluate, learners, priorities, replay, samplers
+from mjx_dher import check, evaluate, learners, priorities, replay, samplers, validation
 from mjx_dher import config as config_lib
 from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
@@ -144,7 +144,7 @@ def make_train(
     spec = env_spec(env)
     if not isinstance(config, Config):
         raise ValueError(f"config must be a Config; got {config!r}")
-    config_lib.validate(config, HParams(), spec.episode_length)
+    validation.validate(config, HParams(), spec.episode_length)
     learner = learners.make("ddpg", config, spec) if learner is None else learner
     learners.check_methods(learner, learner)
     loop = Loop(
@@ -158,7 +158,7 @@ def make_train(
         template=episode_template(env),
         axis_name=axis_name,
     )
-    if problem := config_lib.delay_problem(config, loop.policy_delay):
+    if problem := validation.delay_problem(config, loop.policy_delay):
         raise ValueError(problem)
     if generator is not None:
         check_with_goal(env)

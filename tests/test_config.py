@@ -5,7 +5,7 @@ import itertools
 import pytest
 from conftest import refuses
 
-from mjx_dher import components, config, presets, spec
+from mjx_dher import components, config, presets, spec, validation
 from mjx_dher.cli import train as cli_train
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import Config, HParams, Number
@@ -119,13 +119,13 @@ BAD_HPARAMS = [
 def test_a_bad_size_is_reported_with_its_value_and_what_is_allowed():
     for change, parts in BAD_CONFIG:
         with refuses(*parts):
-            config.validate(dataclasses.replace(Config(), **change), HParams(), 50)
+            validation.validate(dataclasses.replace(Config(), **change), HParams(), 50)
 
 
 def test_a_number_out_of_its_range_is_reported_with_its_value():
     for name, value in BAD_HPARAMS:
         with refuses(name, value):
-            config.validate(Config(), HParams(**{name: value}), 50)
+            validation.validate(Config(), HParams(**{name: value}), 50)
 
 
 def test_every_number_has_a_range_and_a_default_in_it():
@@ -149,10 +149,10 @@ def test_extremes_of_every_field_are_accepted_or_reported_by_name(value):
         numeric = isinstance(value, int if owner is Config else (int, float)) and not isinstance(value, bool)
         if numeric and config.metadata(owner, Number)[name].contains(value):
             with contextlib.suppress(ValueError):  # sizes that depend on one another may still not agree
-                config.validate(settings[Config], settings[HParams], 50)
+                validation.validate(settings[Config], settings[HParams], 50)
         else:
             with refuses(name):
-                config.validate(settings[Config], settings[HParams], 50)
+                validation.validate(settings[Config], settings[HParams], 50)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_each_component_is_there_and_reads_settings_that_there_are():
 
 def test_all_problems_are_reported_at_once():
     with refuses("num_envs", "batch_size", "gamma") as raised:
-        config.validate(Config(num_envs=0, batch_size=0), HParams(gamma=2), 50)
+        validation.validate(Config(num_envs=0, batch_size=0), HParams(gamma=2), 50)
     assert len(str(raised.value).splitlines()) == 3
 
 

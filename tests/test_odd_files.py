@@ -8,9 +8,10 @@ from test_export import random_policy, save_run
 
 import mjx_dher
 from mjx_dher import cli
-from mjx_dher.config import Config, HParams, validate
+from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import results
 from mjx_dher.system.files import FolderError
+from mjx_dher.validation import validate
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from test_replay import T, make_episodes, make_ring
 
-from mjx_dher import config, replay
+from mjx_dher import config, replay, validation
 from mjx_dher.config import Config, HParams, Number
 
 every_run_alike = settings(deadline=None, max_examples=60, derandomize=True)
@@ -41,7 +41,7 @@ def configs(draw):
 @given(configs())
 @every_run_alike
 def test_what_can_run_is_taken_and_its_sizes_agree(found):
-    config.validate(found, HParams(), 50)
+    validation.validate(found, HParams(), 50)
     epochs, steps = config.num_epochs(found, 50), config.steps_per_epoch(found, 50)
     assert steps == found.num_envs * 50 * found.cycles_per_epoch
     assert (epochs - 1) * steps < found.total_steps <= epochs * steps
@@ -64,14 +64,14 @@ NO_COUNTS = st.one_of(st.integers(-(10**6), 0), st.floats(), st.booleans(), st.n
 def test_what_is_no_count_is_refused_by_the_name_of_its_field(found, field, value):
     assume(not (type(value) is int and value == 0 and INTERVALS[field].startswith("[0")))
     with refuses(field, INTERVALS[field], repr(value)):
-        config.validate(dataclasses.replace(found, **{field: value}), HParams(), 50)
+        validation.validate(dataclasses.replace(found, **{field: value}), HParams(), 50)
 
 
 @given(configs(), st.one_of(st.lists(NO_COUNTS, min_size=1, max_size=3).map(tuple), st.just(()), st.just((True,)), counts))
 @every_run_alike
 def test_what_are_no_hidden_sizes_is_refused(found, sizes):
     with refuses("hidden_sizes", INTERVALS["hidden_sizes"], repr(sizes[0] if isinstance(sizes, tuple) and sizes else sizes)):
-        config.validate(dataclasses.replace(found, hidden_sizes=sizes), HParams(), 50)
+        validation.validate(dataclasses.replace(found, hidden_sizes=sizes), HParams(), 50)
 
 
 @given(st.sampled_from(HParams._fields), st.one_of(st.floats(), st.text(max_size=3), st.none()))
@@ -82,10 +82,10 @@ def test_a_number_is_taken_if_and_only_if_it_is_in_its_range(field, value):
     inside = inside and (left == "[" or value != float(low)) and (right == "]" or value != float(high))
     hparams = HParams(**{field: value})
     if inside:
-        config.validate(Config(), hparams, 50)
+        validation.validate(Config(), hparams, 50)
     else:
         with refuses(field, INTERVALS[field], repr(value)):
-            config.validate(Config(), hparams, 50)
+            validation.validate(Config(), hparams, 50)
 
 
 ROWS = 5

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.config import check_count
 from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
+from mjx_dher.validation import check_count
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx

@@ -19,11 +19,11 @@ import numpy as np
 from flax import struct
 from mujoco.batch import DATA_FIELDS, Batch
 
-from mjx_dher.config import check_number
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
+from mjx_dher.validation import check_number
 
 
 @struct.dataclass

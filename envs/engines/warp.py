@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mjx_dher.config import check_count
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.fused import simulation
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import load, prepare, wp
+from mjx_dher.validation import check_count
 
 
 class WarpEngine:

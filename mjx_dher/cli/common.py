@@ -18,10 +18,10 @@ from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
 from mjx_dher import envs
-from mjx_dher.config import check_count, check_number
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
+from mjx_dher.validation import check_count, check_number
 
 VIEW_PORT = 8080  # of the viewer's page
 

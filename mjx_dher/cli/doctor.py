@@ -8,7 +8,7 @@ import json
 from rich.console import Console
 
 from mjx_dher.cli.commands import parse
-from mjx_dher.config import check_number
+from mjx_dher.validation import check_number
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,10 +10,10 @@ from rich.console import Console
 
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import compare, print_table
-from mjx_dher.config import check_number
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
+from mjx_dher.validation import check_number
 
 TOGETHER = "curves"  # the picture of several runs, without its ending
 

@@ -10,11 +10,11 @@ import tyro
 from rich.console import Console
 
 from mjx_dher.cli import commands
-from mjx_dher.config import check_number
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.tools import figures
+from mjx_dher.validation import check_number
 
 EPISODES = 3  # of a video
 

@@ -16,7 +16,7 @@ from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_components
 from mjx_dher.cli.processes import join
-from mjx_dher.config import Config, HParams, check_count, check_devices, check_number
+from mjx_dher.config import Config, HParams
 from mjx_dher.fleet.options import FleetOptions
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
@@ -26,6 +26,7 @@ from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.validation import check_count, check_devices, check_number
 
 GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "priority", "generator", "learner", "networks")
 

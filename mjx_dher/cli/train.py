@@ -28,7 +28,6 @@ from mjx_dher.cli.common import (
     warn_of_tau,
 )
 from mjx_dher.cli.processes import check_out, claim, join
-from mjx_dher.config import check_all, check_devices
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
@@ -38,6 +37,7 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.validation import check_all, check_devices
 
 
 @dataclasses.dataclass(frozen=True)

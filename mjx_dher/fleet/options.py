@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from mjx_dher import lookup
-from mjx_dher.config import check_count
+from mjx_dher.validation import check_count
 
 LOCAL = "local"
 

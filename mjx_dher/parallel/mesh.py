@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from mjx_dher.config import check_devices
 from mjx_dher.parallel.split import AxisName
 from mjx_dher.types import PRNGKey
+from mjx_dher.validation import check_devices
 
 LANES, DATA = "lanes", "data"
 

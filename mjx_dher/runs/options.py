@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from mjx_dher.config import check_count, check_number
 from mjx_dher.runs.folder import loggers
+from mjx_dher.validation import check_count, check_number
 
 
 @dataclasses.dataclass(frozen=True)

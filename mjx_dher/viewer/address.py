@@ -9,8 +9,8 @@ import socket
 import sys
 import webbrowser
 
-from mjx_dher.config import check_number
 from mjx_dher.lookup import require_extra
+from mjx_dher.validation import check_number
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 EVERYWHERE = ("0.0.0.0", "::")  # all addresses of this machine

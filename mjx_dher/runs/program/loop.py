@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from mjx_dher import config as config_lib
+from mjx_dher import validation
 from mjx_dher.config import Config, HParams
 from mjx_dher.contract import check_steps
 from mjx_dher.parallel import mesh
@@ -86,9 +87,9 @@ def train(
         epoch or after any.
     """
     hparams = HParams() if hparams is None else hparams
-    config_lib.validate(config, hparams, env.episode_length)
+    validation.validate(config, hparams, env.episode_length)
     layout = mesh.arrange(mesh.find(devices), 1)
-    config_lib.check_parts(config, env.episode_length, layout.shards)
+    validation.check_parts(config, env.episode_length, layout.shards)
     program = make_train(env, config_lib.of_one_device(config, layout.shards), axis_name=layout.axis_name, **parts)
     key = jax.random.key(seed)
     check_memory(program, config, layout.sharers)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import config as config_lib
-from mjx_dher import context, learners, priorities, samplers, trainer
+from mjx_dher import context, learners, priorities, samplers, trainer, validation
 from mjx_dher import evaluate as evaluate_lib
 from mjx_dher.config import HParams
 from mjx_dher.contract import check_steps, env_spec
@@ -72,7 +72,7 @@ class Program(NamedTuple):
 
 def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -> Train:
     """Makes the training loop of runs that share a program, with the components that they name."""
-    config_lib.check_parts(spec.config, env.episode_length, layout.shards)
+    validation.check_parts(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
     distance = context.of_env(env, spec.hparams).goal_distance
     train = trainer.make_train(

@@ -1,0 +1,170 @@
+"""Validation of settings: an error names the field, its value and what is allowed. Loads neither JAX nor MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from mjx_dher.config import Config, HParams, Number, episodes_capacity, metadata, num_epochs, steps_per_epoch
+from mjx_dher.lookup import check_name
+
+_INT32_MAX = 2**31 - 1  # counters on the device are int32
+_MAX_DEVICES = 1_000_000
+
+
+def check_devices(devices: Any) -> None:
+    """Raises ValueError unless `devices` is a number of devices, or "all"; whether they are there, JAX knows."""
+    if devices != "all":
+        is_number = isinstance(devices, int) and not isinstance(devices, bool)
+        if not is_number or not 1 <= devices <= _MAX_DEVICES:
+            raise ValueError(f"devices must be an integer in [1, {_MAX_DEVICES}], or all; got {devices!r}")
+
+
+def check_parts(config: Config, episode_length: int, parts: int) -> None:
+    """Refuses sizes that cannot be divided among the devices that share one run.
+
+    Raises:
+      ValueError: names every field at fault, its value and the nearest that can be.
+    """
+    episodes = episodes_capacity(config, episode_length)
+    problems = []
+    for field, count, unit in (
+        ("num_envs", config.num_envs, 1),
+        ("batch_size", config.batch_size, 1),
+        ("replay_size", episodes, episode_length),
+    ):
+        if count % parts:
+            nearest = sorted({parts * max(1, count // parts), parts * (count // parts + 1)})
+            allowed = " or ".join(str(unit * number) for number in nearest)
+            kind = "a multiple of" if unit == 1 else f"whole episodes ({unit} steps), a multiple of"
+            problems.append(
+                f"{field} must be {kind} {parts}, the devices that share a run; got {getattr(config, field)}, the nearest"
+                f" {'is' if len(nearest) == 1 else 'are'} {allowed}"
+            )
+    if problems:
+        raise ValueError("\n".join(problems))
+
+
+def check_all(*calls: tuple[Any, ...]) -> None:
+    """Makes calls, (function, *arguments) each.
+
+    Raises:
+      ValueError: the messages of all calls that raise one.
+    """
+    messages = []
+    for function, *arguments in calls:
+        try:
+            function(*arguments)
+        except ValueError as error:
+            messages.append(str(error))
+    if messages:
+        raise ValueError("\n".join(messages))
+
+
+def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
+    """Refuses what is not a number of `kind` (int or float) in `interval`.
+
+    Raises:
+      ValueError: names the field, the interval and the value.
+    """
+    if problem := _number_problem(field, value, Number(interval), kind):
+        raise ValueError(problem)
+
+
+def check_count(field: str, value: Any) -> None:
+    """Refuses what is not an integer of at least 1 (and at most a million).
+
+    Raises:
+      ValueError: names the field, the interval and the value.
+    """
+    check_number(field, value, "[1, 1000000]")
+
+
+def validate(config: Config, hparams: HParams, episode_length: int) -> None:
+    """Refuses what cannot run in an environment whose episodes have `episode_length` steps.
+
+    Arrays among `hparams` are not looked at: they are one value a seed, made by a program.
+
+    Raises:
+      ValueError: names every field at fault, its value and what is allowed.
+    """
+    check_count("episode_length", episode_length)
+    problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
+    problems += _field_problems(hparams)
+    if problems:
+        raise ValueError("\n".join(problems))
+
+
+def delay_problem(config: Config, delay: int) -> str | None:
+    """Error message if `target_period` or a learner's `policy_delay` does not fit the updates of a cycle, or None."""
+    period, updates = config.target_period, config.updates_per_cycle
+    if updates % period:
+        divisors = [str(n) for n in range(1, updates + 1) if updates % n == 0]
+        return f"target_period must divide updates_per_cycle ({updates}); got {period}, allowed: {', '.join(divisors)}"
+    if period % delay and (delay % period or updates % delay):
+        return (
+            f"policy_delay must divide target_period ({period}), or be a multiple of it that divides updates_per_cycle"
+            f" ({updates}); got {delay}"
+        )
+    return None
+
+
+def _choice_problems(settings: Any) -> Iterator[str]:
+    """Yields the problems of fields that take one of a closed set of names (`Literal`)."""
+    for name, hint in get_type_hints(type(settings)).items():
+        if get_origin(hint) is Literal:
+            try:
+                check_name(name, getattr(settings, name), get_args(hint))
+            except ValueError as error:
+                yield str(error)
+
+
+def _field_problems(settings: Config | HParams) -> Iterator[str]:
+    """Yields what is wrong with single fields."""
+    hints = get_type_hints(type(settings))
+    for name, number in metadata(type(settings), Number).items():
+        value = getattr(settings, name)
+        if name == "hidden_sizes":
+            if not (isinstance(value, tuple) and 1 <= len(value) <= 100):
+                yield f"{name} must be 1 to 100 integers in {number.interval}; got {value!r}"
+            else:
+                yield from filter(None, (_number_problem(name, size, number, int) for size in value))
+        elif not hasattr(value, "dtype") and (problem := _number_problem(name, value, number, hints[name])):
+            yield problem
+    yield from _choice_problems(settings)
+
+
+def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
+    allowed = (int,) if kind is int else (int, float)
+    if isinstance(value, bool) or not isinstance(value, allowed):
+        what = "an integer" if kind is int else "a number"
+        return f"{field} must be {what} in {number.interval}; got {value!r}"
+    return None if number.contains(value) else f"{field} must lie in {number.interval}; got {value!r}"
+
+
+def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
+    """Yields what is wrong with sizes that depend on one another."""
+    if problem := delay_problem(c, c.policy_delay):
+        yield problem
+    cycle = c.num_envs * episode_length
+    if c.replay_size < cycle:
+        yield (
+            f"replay_size must hold at least one cycle of {c.num_envs} episodes x {episode_length} steps = {cycle}"
+            f" transitions; got {c.replay_size}"
+        )
+    if c.batch_size > c.replay_size:
+        yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
+    period, delay = c.target_period, c.policy_delay
+    at_once = max(period, delay)
+    if c.batch_size * at_once > _INT32_MAX:
+        yield (
+            f"batch_size must not exceed {_INT32_MAX // at_once} with target_period {period} and policy_delay {delay}, because"
+            f" the batches of {at_once} updates are drawn at once; got {c.batch_size}"
+        )
+    epochs = num_epochs(c, episode_length)
+    for field, count in (
+        ("total_steps", epochs * steps_per_epoch(c, episode_length)),
+        ("updates_per_cycle", epochs * c.cycles_per_epoch * c.updates_per_cycle),
+    ):
+        if count > _INT32_MAX:
+            yield f"{field} must not make a run of more than {_INT32_MAX} steps or updates; got {count} in {epochs} epochs"
