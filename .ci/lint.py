@@ -35,9 +35,9 @@ Every public name of the algorithm's modules. `python .ci/lint.py --write-names`
 MAX_VALUE = 60  # characters of a constant's value in the table
 HABITS_PER_1000_WORDS = {"pages": 8.0, "docstrings": 6.0}
 CORE = {
-    *("types", "config", "validation", "spec", "context", "replay", "samplers", "relabel", "normalizer"),
-    *("networks", "contract", "rollout", "evaluate", "trainer", "learners", "contrib", "distance_normalization", "priorities"),
-    *("demonstrations"),
+    *("types", "config", "validation", "spec", "context", "replay", "samplers", "relabel", "normalizer", "networks"),
+    *("contract", "rollout", "evaluate", "trainer", "learners", "contrib", "distance_normalization", "priorities"),
+    "demonstrations",
 }
 HABITS = re.compile(
     r"\b(?:of|with|in|by|from|to|for|on|and|says?|than|as|is|are|has|have|gives?|returns?|takes?|sees?) what\b"
