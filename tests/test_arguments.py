@@ -162,7 +162,7 @@ def command(argv, console):
     console.print("a dash \\u2013 and no letter \\udcff")
     return open("pyproject.toml").fileno()
 sys.modules["toy"] = types.SimpleNamespace(command=command)
-cli.COMMANDS = {"train": "toy:command"}
+cli.COMMANDS["train"] = "toy:command"
 sys.exit(cli.main([]))
 """
 

@@ -132,7 +132,7 @@ def test_help_that_cannot_be_printed(flag):
 
 
 def test_a_fault_of_this_program_keeps_its_place(monkeypatch):
-    monkeypatch.setattr(cli, "COMMANDS", {"train": "test_wrong_calls:faulty"})
+    monkeypatch.setitem(cli.COMMANDS, "train", "test_wrong_calls:faulty")
     with pytest.raises(KeyError):
         cli.main([])
 
@@ -159,7 +159,7 @@ def test_what_a_user_can_do_is_a_sentence(monkeypatch, capsys, error, message):
         raise error
 
     monkeypatch.setattr(sys.modules[__name__], "faulty", raising)
-    monkeypatch.setattr(cli, "COMMANDS", {"train": f"{__name__}:faulty"})
+    monkeypatch.setitem(cli.COMMANDS, "train", f"{__name__}:faulty")
     assert cli.main([]) == 2
     assert message in capsys.readouterr().err
 
