@@ -39,7 +39,6 @@ def test_an_array_of_the_expected_shape_and_kind_is_returned(value: Any, shape: 
         (jnp.zeros(()), (1,), jnp.floating, "float32[]"),
         (jnp.arange(2), (2,), jnp.floating, "int32[2]"),
         (jnp.zeros(2), (2,), jnp.integer, "float32[2]"),
-        (jnp.zeros(2, bool), (2,), jnp.number, "bool[2]"),
         (None, (2,), jnp.floating, "a NoneType"),
         ("text", (), jnp.floating, "a str"),
         ({"a": 1.0}, (1,), jnp.floating, "a dict"),

@@ -60,11 +60,14 @@ def test_the_modules_that_start_first_are_there():
 CI = ROOT / ".ci" / "run"
 
 
-@pytest.mark.parametrize(("args", "runs"), [([], ["pytest"]), (["--all"], ["pytest", "pytest -m slow --dist load"])])
+COVERED = ["pytest --cov --cov-report=", "pytest -m slow --dist load --cov --cov-append --cov-report="]
+
+
+@pytest.mark.parametrize(("args", "runs"), [([], ["pytest"]), (["--all"], COVERED)])
 def test_ci_runs_the_tests_and_if_asked_the_slow_ones(args, runs, tmp_path):
     """With stand-ins for all that it calls."""
     called = tmp_path / "called"
-    for name in ("python3", "pip", "ruff", "mypy", "pytest"):
+    for name in ("python3", "python", "pip", "ruff", "lint-imports", "mypy", "pytest", "coverage"):
         (tmp_path / name).write_text(
             f'#!/bin/sh\n[ "$1" = -m ] && [ "$2" = venv ] && mkdir -p "$3/bin" && touch "$3/bin/activate"\n'
             f'echo "{name} $*" | sed "s/ $//" >> {called}\n'
