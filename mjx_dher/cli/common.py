@@ -23,8 +23,6 @@ from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
 from mjx_dher.validation import check_count, check_number
 
-VIEW_PORT = 8080  # of the viewer's page
-
 if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
@@ -142,7 +140,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
         console.print(table, soft_wrap=False)
     else:
         for row in rows:
-            console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n")
+            console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n", soft_wrap=True)
 
 
 def compare(
