@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -60,6 +61,11 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
     """
     if seeds < 2 or 2.0 ** (1 - seeds) > ALPHA / tests:
         return math.nan
+    return _smallest_effect(seeds, tests) * spread
+
+
+@functools.cache
+def _smallest_effect(seeds: int, tests: int) -> float:
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=(2000, seeds))
     every = np.array(list(itertools.product((1, -1), repeat=seeds))) if seeds <= 12 else rng.choice((1, -1), size=(4096, seeds))
@@ -73,7 +79,7 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
     for _ in range(14):
         middle = (low + high) / 2
         low, high = (middle, high) if power(middle) < POWER else (low, middle)
-    return high * spread
+    return high
 
 
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm], tests: int | None = None) -> list[Row]:

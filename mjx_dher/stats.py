@@ -136,7 +136,7 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
     """Estimates the probability that a score of `a` exceeds one of `b`, with ties counting half, averaged over tasks.
 
     For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). scipy's
-    `mannwhitneyu` also computes a p-value, which takes 45 times as long; `improvement_interval` calls this thousands of times.
+    `mannwhitneyu` also computes a p-value, which takes 45 times as long.
     The shapes are [S] or [S, K]; the numbers of seeds may differ.
 
     Raises:
@@ -159,8 +159,16 @@ def improvement_interval(
     """
     a, b = _scores(a), _scores(b)
     rng = np.random.default_rng(seed)
-    resampled = [probability_of_improvement(_resample(a, rng), _resample(b, rng)) for _ in range(repeats)]
-    low, high = _quantiles(np.array(resampled), level)
+    probability_of_improvement(a, b)  # raises where they cannot be compared
+    a, b = (scores[:, None] if scores.ndim == 1 else scores for scores in (a, b))  # [A, K], [B, K]
+    wins = np.greater(a[:, None], b[None]) + np.equal(a[:, None], b[None]) / 2  # [A, B, K]
+    of_a, of_b = np.zeros((repeats, *a.shape)), np.zeros((repeats, *b.shape))  # how often a score was drawn
+    tasks = np.arange(a.shape[1])
+    for drawn_a, drawn_b in zip(of_a, of_b):
+        for drawn in (drawn_a, drawn_b):
+            np.add.at(drawn, (rng.integers(len(drawn), size=drawn.shape), tasks), 1)
+    resampled = np.einsum("rbk,rbk->r", np.einsum("rak,abk->rbk", of_a, wins), of_b) / wins.size
+    low, high = _quantiles(resampled, level)
     return float(low), float(high)
 
 
@@ -222,11 +230,6 @@ def _curves(x: ArrayLike, curves: ArrayLike) -> tuple[NDArray, NDArray]:
     if x.ndim != 1 or curves.ndim != 2 or curves.shape[1] != len(x) or curves.size == 0:
         raise ValueError(f"x must be [P] and curves [S, P]; got shapes {x.shape} and {curves.shape}")
     return x, curves
-
-
-def _resample(scores: NDArray, rng: np.random.Generator) -> NDArray:
-    """Draws as many seeds with replacement, independently for each task."""
-    return np.take_along_axis(scores, rng.integers(len(scores), size=scores.shape), axis=0)
 
 
 def _quantiles(values: NDArray, level: float) -> tuple[NDArray, NDArray]:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 from test_samplers import ACHIEVED, DESIRED, HP, table
 
 from mjx_dher import samplers
@@ -122,14 +123,14 @@ def test_a_scale_of_any_size_that_is_allowed_leaves_goals(kernel):
 
 
 @pytest.mark.parametrize(
-    ("normalization", "said"),
+    ("normalization", "given"),
     [
-        (lambda distance, candidates, scale: jnp.mean(distance), r"must be floats \[30\]; they are float32 \[\]"),
-        (lambda distance, candidates, scale: jnp.argsort(distance), r"must be floats \[30\]; they are int32 \[30\]"),
-        (lambda distance, candidates, scale: jnp.where(candidates, distance, jnp.nan), "not finite, for distances from 0.01"),
-        (lambda distance, candidates: distance, r"must be a function \(distance, candidates, scale\)"),
+        (lambda distance, candidates, scale: jnp.mean(distance), "float32[]"),
+        (lambda distance, candidates, scale: jnp.argsort(distance), "int32[30]"),
+        (lambda distance, candidates, scale: jnp.where(candidates, distance, jnp.nan), "not finite"),
+        (lambda distance, candidates: distance, "(distance, candidates, scale)"),
     ],
 )
-def test_what_is_no_normalization_is_named(normalization, said):
-    with pytest.raises(ValueError, match=f"weight_normalization.*{said}"):
+def test_what_is_no_normalization_is_named(normalization, given):
+    with refuses("weight_normalization", given):
         check_normalization(normalization)
