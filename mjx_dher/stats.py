@@ -83,7 +83,7 @@ def bootstrap_interval(
     """
     scores = _scores(scores)
     rng = np.random.default_rng(seed)
-    chosen = rng.integers(len(scores), size=(repeats, *scores.shape))  # as many calls of `_resample` would draw them
+    chosen = rng.integers(len(scores), size=(repeats, *scores.shape))
     resampled = np.take_along_axis(scores[None], chosen, axis=1).reshape(repeats, -1)
     low, high = _quantiles(statistic(resampled, axis=1), level)
     return float(low), float(high)
