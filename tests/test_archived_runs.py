@@ -73,6 +73,7 @@ def test_a_stopped_run_resumes(archive, name):
     compare(folder, archive / "expected" / folder.name)
 
 
+@pytest.mark.slow
 def test_an_ended_run_goes_on_with_more_steps(archive):
     folder = archive / "ddpg_ended"
     assert results.result_problem(folder) is None

@@ -129,6 +129,7 @@ def in_64_bits():
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("pick_and_place", "push", "slide")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["reach", *SLOW])
 def test_starts_are_the_same_in_64_bits(name, in_64_bits, task):
     env, key = task(name).env, jax.random.key(4)

@@ -291,7 +291,8 @@ def test_a_file_without_runs_is_refused(bakeoff, ablation, tmp_path, capsys):
         names(capsys.readouterr().err, "runs.csv")
 
 
-@pytest.mark.parametrize("which", ["bakeoff", pytest.param("ablation", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["bakeoff", "ablation"])
 def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
     experiment = bakeoff.BAKEOFF if which == "bakeoff" else ablation.ABLATION
     argv = ["--out", str(tmp_path), "--toy", "--seeds", "2", "--lanes", "10"]

@@ -109,6 +109,7 @@ def test_a_run_that_has_ended_is_not_trained_over(tmp_path):
     assert len(tables.read(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_a_trial_that_ended_since_it_was_listed_is_left_alone(tmp_path, monkeypatch):
     """Another program trains all four while this one compiles, and has one of them again."""
     trials = make_grid(static=LONGER)
@@ -175,6 +176,7 @@ def test_files_of_two_runs_are_told_apart(tmp_path):
     assert len(tables.read(tmp_path)) == 2
 
 
+@pytest.mark.slow
 def test_a_sweep_whose_runs_another_program_has_says_so(tmp_path, capsys):
     flags = ["sweep", *TINY, "--total-steps", "40", "--sampler", "future", "--seeds", "2", "--out", str(tmp_path)]
     assert cli.main(flags) == 0

@@ -87,6 +87,7 @@ def trained(tmp_path_factory):
     return folder, specs, results, seen, said
 
 
+@pytest.mark.slow
 def test_a_library_call_trains_runs_side_by_side(trained):
     folder, specs, results, seen, said = trained
     assert [result.status for result in results] == ["finished", "failed", "finished"]

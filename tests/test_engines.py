@@ -107,6 +107,7 @@ def test_engines_follow_the_same_episode(task, recorded):
     assert np.linalg.norm((native - mjx)[:, :10, 3:6], axis=-1).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_engines_agree_where_nothing_is_touched():
     """Rounding alone: 0.01 mm after 20 steps of free motion, in each environment of a nested batch."""
     keys = jax.random.split(jax.random.key(2), 6).reshape(2, 3)

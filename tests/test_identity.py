@@ -143,6 +143,7 @@ def test_a_setting_that_was_edited_is_named_and_refused(stopped, whole, capsys):
             mjx_dher.load_policy(whole)
 
 
+@pytest.mark.slow
 def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_path, capsys):
     longer = dataclasses.replace(SPEC, config=dataclasses.replace(SPEC.config, total_steps=320))
     edited = shutil.copytree(stopped, tmp_path / "edited")
@@ -183,6 +184,7 @@ def test_parts_of_another_kind_are_named(stopped, capsys):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, capsys):
     before = (stopped / "config.json").read_bytes()
     status, text = resume(stopped, capsys, "--total-steps", "160")

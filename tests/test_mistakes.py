@@ -175,6 +175,7 @@ def test_a_run_that_has_gone_bad_fails_and_says_why(tmp_path, env, parts, reason
     assert not (tmp_path / "run" / "policy.npz").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "parts", "warning"),
     [

@@ -94,6 +94,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_run_in_the_current_folder_s_module_is_resumed_and_evaluated(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert cli.main(["resume", "run"]) == 0

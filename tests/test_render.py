@@ -89,6 +89,7 @@ def centre(picture, colour):
     return pixels.mean(axis=0) if len(pixels) > 20 else None
 
 
+@pytest.mark.slow
 def test_every_task_shows_its_goal_and_its_object(drawn):
     _, frames, _ = drawn
     for name in envs.list_envs():

@@ -87,6 +87,7 @@ def test_environments_stay_together():
     assert [trial.env for trial in trials] == ["reach"] * 3 + ["push"] * 3
 
 
+@pytest.mark.slow
 def test_a_run_that_another_program_trains_is_left_to_it(tmp_path, monkeypatch):
     trials = make_grid(seeds=(0, 1))
     path = grid.folder_of(tmp_path, trials[0])
@@ -109,6 +110,7 @@ def test_a_run_that_another_program_trains_is_left_to_it(tmp_path, monkeypatch):
     assert locked[3:] == [path]
 
 
+@pytest.mark.slow
 def test_another_program_s_checkpoints_stay(tmp_path):
     first, second = make_grid(("future",), (0, 1), static=LONGER), make_grid(("future",), (2, 3), static=LONGER)
     cut_short(tmp_path, first, 2, lanes=2)
@@ -196,6 +198,7 @@ def test_a_checkpoint_is_made_every_so_many_epochs_and_one_is_kept(tmp_path):
     assert seen == [[], [], ["epoch-000002"], ["epoch-000002"], []]  # none when the results are written
 
 
+@pytest.mark.slow
 def test_one_run_at_a_time_has_its_checkpoints_in_its_own_folder(tmp_path):
     trials = make_grid(("future",), (0, 1), static=LONGER)
     cut_short(tmp_path, trials, 2)
@@ -226,6 +229,7 @@ def test_another_lane_s_sampler_is_its_own_when_fewer_are_left(tmp_path):
 NUMBERS = ("actor_norm", "critic_norm", "q_mean", "relabel_distance")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", ["damaged", "other lanes"])
 def test_without_a_checkpoint_that_fits_runs_begin_anew(tmp_path, harm):
     trials, seen, said = make_grid(static=LONGER), [], []

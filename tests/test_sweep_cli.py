@@ -12,6 +12,7 @@ from mjx_dher.components import COMPONENTS, Component
 from mjx_dher.sweeps import tables
 
 
+@pytest.mark.slow
 def test_two_commands_share_a_sweep_and_the_last_one_s_tables_have_it_all(tmp_path, point_mass, capsys):
     out = ["--lanes", "2", "--out", str(tmp_path / "shared")]
     assert cli.main([*COMMAND, *out, "--seeds", "1", "--first-seed", "1"]) == 0

@@ -219,6 +219,7 @@ def test_a_frozen_learner_stays_near_chance(learn):
     assert records[-1].metrics["success_rate"] < 0.5
 
 
+@pytest.mark.slow
 def test_bfloat16_is_for_learning_alone():
     """First networks, parameters, normalizers and the policy that plays are those of float32."""
     program, other = (make_train(ENV, dataclasses.replace(SMALL, learner_dtype=dtype)) for dtype in DTYPES)
@@ -248,6 +249,7 @@ def test_the_same_seed_gives_the_same_run(program):
     assert runs[0] != runs[2]
 
 
+@pytest.mark.slow
 def test_replay_memory_is_what_the_arrays_need():
     """The compiled epoch owns its state in place: beside it there is little, and no second ring."""
     program = make_train(ENV, dataclasses.replace(SMALL, replay_size=1_000_000))

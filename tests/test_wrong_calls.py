@@ -196,6 +196,7 @@ def test_the_tasks_under_64_bits(switch, name):
     check_env(envs.make(name, engine="native", episode_length=4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "value"), [("jax_enable_x64", True), ("jax_numpy_rank_promotion", "raise")])
 def test_a_run_under_jax_s_switches(switch, tmp_path, option, value):
     switch(option, value)
