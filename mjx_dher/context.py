@@ -75,6 +75,11 @@ def of_env(env: Any, hparams: HParams, **fields: Any) -> Context:
     return Context(env.compute_reward, hparams, reached_fn=getattr(env, "reached", None), goal_distance=distance, **fields)
 
 
+def reached_fn(env: Any) -> ReachedFn:
+    """Whether an environment's goals are reached: its own `reached`, or a reward at its maximum (`Context.reached`)."""
+    return of_env(env, HParams()).reached
+
+
 def return_bounds(reward_range: tuple[float, float], gamma: Array | float) -> tuple[Array | float, Array | float]:
     """Lowest and highest discounted return of rewards in `reward_range`, for episodes of any length.
 

@@ -76,10 +76,9 @@ class _GoalApi:
         """
         if self._compiled.spec.ends_at_goal:
             from mjx_dher import context
-            from mjx_dher.config import HParams
 
             goals: Any = self._goals(achieved_goal, desired_goal)
-            return np.asarray(context.of_env(self._compiled.env, HParams()).reached(*goals))[()]
+            return np.asarray(context.reached_fn(self._compiled.env)(*goals))[()]
         return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:

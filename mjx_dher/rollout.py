@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import context
-from mjx_dher.config import HParams
 from mjx_dher.contract import check_first, check_same_shapes, check_with_goal, env_spec
 from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size
 
@@ -125,7 +124,8 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
         action, reward = (where_each(playing.over, jnp.zeros_like(x), x) for x in (action, reward))
     played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
     length = playing.length + (~playing.over).astype(jnp.int32)
-    return _Playing(following, playing.over | _has_ended(env, spec, following), length), played
+    terminated, done = ended(env, spec, following)
+    return _Playing(following, playing.over | terminated | done, length), played
 
 
 def _whole(steps: Array, end: Array) -> Array:
@@ -149,15 +149,13 @@ def _bad_rewards(spec: EnvSpec, reward: Array, length: Array) -> Array:
     return jnp.sum(bad & played, axis=0, dtype=jnp.float32) / length.astype(jnp.float32)
 
 
-def _has_ended(env: Any, spec: EnvSpec, state: Any) -> Array:
-    """Whether the episodes of N environments have ended with `state`, bool [N]."""
-    ended = jnp.zeros(state.reward.shape, bool)
-    if spec.ends:
-        ended |= getattr(state, "done", False)
-        ended |= getattr(state, "terminal", False)
+def ended(env: Any, spec: EnvSpec, state: Any) -> tuple[Array, Array]:
+    """Whether episodes have ended with `state`, bool [...] each: because no future follows, and for another reason."""
+    none = jnp.zeros(state.reward.shape, bool)
+    terminated = none | getattr(state, "terminal", False)
     if spec.ends_at_goal:
-        ended |= context.of_env(env, HParams()).reached(state.obs["achieved_goal"], state.obs["desired_goal"])
-    return ended
+        terminated |= context.reached_fn(env)(state.obs["achieved_goal"], state.obs["desired_goal"])
+    return terminated, (none | getattr(state, "done", False)) & ~terminated
 
 
 def where_each(condition: Array, yes: PyTree, no: PyTree) -> PyTree:

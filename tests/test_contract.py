@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import configs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -181,18 +182,8 @@ def test_values_are_known(kind, n_step):
     """Truncated is not terminal; a trap is, for every goal; a goal that is reached is, for itself."""
     goal, value = KNOWN[kind]
     env = Corridor(kind, goal)
-    config = Config(
-        num_envs=8,
-        cycles_per_epoch=1,
-        updates_per_cycle=400,
-        target_period=1,
-        batch_size=64,
-        replay_size=200,
-        hidden_sizes=(32,),
-        eval_episodes=2,
-        total_steps=40,
-        n_step=n_step,
-    )
+    sizes = {"num_envs": 8, "batch_size": 64, "replay_size": 200, "hidden_sizes": (32,), "eval_episodes": 2}
+    config = dataclasses.replace(configs.TINY, updates_per_cycle=400, n_step=n_step, **sizes)
     hparams = HParams(gamma=0.5, polyak=0.9, critic_lr=3e-3, her_k=1.0)
     train = make_train(env, config, sampler=samplers.make("future"))
     state, metrics = jax.jit(train.epoch)(train.init(jax.random.key(0), hparams))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import check, context, contract, rollout
-from mjx_dher.config import HParams
 from mjx_dher.testing.trial import TOLERANCE, attempt, expect
 from mjx_dher.types import Env, EnvSpec
 
@@ -141,7 +140,7 @@ def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDAr
     ended = played.get("done", none) | played.get("terminal", none)
     expect(not ended[0].any(), "reset: done and terminal must be False: an episode has one step or more")
     if spec.ends_at_goal:
-        reached = np.asarray(context.of_env(env, HParams()).reached(*(jnp.asarray(played[name]) for name in GOALS)))
+        reached = np.asarray(context.reached_fn(env)(*(jnp.asarray(played[name]) for name in GOALS)))
         expect(not reached[0].all(), "reset must draw goals that are not reached yet, because reaching one ends the episode")
         ended = ended | reached
     over = np.logical_or.accumulate(np.concatenate([none[:1], ended[:-1]]))

@@ -65,8 +65,7 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
 def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 
-    from mjx_dher import context, rollout
-    from mjx_dher.config import HParams
+    from mjx_dher import rollout
     from mjx_dher.contract import env_spec
 
     env = envs.make(name, **dict(options))
@@ -78,12 +77,6 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     def restart(states, seeds, which):
         return rollout.where_each(which, jax.vmap(reset)(seeds), states)
 
-    def ended(state):
-        terminated = getattr(state, "terminal", state.reward != state.reward)  # False, of the shape of the rewards
-        if spec.ends_at_goal:
-            terminated |= context.of_env(env, HParams()).reached(state.obs["achieved_goal"], state.obs["desired_goal"])
-        return terminated, getattr(state, "done", terminated) & ~terminated
-
     return Programs(
         name=name,
         options=options,
@@ -94,6 +87,6 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
         reset_all=jax.jit(jax.vmap(reset)),
         step_all=jax.jit(jax.vmap(env.step)),
         restart=jax.jit(restart),
-        ended=jax.jit(ended),
+        ended=jax.jit(functools.partial(rollout.ended, env, spec)),
         reward=jax.jit(env.compute_reward),
     )
