@@ -114,8 +114,8 @@ def _check_arrays(arrays: dict[str, np.ndarray], names: Mapping[str, Any], env: 
         if value is None or value.shape != shape or not np.can_cast(value.dtype, leaf.dtype, "same_kind"):
             given = "none" if value is None else f"{value.dtype}{list(value.shape)}"
             problems.append(f"{name} must be {leaf.dtype}{list(shape)}; got {given}")
-        elif value.dtype.kind == "f" and not np.all(np.isfinite(value)):
-            problems.append(f"{name} must be finite")
+        elif value.dtype.kind == "f" and not np.all(np.abs(value) <= np.finfo(leaf.dtype).max):
+            problems.append(f"{name} must be finite, as {leaf.dtype}")
     if problems:
         raise ValueError("\n".join(problems))
     _check_values(arrays, env, played[1])

@@ -49,8 +49,8 @@ class RunSpec:
     learner: Annotated[str, _doc("learner", "Learner")] = "ddpg"
     networks: Annotated[str, _doc("networks", "Networks of the learner")] = "mlp"
     demonstrations: Annotated[
-        str, Doc("Episodes that fill the replay ring first: an .npz, or a Minari data set by folder or name.")
-    ] = ""
+        str | None, Doc("Episodes that fill the replay ring first: an .npz, or a Minari data set by folder or name.")
+    ] = None
     seed: int = 0
     """Random seed."""
     config: Config = dataclasses.field(default_factory=Config)
@@ -132,7 +132,9 @@ def validate_values(spec: RunSpec) -> None:
       ValueError: names every invalid field, its value and what is allowed.
     """
     validation.check_all(
-        *((_check_text, name, getattr(spec, name)) for name in (*COMPONENTS, "demonstrations")), *_checks(spec, 1)
+        *((_check_text, name, getattr(spec, name)) for name in COMPONENTS),
+        (_check_text, "demonstrations", "" if spec.demonstrations is None else spec.demonstrations),
+        *_checks(spec, 1),
     )
 
 
@@ -152,17 +154,17 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
         episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
     else:
         del names[0]
-    files = [(find_demonstrations, spec.demonstrations)] if spec.demonstrations else []
+    files = [] if spec.demonstrations is None else [(find_demonstrations, spec.demonstrations)]
     validation.check_all(*names, *files, *_checks(spec, episode_length))
 
 
 def find_demonstrations(source: str) -> Path:
     """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none."""
-    if Path(source).is_file() and source.endswith(".npz"):
+    if source.endswith(".npz") and Path(source).is_file():
         return Path(source)
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
     for folder in (Path(source), root / source):
-        if (folder / "data").is_dir():
+        if source and (folder / "data").is_dir():
             return folder
     raise ValueError(f"demonstrations must be an .npz file, or the folder or name of a Minari data set; got {source!r}")
 

@@ -17,6 +17,7 @@ from mjx_dher.contract import env_spec
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.spec import validate
 from point_mass import PointMass, PointState
 
 ENV = PointMass()
@@ -83,6 +84,7 @@ BAD_ARRAYS = [
     ({"observation": np.zeros((6, 10, 2))}, ("observation", "[6, 11, 2]", "[6, 10, 2]")),
     ({"observation": None, "desired_goal": np.zeros((6, 3))}, ("observation", "none", "desired_goal", "[6, 2]", "[6, 3]")),
     ({"achieved_goal": np.full((6, 11, 2), np.nan)}, ("achieved_goal", "finite")),
+    ({"achieved_goal": np.full((6, 11, 2), 1e300)}, ("achieved_goal", "finite")),  # in float32
     ({"achieved_goal": np.full((6, 11, 2), "x")}, ("achieved_goal", "float32", "U1")),
     ({"length": np.full(6, 9)}, ("length", "10", "9")),
     ({"length": np.full(6, 9.0)}, ("length", "int32", "float64")),
@@ -109,6 +111,8 @@ def test_files_that_cannot_be_used_are_refused(file, tmp_path):
     for name in ("none.npz", "", str(tmp_path)):
         with refuses("demonstrations", ".npz", "Minari", repr(name)):
             read_demonstrations(name, ENV, 6)
+        with refuses("demonstrations", repr(name)):
+            validate(RunSpec(demonstrations=name))
 
 
 def test_the_ring_holds_them_and_the_normalizers_have_seen_them():
@@ -133,7 +137,7 @@ def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, m
     (tmp_path / "moved").mkdir()
     moved = file.rename(tmp_path / "moved" / "demos.npz")
     assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=str(moved))) == fingerprint.trial_name(spec)
-    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations="")) != fingerprint.trial_name(spec)
+    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=None)) != fingerprint.trial_name(spec)
     capsys.readouterr()
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--json"]) == 0  # the policy needs no file
     assert json.loads(capsys.readouterr().out)["episodes"] == 2

@@ -31,7 +31,7 @@ def load(folder: Path, run: RunSpec, env: Env) -> Critic:
     Raises:
       FolderError: there is no checkpoint that can be used, or the run's learner has no `value`; the message says which.
     """
-    run = dataclasses.replace(run, demonstrations="")  # the checkpoint's ring holds them
+    run = dataclasses.replace(run, demonstrations=None)  # the checkpoint's ring holds them
     train = program.make_loop(env, run, program.choices_of([run]))
     learner: Any = train.learner
     if not callable(getattr(learner, "value", None)):

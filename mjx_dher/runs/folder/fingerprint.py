@@ -60,7 +60,8 @@ def sources(spec: RunSpec) -> dict[str, str]:
     Files that a component imports are not included. Each file is read once in a process, as its module is.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
-    read["demonstrations"] = _demonstrations(spec.demonstrations)
+    if spec.demonstrations is not None:
+        read["demonstrations"] = _demonstrations(spec.demonstrations)
     return {name: source for name, source in read.items() if source is not None}
 
 

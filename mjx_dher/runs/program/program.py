@@ -84,7 +84,7 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
         learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
         axis_name=layout.axis_name,
     )
-    if not spec.demonstrations:
+    if spec.demonstrations is None:
         return train
     from mjx_dher.demonstrations import read_demonstrations
 
