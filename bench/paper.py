@@ -37,7 +37,7 @@ COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")
 XLA_FLAGS = "--xla_gpu_enable_cublaslt=true --xla_gpu_enable_triton_gemm=false"
 SEEDS = 10
 # An epoch of the paper is 50 cycles of two episodes a worker; here it is one cycle of as many episodes and updates.
-FAST = "--preset paper --cycles-per-epoch 1 --updates-per-cycle 2000 --learner-dtype bfloat16 --checkpoint-every 0 --lanes 40"
+FAST = "--cycles-per-epoch 1 --updates-per-cycle 2000 --learner-dtype bfloat16"
 EPISODES = {"push": 800, "pick_and_place": 1600, "slide": 800}  # an epoch
 TOY = (
     "--preset paper --engine native --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 8"
@@ -46,20 +46,30 @@ TOY = (
 
 
 class Sweep(NamedTuple):
-    """One call of `train.py sweep`: its name within the figure, task, epochs, how many settings it has, and what they are."""
+    """One call of `train.py sweep`: its name within the figure, task, epochs, number of settings, options, seeds."""
 
     name: str
     task: str
     epochs: int
     settings: int
     options: str
+    seeds: int = SEEDS
+    first_seed: int = 0
+    own_cycles: bool = False  # the paper's 50 cycles an epoch and float32, instead of FAST
 
 
 _LINEAR = "--sampler weighted --weight-kernel linear --weight-normalization"
 _SOFTMAX = "--sampler weighted --weight-kernel softmax --weight-normalization"
 _K = "--sampler future --sweep.her-k 1 2 8 16"
 _EVENTFUL = "--sampler future --sweep.priority-fraction 0.5"
+_BOTH, _NEW = "--sampler future weighted", {"first_seed": 20, "own_cycles": True}  # seeds that no choice was made with
 FIGURES: dict[str, tuple[Sweep, ...]] = {
+    "own_cycles": (
+        Sweep("own_push", "push", 50, 2, _BOTH, 20, **_NEW),
+        Sweep("own_pick_and_place", "pick_and_place", 50, 2, _BOTH, 20, **_NEW),
+        Sweep("own_slide", "slide", 200, 2, _BOTH, 10, **_NEW),
+        Sweep("own_methods", "push", 50, 2, "--sampler closest epsilon_closest", 10, **_NEW),
+    ),
     "samplers": (
         Sweep(
             "samplers",
@@ -105,10 +115,12 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
         options = sweep.options.replace("--replay-size 1000000", "--replay-size 200")
     else:
         episodes = EPISODES[sweep.task]
-        sizes = f"{FAST} --env {sweep.task} --num-envs {episodes} --seeds {SEEDS} --total-steps {sweep.epochs * episodes * 50}"
-        options = sweep.options
+        cycles = "" if sweep.own_cycles else f"{FAST} --num-envs {episodes}"
+        seeds = f"--seeds {sweep.seeds} --first-seed {sweep.first_seed}"
+        sizes = f"--preset paper --checkpoint-every 0 --lanes 40 {cycles} --env {sweep.task} {seeds}"
+        options = f"--total-steps {sweep.epochs * episodes * 50} {sweep.options}"
     threshold = "0.6" if sweep.task == "slide" else "0.9"
-    baseline = "weighted" if "future" not in sweep.options else "future"
+    baseline = "future" if "future" in sweep.options else sweep.options.split()[1]
     return [
         "sweep",
         *f"{sizes} {options} --threshold {threshold} --baseline {baseline}".split(),
@@ -118,7 +130,8 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
 
 
 # What an estimate is made of, all measured on one H200 (bench/README.md, docs/design.md), 40 runs side by side.
-_UPDATE = 23.8e-6  # seconds of gradients and drawing of an update of 2,048, a run
+_UPDATE = 23.8e-6  # seconds of gradients and drawing of an update of 2,048 in bfloat16, a run
+_FLOAT32 = 82.2e-6  # the same in float32, 20 runs side by side
 _STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
 _MORE = 1.25  # whole epochs took that much more than their parts, in the sweeps of 2026-11-22
 _AROUND = 38.0  # seconds a command: compiling (24 to 47), imports, last evaluations, tables (12)
@@ -128,8 +141,9 @@ def estimate(sweep: Sweep) -> float:
     """Returns the seconds that a sweep takes on one H200, by the parts that were measured. It was not measured itself."""
     workers = 2 if sweep.task == "pick_and_place" else 1  # times 8, and with them the batch
     steps = (EPISODES[sweep.task] + 100) * 50  # with the evaluation
-    epoch = 2000 * workers * _UPDATE + steps / _STEPS_A_SECOND[sweep.task]
-    return _AROUND + _MORE * epoch * sweep.epochs * sweep.settings * SEEDS
+    update = _FLOAT32 if sweep.own_cycles else _UPDATE
+    epoch = 2000 * workers * update + steps / _STEPS_A_SECOND[sweep.task]
+    return _AROUND + _MORE * epoch * sweep.epochs * sweep.settings * sweep.seeds
 
 
 def chosen(names: Iterable[str]) -> list[Sweep]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t
 
 from mjx_dher import stats
 
@@ -33,7 +34,7 @@ Sweeps = Mapping[tuple[str, str], Curves]  # by sweep and setting
 
 
 class Difference(NamedTuple):
-    """Paired difference of two settings: its mean over seeds, bootstrap interval at 95 %, and the permutation test's p."""
+    """Paired difference of two settings: mean over seeds, Student's t interval at 95 %, and the permutation test's p."""
 
     each: NDArray  # [S]
     mean: float
@@ -76,7 +77,9 @@ def difference(a: NDArray, b: NDArray) -> Difference:
     each = a - b
     if not np.isfinite(each).all():
         return Difference(each, math.nan, math.nan, math.nan, math.nan)
-    return Difference(each, float(each.mean()), *stats.bootstrap_interval(each, np.mean), stats.paired_p_value(a, b))
+    mean = float(each.mean())
+    half = float(t.ppf(0.975, len(each) - 1) * each.std(ddof=1) / math.sqrt(len(each)))
+    return Difference(each, mean, mean - half, mean + half, stats.paired_p_value(a, b))
 
 
 def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str, epochs: int | None = None) -> Difference:

@@ -59,7 +59,12 @@ def _readings() -> list[Comparison]:
     return found
 
 
+OWN = {task: f"own_{task}" for task in NAMES}  # the sweeps with the paper's own cycles, in float32
 FAMILIES: dict[str, list[Comparison]] = {
+    "the paper's own cycles": [Comparison(task, sweep, "weighted", (sweep, "future")) for task, sweep in OWN.items()],
+    "methods 1 and 2, own cycles": [
+        Comparison("push", "own_methods", name, (OWN["push"], "future")) for name in ("closest", "epsilon_closest")
+    ],
     "the paper's claim": [Comparison(task, sweep, "weighted") for task, sweep in MAIN.items()],
     "readings": _readings(),
     "method 2": [Comparison("push", "samplers", f"epsilon_closest, epsilon {e}") for e in (0.1, 0.2, 0.3, 0.5)]
@@ -148,10 +153,11 @@ def _baseline(c: Comparison) -> tuple[str, str]:
 
 
 def _compare(sweeps: Sweeps, c: Comparison) -> tuple[Difference, int]:
-    """Returns the difference of mean success over the epochs that both have, and how many these are."""
+    """Difference of mean success over the epochs that both have, paired by the setting's seeds, and the number of epochs."""
     a, b = sweeps[c.sweep, c.setting], sweeps[_baseline(c)]
-    if a.seeds != b.seeds:
-        raise ValueError(f"{c.sweep}, {c.setting} has seeds {a.seeds}; what it is compared with has {b.seeds}")
+    if missing := set(a.seeds) - set(b.seeds):
+        raise ValueError(f"{c.sweep}, {c.setting} has seeds {sorted(missing)} that its baseline lacks; it has {b.seeds}")
+    b = Curves(a.seeds, b.success[[b.seeds.index(seed) for seed in a.seeds]])
     epochs = min(a.success.shape[1], b.success.shape[1])
     return difference(area(a, epochs), area(b, epochs)), epochs
 

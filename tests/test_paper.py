@@ -42,12 +42,14 @@ def trials(tmp_path_factory):
 def test_every_command_trains_what_the_page_says(trials):
     assert len({sweep.name for sweep in SWEEPS}) == len(SWEEPS)
     for sweep, runs in trials.items():
-        assert len(runs) == sweep.settings * paper.SEEDS, sweep.name
-        assert {run.seed for run in runs} == set(range(10))
+        assert len(runs) == sweep.settings * sweep.seeds, sweep.name
+        assert {run.seed for run in runs} == set(range(sweep.first_seed, sweep.first_seed + sweep.seeds))
         assert len({run.program for run in runs}) == 1, sweep.name  # lanes of one program
         for run in runs:
             assert config.num_epochs(run.config, 50) == sweep.epochs
-            assert (run.env, run.networks, run.config.learner_dtype) == (sweep.task, "fan_in", "bfloat16")
+            dtype = "float32" if sweep.own_cycles else "bfloat16"
+            assert (run.env, run.networks, run.config.learner_dtype) == (sweep.task, "fan_in", dtype)
+            assert run.config.cycles_per_epoch == (50 if sweep.own_cycles else 1)
             workers = 16 if sweep.task == "pick_and_place" else 8
             assert run.config.batch_size == 256 * workers
             # An epoch of the paper: 50 cycles of two episodes a worker, and of 40 updates.
@@ -59,8 +61,8 @@ def test_every_command_trains_what_the_page_says(trials):
     assert {run.hparams.random_noise for s, runs in trials.items() if s.name == "noise_slide" for run in runs} == {0.0}
 
 
-def test_the_set_fits_an_hour_by_the_estimate():
-    assert 3000 < sum(map(paper.estimate, SWEEPS)) <= 3600
+def test_the_set_fits_two_hours_by_the_estimate():
+    assert 6000 < sum(map(paper.estimate, SWEEPS)) <= 7200
     push = paper.Sweep("x", "push", 50, 1, "")  # 2,000 updates of 23.8 us and 45,000 steps at 1.68 million a second
     assert paper.estimate(push) == pytest.approx(38 + 1.25 * (0.0476 + 45_000 / 1.68e6) * 50 * 10)
 
@@ -93,7 +95,8 @@ def test_every_comparison_is_of_settings_that_the_set_has(trials):
     needed |= {(c.task, *paper_set._baseline(c)) for family in paper_set.FAMILIES.values() for c in family}
     assert needed <= set(named)
     assert set(named) - needed == {("push", "samplers", "episode")}
-    assert set(named.values()) == {10}
+    assert {count for (_, sweep, _), count in named.items() if sweep in ("own_push", "own_pick_and_place")} == {20}
+    assert {count for (_, sweep, _), count in named.items() if sweep not in ("own_push", "own_pick_and_place")} == {10}
 
 
 def test_no_family_is_larger_than_ten_pairs_can_decide():
@@ -146,6 +149,23 @@ def test_verdicts_by_hand(tmp_path):
         ("PickAndPlace", "1.00", "alike"),
         ("Slide", "0.0059", "better"),
     ]
+
+
+def test_the_interval_is_students_t_and_pairs_by_seed():
+    """By hand: differences 0.1, 0.2 and 0.3 have mean 0.2, spread 0.1 and t 4.303 with two degrees of freedom."""
+    d = paper_analysis.difference(np.array([0.4, 0.4, 0.4]), np.array([0.3, 0.2, 0.1]))
+    assert (d.mean, d.low, d.high) == pytest.approx((0.2, 0.2 - 4.303 * 0.1 / 3**0.5, 0.2 + 4.303 * 0.1 / 3**0.5), abs=1e-4)
+    flat = {seed: np.full((1, 3), 0.1 * seed) for seed in range(4)}
+    baseline = paper_analysis.Curves((0, 1, 2, 3), np.concatenate([flat[seed] for seed in range(4)]))
+    setting = paper_analysis.Curves((1, 3), np.concatenate([flat[1], flat[3]]) + 0.05)
+    sweeps = {("own_push", "future"): baseline, ("own_methods", "closest"): setting}
+    compared, epochs = paper_set._compare(sweeps, paper_set.FAMILIES["methods 1 and 2, own cycles"][0])
+    assert (compared.each.tolist(), epochs) == (pytest.approx([0.05, 0.05]), 3)
+    with refuses("seeds", [3]):
+        paper_set._compare(
+            {**sweeps, ("own_push", "future"): paper_analysis.Curves((1, 2), baseline.success[:2])},
+            paper_set.FAMILIES["methods 1 and 2, own cycles"][0],
+        )
 
 
 def test_verdicts_of_intervals():
