@@ -104,7 +104,7 @@ def record(path: Path, repeats: int, anyway: bool) -> dict[str, Any]:
     from timing import cpu
 
     import mjx_dher
-    from mjx_dher.envs.engines.native import usable_cores
+    from mjx_dher.system.limits import usable_cores
 
     read(path)  # a file that is none is not appended to
     remarks = remarks_of(os.getloadavg()[0], usable_cores(), git("status", "--porcelain"))

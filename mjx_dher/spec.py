@@ -162,7 +162,7 @@ def find_demonstrations(source: str) -> Path:
     """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none."""
     if source.endswith(".npz") and Path(source).is_file():
         return Path(source)
-    root = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
     for folder in (Path(source), root / source):
         if source and (folder / "data").is_dir():
             return folder

@@ -1,6 +1,5 @@
 """What the C library keeps of freed memory, in programs of their own."""
 
-import os
 import subprocess
 import sys
 
@@ -8,14 +7,14 @@ import jax
 import pytest
 from conftest import ROOT
 
-from mjx_dher.system import memory
+from mjx_dher.system import limits, memory
 
 pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="not glibc")
 
 # Blocks that are freed while a smaller one on top of each stays: a hole each, which the heap cannot give back by itself.
 HOLES = """
 import ctypes
-from mjx_dher.system import memory
+from mjx_dher.system import limits, memory
 c = ctypes.CDLL("libc.so.6")
 c.malloc.restype, c.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
 {before}
@@ -48,7 +47,7 @@ def test_blocks_of_some_megabytes_go_back_to_the_system_when_they_are_freed():
 
 THREADS = """
 import ctypes, threading
-from mjx_dher.system import memory
+from mjx_dher.system import limits, memory
 c = ctypes.CDLL("libc.so.6")
 {before}
 together = threading.Barrier({threads})
@@ -67,14 +66,14 @@ c.fflush(stdout)
 
 def heaps(before=""):
     """How many heaps threads have that allocate at the same time."""
-    code = THREADS.format(before=before, threads=4 * os.cpu_count())
+    code = THREADS.format(before=before, threads=4 * limits.usable_cores())
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
     return found.count("<heap nr=")
 
 
 def test_there_are_two_heaps_a_core():
     """Not one for all: threads of the compiler would wait for one another."""
-    cores = max(2, os.cpu_count())
+    cores = max(2, limits.usable_cores())
     assert heaps() > 2 * cores
     assert heaps(before="memory.keep_heap_small()") == 2 * cores
 

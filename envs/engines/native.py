@@ -22,6 +22,7 @@ from mujoco.batch import DATA_FIELDS, Batch
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes
 from mjx_dher.lookup import check_name
+from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
 
@@ -228,11 +229,6 @@ class Simulator:
             )
             self._batches[key] = _Views(batch, inputs, outputs)
         return self._batches[key]
-
-
-def usable_cores() -> int:
-    """Returns the number of cores that this process may use, which a container or `taskset` can limit."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _drop_warnings() -> None:

@@ -43,18 +43,18 @@ def transfer_command(argv: list[str], console: Console) -> int:
     folder = find_run(args.run, console)
     run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)
-    from mjx_dher.envs.engines.native import usable_cores
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, check_plain, load_policy
     from mjx_dher.stats import difference_interval
+    from mjx_dher.system.limits import usable_cores
     from mjx_dher.tools import transfer
 
     policy = check_plain(load_policy(folder), run, "transfer")
-    environment = transfer.default_environment()
     if args.set_up:
+        environment = transfer.default_environment()
         console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
         transfer.set_up(environment)
-    python = args.python or transfer.interpreter(environment)
+    python = args.python or transfer.interpreter(transfer.default_environment())
     name = transfer.check_original(run.env, python)
     keep_compiled_programs()
     if run.env_kwargs:

@@ -6,6 +6,8 @@ import ctypes
 import os
 from pathlib import Path
 
+from mjx_dher.system import limits
+
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # of glibc's malloc.h
 _HEAPS_A_CORE = 2
 
@@ -13,7 +15,7 @@ _HEAPS_A_CORE = 2
 def available_bytes() -> int | None:
     """Returns the bytes that this process's first device can still allocate, or None where they are unknown.
 
-    On a CPU: the free memory of the machine, or of the container if that is less (Linux only).
+    On a CPU: the free memory of the machine, or of a container if that is less (Linux only).
     """
     import jax
 
@@ -21,8 +23,7 @@ def available_bytes() -> int | None:
     if device.platform != "cpu":
         stats = device.memory_stats()
         return stats["bytes_limit"] - stats["bytes_in_use"] if stats and "bytes_limit" in stats else None
-    known = [amount for amount in (_meminfo_available(), _container_available()) if amount is not None]
-    return min(known, default=None)
+    return limits.free_bytes()
 
 
 def used_bytes() -> int | None:
@@ -34,7 +35,7 @@ def used_bytes() -> int | None:
         stats = device.memory_stats()
         return stats["bytes_in_use"] if stats else None
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return None
 
@@ -49,7 +50,7 @@ def keep_heap_small() -> None:
     """
     if (library := _glibc()) is not None:
         library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
-        library.mallopt(_M_ARENA_MAX, _HEAPS_A_CORE * max(2, os.cpu_count() or 1))
+        library.mallopt(_M_ARENA_MAX, _HEAPS_A_CORE * max(2, limits.usable_cores()))
 
 
 def release() -> None:
@@ -73,20 +74,3 @@ def format_bytes(amount: float) -> str:
             return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"
         amount /= 1000
     return f"{amount:.1f} TB"
-
-
-def _meminfo_available() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
-
-
-def _container_available() -> int | None:
-    try:
-        limit = Path("/sys/fs/cgroup/memory.max").read_text().strip()
-        used = int(Path("/sys/fs/cgroup/memory.current").read_text())
-    except (OSError, ValueError):
-        return None
-    return None if limit == "max" else int(limit) - used

@@ -10,6 +10,8 @@ import tempfile
 import warnings
 from typing import Any
 
+from mjx_dher.system.caches import user_cache
+
 with contextlib.redirect_stdout(io.StringIO()):
     import warp as wp
 
@@ -25,6 +27,8 @@ def prepare() -> None:
     this process takes its place.
     """
     try:
+        if not (wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")):
+            user_cache()  # Warp itself would make a folder called ~ without a home folder
         wp.init()
         with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir):
             pass

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher import __version__, presets, spec
-from mjx_dher.system import caches, memory, subprocesses
+from mjx_dher.system import caches, limits, memory, subprocesses
 from mjx_dher.tools import render, transfer
 
 ENGINES = tuple(name for name in spec.ENGINES if name != "auto")
@@ -42,7 +42,7 @@ def examine(seconds: float) -> Report:
     """
     requested = os.environ.get("MUJOCO_GL", "")
     backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(4, limits.usable_cores())) as pool:
         asked = {topic: pool.submit(ask, topic, seconds) for topic in ("machine", *ENGINES)}
         drawn = {name or "system": pool.submit(render.try_gl, name, seconds) for name in backends}
     failures = {name: future.result() for name, future in drawn.items()}
@@ -126,13 +126,12 @@ def _examine_machine() -> Iterator[tuple[str, str]]:
     import jax
 
     from mjx_dher.envs import engines
-    from mjx_dher.envs.engines import native
 
     def devices() -> str:
         sizes = {device: (device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()}
         return "; ".join(f"{d.device_kind}{f', {memory.format_bytes(size)}' if size else ''}" for d, size in sizes.items())
 
-    yield "cores", str(native.usable_cores())
+    yield "cores", str(limits.usable_cores())
     yield "devices", _guarded(devices)
     yield "memory", _guarded(lambda: memory.format_bytes(memory.available_bytes() or 0))
     yield "engine", _guarded(lambda: engines.resolve_engine("auto"))
@@ -198,8 +197,8 @@ def _originals() -> str:
 
 def _brief(path: str | Path) -> str:
     """A path that can be shown to others: without the user's home folder."""
-    path = Path(path)
-    return f"~/{path.relative_to(Path.home())}" if path.is_relative_to(Path.home()) else str(path)
+    path, home = Path(path), os.path.expanduser("~")  # "~" without a home folder
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 
 if __name__ == "__main__":
