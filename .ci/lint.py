@@ -157,7 +157,9 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 def paragraphs(path: Path) -> Iterator[tuple[int, str]]:
     """A page's lines with their numbers; without code, tables and addresses."""
-    text = re.sub(r"```.*?```|<!--.*?-->", lambda match: re.sub(r"[^\n]", "", match[0]), path.read_text(), flags=re.DOTALL)
+    text = re.sub(
+        r"```.*?```|<!--.*?-->", lambda match: re.sub(r"[^\n]", "", match[0]), path.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
     for number, line in enumerate(text.splitlines(), 1):
         if not line.lstrip().startswith(("|", "![", "    ")):
             yield number, re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)

@@ -47,7 +47,7 @@ def load(path: Path, experiment: Experiment | None = None) -> list[Run]:
       FolderError: no such file, a row that is none, or a run whose settings are not those of the `experiment`'s arm today.
     """
     try:
-        with path.open(newline="") as file:
+        with path.open(encoding="utf-8", newline="") as file:
             rows = csv.DictReader(file)
             if tuple(rows.fieldnames or ()) != Run._fields:
                 raise FolderError(f"{path} has not the columns {', '.join(Run._fields)}")

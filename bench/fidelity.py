@@ -165,7 +165,7 @@ def report(tasks, engines):
         for task in tasks
         for engine in engines
     }
-    with open(YARDSTICK) as file:
+    with open(YARDSTICK, encoding="utf-8") as file:
         original = [row for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
     rows = []
     for task in tasks:
@@ -275,7 +275,7 @@ def yardstick():
     warnings.filterwarnings("ignore")
     gym.register_envs(gymnasium_robotics)
     rng = np.random.default_rng(0)
-    with open(YARDSTICK, "w", newline="") as file:
+    with open(YARDSTICK, "w", encoding="utf-8", newline="") as file:
         out = csv.writer(file)
         out.writerow(HEAD)
         for task in TASKS:

@@ -117,7 +117,7 @@ def pin(cores: int) -> None:
 @contextlib.contextmanager
 def started(command: Sequence[str], log: Path, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
     """Starts a program whose messages go to a file, and kills it where the block is left before it has ended."""
-    with log.open("w") as file, subprocess.Popen(command, stdout=stdout or file, stderr=file, text=True) as process:
+    with log.open("wb") as file, subprocess.Popen(command, stdout=stdout or file, stderr=file, text=True) as process:
         try:
             yield process
         finally:
@@ -127,7 +127,7 @@ def started(command: Sequence[str], log: Path, stdout: int | None = None) -> Ite
 def check_ended(process: subprocess.Popen[str], log: Path, allowed: Sequence[int] = (0,)) -> None:
     """Waits for a program, and raises ValueError with the end of its log where its exit status is not `allowed`."""
     if process.wait() not in allowed:
-        end = "\n".join(log.read_text(errors="replace").splitlines()[-15:])
+        end = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
         raise ValueError(f"{log.stem} failed with exit status {process.returncode}; the end of {log}:\n{end}")
 
 
@@ -196,7 +196,7 @@ def train(args: argparse.Namespace, python: Path) -> None:
 
 def write_csv(runs: Sequence[Run], path: Path) -> None:
     """Writes a line for each evaluation of each run."""
-    with path.open("w", newline="") as file:
+    with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for run, row in ((each, row) for each in runs for row in each.rows):

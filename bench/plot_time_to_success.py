@@ -20,7 +20,7 @@ LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"
 def read(source: Path) -> dict[str, list[tuple[float, float, float]]]:
     """By seed: seconds, environment steps and success rate of each evaluation."""
     seeds: dict[str, list[tuple[float, float, float]]] = {}
-    with source.open() as file:
+    with source.open(encoding="utf-8") as file:
         for row in csv.DictReader(file):
             point = (float(row["wall_seconds"]), float(row["env_steps"]), float(row["success_rate"]))
             seeds.setdefault(row["seed"], []).append(point)

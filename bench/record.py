@@ -54,7 +54,7 @@ def remarks_of(load: float, cores: int, changes: str) -> list[str]:
 def read(path: Path) -> list[dict[str, Any]]:
     """All lines of a history, oldest first; exits where one is none."""
     entries = []
-    for number, line in enumerate(path.read_text().splitlines() if path.exists() else [], start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.exists() else [], start=1):
         try:
             entry = json.loads(line)
             missing = [name for name in FIELDS if name not in entry]
@@ -121,7 +121,7 @@ def record(path: Path, repeats: int, anyway: bool) -> dict[str, Any]:
         "setup": setup,
         "figures": {name: float(f"{value:.4g}") for name, value in figures.items()},
     }
-    with path.open("a") as file:
+    with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(entry) + "\n")
     return entry
 

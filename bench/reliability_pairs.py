@@ -110,7 +110,7 @@ def train_held(folder, right, rng):
 def has_jax(process):
     """Whether a process has loaded JAX: by then it has looked at its arguments."""
     try:
-        return "jaxlib" in Path(f"/proc/{process.pid}/maps").read_text()
+        return "jaxlib" in Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8")
     except OSError:
         return True
 

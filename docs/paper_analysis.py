@@ -46,7 +46,7 @@ class Difference(NamedTuple):
 def read(path: Path) -> Sweeps:
     """Returns the curves in a CSV, by sweep and setting; a sweep that was cut short is as long as its shortest run."""
     runs: dict[tuple[str, str], dict[int, list[float]]] = {}
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             curve = runs.setdefault((row["sweep"], row["setting"]), {}).setdefault(int(row["seed"]), [])
             if int(row["epoch"]) != len(curve) + 1:

@@ -131,7 +131,7 @@ def add_comments(module: str) -> None:
 def classes(module: str) -> dict[str, ast.ClassDef]:
     """Returns the classes of a module that is imported, by name."""
     origin = getattr(sys.modules.get(module), "__file__", None)
-    tree = ast.parse(Path(origin).read_text()) if origin else ast.Module([], [])
+    tree = ast.parse(Path(origin).read_text(encoding="utf-8")) if origin else ast.Module([], [])
     return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
@@ -140,7 +140,7 @@ def texts_of(module: str, owner: str) -> dict[str, str]:
     """Returns the docstrings of a class's fields, or else the comments beside and above them, by name; nothing for no class."""
     if (node := classes(module).get(owner)) is None:
         return {}
-    rows, texts = Path(sys.modules[module].__file__ or "").read_text().splitlines(), {}
+    rows, texts = Path(sys.modules[module].__file__ or "").read_text(encoding="utf-8").splitlines(), {}
     for field, following in zip(node.body, [*node.body[1:], None], strict=True):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and field.end_lineno:
             text = docstring(following) or comment(rows, field.lineno - 1, field.end_lineno - 1)

@@ -98,7 +98,7 @@ def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[Ru
     earlier = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():
         with contextlib.suppress(OSError, ValueError):  # damaged: its runs begin from the start
-            chunk = tuple(by_name[name] for name in json.loads(path.read_text()) if name in by_name)
+            chunk = tuple(by_name[name] for name in json.loads(path.read_text(encoding="utf-8")) if name in by_name)
             if waiting & set(chunk):
                 waiting -= set(chunk)
                 earlier.append(chunk)
@@ -115,7 +115,7 @@ def make(
     if folder is not None:
         files.make_folder(folder)
         with files.atomic_write(folder / NAMES_FILE) as partial:
-            partial.write_text(json.dumps(names))
+            partial.write_text(json.dumps(names), encoding="utf-8")
     return Chunk(own, specs, options, lanes, None if task.gpus else task.cpus, folder, code)
 
 

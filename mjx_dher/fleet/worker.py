@@ -136,7 +136,7 @@ def pack(folder: Path) -> bytes:
     with zipfile.ZipFile(buffer, "w") as archive:
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder)
-            if path.is_file() and name.parts[0] not in (files.LOCK, run_folder.CHECKPOINTS):
+            if path.is_file() and name.parts[0] != run_folder.CHECKPOINTS and not files.is_lock(path):
                 entry = zipfile.ZipInfo(name.as_posix())  # without a time: the same run gives the same bytes
                 archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED, compresslevel=1)
     return buffer.getvalue()
@@ -158,7 +158,7 @@ def unpack(folder: Path, parcel: bytes) -> None:
             content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are compared
             (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
             for path in folder.iterdir():  # left by a run without Ray, or by a driver that was killed
-                if path.name != files.LOCK:
+                if not files.is_lock(path):
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
             archive.extractall(folder, [name for name in content if name != run_folder.RESULT_FILE])
             files.flush_all(folder)

@@ -237,7 +237,7 @@ def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
 
 def write(folder: Path, rows: list[Row]) -> None:
     """Writes the rows to comparison.csv in `folder`."""
-    with files.atomic_write(folder / COMPARISON) as partial, partial.open("w", newline="") as file:
+    with files.atomic_write(folder / COMPARISON) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(Row._fields)
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import functools
 import json
 import os
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 LOCK = ".lock"  # name of the file in a folder by which it is locked
+_MARKER = f"{LOCK}.soft"  # the same, on a file system without locks
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)  # filelock itself marks the folder for ENOSYS
+_NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # of a folder: CIFS, AFS, some of FUSE
 
 
 class FolderError(ValueError):
@@ -43,7 +52,7 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
     """Locks a folder against other programs, and other threads of this one. Who has the lock can take it again.
 
     The system releases the lock when this process ends, however it ends. The file stays: who unlinks a file by which others
-    lock gives the lock to two of them.
+    lock gives the lock to two of them. On a file system without locks, a file that names this process marks the folder.
 
     Args:
       folder: it must exist.
@@ -55,15 +64,42 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
-    held = FileLock(folder.absolute() / LOCK, timeout=-1 if wait else 0, is_singleton=True)
+    path, timeout = folder.absolute() / LOCK, -1 if wait else 0
+    is_new = not path.exists()
+    held: BaseFileLock = FileLock(path, timeout=timeout, is_singleton=True)
     try:
-        held.acquire()
+        with naming(path):
+            held.acquire()
     except Timeout:
         raise BusyError(f"{folder} is being trained by another program") from None
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        if is_new:
+            path.unlink(missing_ok=True)
+        held = _mark(folder, timeout)
     try:
         yield
     finally:
         held.release()
+
+
+def _mark(folder: Path, timeout: float) -> BaseFileLock:
+    """Locks a folder on a file system without locks."""
+    from filelock import SoftFileLock, Timeout
+
+    _tell_no_locks()
+    held = SoftFileLock(folder.absolute() / _MARKER, timeout=timeout, is_singleton=True)
+    try:
+        held.acquire()
+    except Timeout:
+        raise BusyError(f"{folder} is being trained by another program; if not, delete {held.lock_file}") from None
+    return held
+
+
+@functools.cache
+def _tell_no_locks() -> None:
+    warnings.warn("a file system here has no locks: folders in use are marked by files", stacklevel=2)
 
 
 @contextlib.contextmanager
@@ -75,9 +111,7 @@ def new_folder(folder: Path) -> Iterator[None]:
       FolderError: it holds something already.
       OSError: it cannot be made or written to.
     """
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    make_folder(folder)
-    try:
+    with made(folder):
         if not (folder / LOCK).exists():  # else another program may be at work on it, which says more
             _refuse_used(folder)  # before a lock is left in what is someone else's
         with lock(folder):
@@ -87,10 +121,6 @@ def new_folder(folder: Path) -> Iterator[None]:
             finally:
                 if not is_used(folder):
                     (folder / LOCK).unlink(missing_ok=True)  # none will wait for it: the folder goes, too
-    finally:
-        for path in missing:
-            with contextlib.suppress(OSError):  # something is in it
-                path.rmdir()
 
 
 def _refuse_used(folder: Path) -> None:
@@ -99,25 +129,65 @@ def _refuse_used(folder: Path) -> None:
 
 
 def is_used(folder: Path) -> bool:
-    """Returns whether a folder holds anything but the file by which it is locked."""
-    return any(path.name != LOCK for path in folder.iterdir())
+    """Whether a folder holds anything but the file by which it is locked."""
+    return not all(map(is_lock, folder.iterdir()))
 
 
-def make_folder(folder: Path) -> None:
-    """Makes a folder, and those above it that are missing, so that they survive a power cut."""
+def is_lock(path: Path) -> bool:
+    """Whether a file is one by which `lock` locks its folder."""
+    return path.name == LOCK or path.name.startswith(_MARKER)
+
+
+def make_folder(folder: Path) -> list[Path]:
+    """Makes a folder, and those above it that are missing, so that they survive a power cut; returns those that it made."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in missing:
-        flush(path.parent)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in missing:
+            flush(path.parent)
+    except OSError:
+        _remove_empty(missing)
+        raise
+    return missing
+
+
+@contextlib.contextmanager
+def made(folder: Path) -> Iterator[None]:
+    """Makes a folder, and those above it that are missing. Those of them that stay empty are removed at the end."""
+    missing = make_folder(folder)
+    try:
+        yield
+    finally:
+        _remove_empty(missing)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        with contextlib.suppress(OSError):  # something is in it
+            folder.rmdir()
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Gives an OSError that names no file this one: those of writing and flushing do not."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def flush(path: Path) -> None:
-    """Flushes a file's content, or the names in a folder, onto the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    """Flushes a file's content, or the names in a folder if the file system can do that, onto the disk."""
+    with naming(path):
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        except OSError as error:
+            if not (error.errno in _NO_FLUSH and path.is_dir()):
+                raise
+        finally:
+            os.close(descriptor)
 
 
 def flush_all(folder: Path) -> None:
@@ -139,7 +209,7 @@ def remove(path: Path) -> None:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes `content` as JSON, atomically, so that it survives a power cut; what is not finite becomes null."""
     with atomic_write(path) as partial:
-        partial.write_text(json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n")
+        partial.write_text(json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         flush(partial)
     flush(path.parent)
 
@@ -159,7 +229,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     partial = path.with_name(path.name + ".partial")
     partial.unlink(missing_ok=True)  # what a kill has left, or a link, through which another file would be written
     try:
-        yield partial
-        partial.replace(path)
+        with naming(path):
+            yield partial
+            partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

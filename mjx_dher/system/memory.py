@@ -35,7 +35,7 @@ def used_bytes() -> int | None:
         stats = device.memory_stats()
         return stats["bytes_in_use"] if stats else None
     try:
-        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
         return None
 

@@ -51,4 +51,4 @@ def is_shipped(path: Path) -> bool:
 
 def facts(folder: Path) -> dict[str, Any]:
     """Returns what was measured of a policy of the package: `here` and `original`, `machine`, `commit` and `date`."""
-    return dict(json.loads((folder / FACTS).read_text()))
+    return dict(json.loads((folder / FACTS).read_text(encoding="utf-8")))

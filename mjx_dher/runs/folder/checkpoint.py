@@ -112,7 +112,7 @@ def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
         "leaves": [[name, list(array.shape), str(array.dtype)] for name, array in leaves.items()],
         "files": {path.relative_to(partial).as_posix(): _digest(path) for path in _files(partial)},
     }
-    with (partial / MANIFEST).open("w") as file:
+    with (partial / MANIFEST).open("w", encoding="utf-8") as file:
         json.dump({**content, "sha256": sha256_of(content)}, file, indent=1)
 
 

@@ -159,6 +159,6 @@ class LaneCheckpoints:
 def _names(path: Path) -> list[str]:
     """Names of the runs that share a checkpoint; none if another process has just removed it."""
     try:
-        return list(json.loads(path.read_text())["cells"])
+        return list(json.loads(path.read_text(encoding="utf-8"))["cells"])
     except (OSError, ValueError, KeyError, TypeError):
         return []

@@ -60,7 +60,7 @@ class Claims:
                 return claimed, [*waiting[number:], *busy]
             try:
                 with named(folder), contextlib.ExitStack() as attempt:
-                    files.make_folder(folder)
+                    attempt.enter_context(files.made(folder))
                     attempt.enter_context(files.lock(folder))
                     if self._is_due(spec, folder):
                         claimed.append((spec, folder))

@@ -53,7 +53,7 @@ class CsvSink:
             whole = max(0, len(kept) - 1)
             raise FolderError(f"{path} is damaged: {epochs} epochs had ended, and it has whole lines of {whole}")
         _write(path, kept)
-        self._file = path.open("a", newline="")
+        self._file = path.open("a", newline="", encoding="utf-8")
         if kept:
             self._writer = self._make_writer(kept[0].strip().split(","))
 
@@ -86,7 +86,7 @@ class JsonlSink:
         whole = list(itertools.takewhile(lambda line: line.endswith("}\n"), lines))[:epochs]
         missing = read_rows(path.with_name(METRICS_FILE))[len(whole) : epochs] if epochs else []
         _write(path, [*whole, *map(_to_json, missing)])
-        self._file = path.open("a")
+        self._file = path.open("a", encoding="utf-8")
 
     def write(self, row: dict[str, Any]) -> None:
         self._file.write(_to_json(row))

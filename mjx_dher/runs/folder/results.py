@@ -26,7 +26,7 @@ def read_result(folder: Path) -> dict[str, Any]:
     if path.exists() and not path.is_file():
         raise FolderError(f"{path} is damaged: it is not a file")  # a reader of a FIFO would block
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         return {"reason": "", **content, "status": str(content["status"]), "epochs": int(content["epochs"])}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(f"{path} is damaged ({type(error).__name__}: {error})") from error

@@ -127,7 +127,7 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
     if file.exists() and not file.is_file():
         raise FolderError(f"{file} is not a file")  # a reader of a FIFO would block
     try:
-        content = json.loads(file.read_text())
+        content = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:

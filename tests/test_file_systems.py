@@ -1,0 +1,154 @@
+"""File systems that lack something: flushing folders, locks, space; what is left of a folder that could not be made."""
+
+import ast
+import contextlib
+import errno
+import fcntl
+import os
+import stat
+import subprocess
+import sys
+import warnings
+
+import pytest
+from conftest import ROOT
+
+from mjx_dher.cli import sentence
+from mjx_dher.runs.folder.locks import Claims
+from mjx_dher.spec import RunSpec
+from mjx_dher.system import files
+
+fsync = os.fsync
+
+
+def failing(number, is_folder):
+    """`os.fsync` of a file system that cannot flush folders, or files."""
+
+    def flush(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode) is is_folder:
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    return flush
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP])
+def test_folders_that_cannot_be_flushed_are_passed_over_and_files_are_not(number, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", failing(number, is_folder=True))
+    with files.new_folder(tmp_path / "a" / "b"):
+        files.write_json(tmp_path / "a" / "b" / "x.json", {})
+    files.flush_all(tmp_path)
+    monkeypatch.setattr(os, "fsync", failing(number, is_folder=False))
+    with pytest.raises(OSError) as raised:  # noqa: PT011
+        files.write_json(tmp_path / "y.json", {})
+    assert (raised.value.errno, str(tmp_path / "y.json")) == (
+        number,
+        sentence(raised.value).split(": ")[0].removesuffix(".partial"),
+    )
+    assert not list(tmp_path.glob("y.json*"))
+
+
+@pytest.mark.parametrize("make", [files.make_folder, lambda path: files.new_folder(path).__enter__()])
+def test_a_folder_that_cannot_be_flushed_is_named_and_does_not_stay(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", failing(errno.EIO, is_folder=True))
+    with pytest.raises(OSError) as raised:  # noqa: PT011
+        make(tmp_path / "a" / "b")
+    assert sentence(raised.value) == f"{tmp_path / 'a'}: {os.strerror(errno.EIO)}"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(params=[errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def no_locks(request, monkeypatch):
+    def flock(descriptor, operation):
+        raise OSError(request.param, os.strerror(request.param))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    files._tell_no_locks.cache_clear()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        yield request.param
+        assert len(told) == 1
+
+
+OTHER = """
+import sys
+from pathlib import Path
+from mjx_dher.system import files
+with files.lock(Path(sys.argv[1])):
+    print(flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_without_locks_a_file_marks_a_folder(no_locks, tmp_path):
+    out = tmp_path / "a" / "b"
+    with files.new_folder(out), files.lock(out):
+        assert not files.is_used(out)
+    assert not list(tmp_path.iterdir())
+    with files.new_folder(out):
+        (out / "x").touch()
+    with files.lock(out):
+        pass
+    assert not [path for path in out.iterdir() if path.name not in ("x", files.LOCK)]
+
+
+def test_without_locks_another_program_is_noticed_until_it_is_killed(tmp_path):
+    shim = tmp_path / "flock.so"
+    source = "#include <errno.h>\nint flock(int fd, int op) { errno = 37; return -1; }\n"
+    built = subprocess.run(["gcc", "-shared", "-fPIC", "-o", shim, "-xc", "-"], input=source, text=True, check=False)
+    if built.returncode:
+        pytest.skip("no compiler")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    variables = {**os.environ, "LD_PRELOAD": str(shim)}
+    start = lambda: subprocess.Popen(  # noqa: E731
+        [sys.executable, "-c", OTHER, folder],
+        cwd=ROOT,
+        env=variables,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    first = start()
+    assert first.stdout.readline() == "\n"
+    second = start()
+    stderr = second.communicate()[1]
+    assert second.returncode
+    assert f"BusyError: {folder} " in stderr
+    first.kill()
+    first.communicate()
+    third = start()
+    assert third.communicate()[0] == "\n"
+    assert third.returncode == 0
+
+
+def test_a_folder_whose_lock_fails_is_named_and_does_not_stay(tmp_path, monkeypatch):
+    def flock(descriptor, operation):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(ValueError, match=r"x.*Input/output"), contextlib.ExitStack() as stack:
+        Claims(False, print).claim(stack, [(RunSpec(), tmp_path / "x")], 1)
+    with pytest.raises(OSError) as raised, files.new_folder(tmp_path / "y"):  # noqa: PT011
+        pass
+    assert sentence(raised.value) == f"{tmp_path / 'y' / files.LOCK}: {os.strerror(errno.EIO)}"
+
+
+TEXT = ("open", "read_text", "write_text")  # functions that take an encoding
+
+
+def is_in_the_locale_s_encoding(call):
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    texts = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]
+    given = {keyword.arg for keyword in call.keywords}
+    other = getattr(getattr(call.func, "value", None), "id", "") in ("os", "webbrowser")
+    return name in TEXT and "encoding" not in given and not other and not any("b" in str(text) for text in texts[-1:])
+
+
+@pytest.mark.parametrize("folder", ["mjx_dher", "envs"])
+def test_no_text_is_in_the_locale_s_encoding(folder):
+    """A sampler called `grün` would be written otherwise on another machine, or not at all."""
+    for path in (ROOT / folder).rglob("*.py"):
+        calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+        assert not [f"{path}:{call.lineno}" for call in calls if is_in_the_locale_s_encoding(call)]
