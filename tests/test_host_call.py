@@ -18,6 +18,17 @@ def double(rows):
     return np.concatenate([2 * rows, rows.sum(-1, keepdims=True)], axis=-1, dtype=np.float32)
 
 
+class Object:
+    """Has a method to register."""
+
+    def __init__(self, name, function):
+        self._function = function
+        host_call.register(name, self.answer)
+
+    def answer(self, rows):
+        return self._function(rows)
+
+
 def test_a_function_is_called_once_for_all_batch_axes():
     seen = []
 
@@ -25,40 +36,48 @@ def test_a_function_is_called_once_for_all_batch_axes():
         seen.append(rows.shape)
         return double(rows)
 
-    host_call.register("test_noting", noting)
+    kept = Object("test_noting", noting)
     call = lambda row: host_call.call("test_noting", (4,), row)  # noqa: E731
     np.testing.assert_array_equal(jax.jit(call)(ROWS[1]), double(np.asarray(ROWS[1])))
     nested = jax.jit(jax.vmap(jax.vmap(call)))(ROWS.reshape(2, 2, 3))
     np.testing.assert_array_equal(nested.reshape(4, 4), double(np.asarray(ROWS)))
     scanned = jax.jit(lambda x: jax.lax.scan(lambda x, _: (call(x)[:3], None), x, length=3)[0])(ROWS[1])
     np.testing.assert_array_equal(scanned, 8 * ROWS[1])
+    assert kept._function is noting
     assert seen == [(3,), (2, 2, 3), (3,), (3,), (3,)]
 
 
 def test_numbers_of_64_bits_are_handed_over_as_32():
-    host_call.register("test_bits", double)
+    kept = Object("test_bits", double)
     with jax.enable_x64(True):
         rows = jnp.asarray(ROWS, jnp.float64)
         assert rows.dtype == jnp.float64
         given = jax.jit(jax.vmap(lambda row: host_call.call("test_bits", (4,), row)))(rows)
-    np.testing.assert_array_equal(given, double(np.asarray(ROWS)))
+    np.testing.assert_array_equal(given, kept.answer(np.asarray(ROWS)))
 
 
 def test_programs_for_other_devices_call_the_function_itself(monkeypatch):
-    host_call.register("test_elsewhere", double)
+    kept = Object("test_elsewhere", double)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     call = lambda row: host_call.call("test_elsewhere", (4,), row)  # noqa: E731
     program = jax.jit(jax.vmap(call))
     assert "pure_callback" in str(jax.make_jaxpr(program)(ROWS))
-    np.testing.assert_array_equal(program(ROWS), double(np.asarray(ROWS)))
+    np.testing.assert_array_equal(program(ROWS), kept.answer(np.asarray(ROWS)))
 
 
-def test_the_last_function_of_a_name_is_called_also_by_what_is_compiled():
-    host_call.register("test_two", double)
+def test_a_name_ends_with_the_last_of_its_objects():
+    first, second = Object("test_two", double), Object("test_two", double)
     call = jax.jit(lambda row: host_call.call("test_two", (4,), row))
-    first = call(ROWS[0])
-    host_call.register("test_two", lambda rows: -double(rows))
-    np.testing.assert_array_equal(call(ROWS[0]), -first)
+    expected = np.asarray(call(ROWS[0]))
+    del first
+    np.testing.assert_array_equal(call(ROWS[0]), expected)
+    del second
+    with refuses("simulator", "exists", error=(jax.errors.JaxRuntimeError, ValueError)):
+        jax.block_until_ready(call(ROWS[0]))
+    kept = Object("test_three", double)
+    assert "test_two" not in host_call._methods
+    assert "test_three" in host_call._methods
+    del kept
 
 
 def test_an_error_ends_the_program_with_its_message():
@@ -69,9 +88,10 @@ def test_an_error_ends_the_program_with_its_message():
     ]
     call = jax.jit(lambda row: host_call.call("test_error", (4,), row))
     for function, message in cases:
-        host_call.register("test_error", function)
+        kept = Object("test_error", function)
         with refuses(message, error=(jax.errors.JaxRuntimeError, ValueError)):
             jax.block_until_ready(call(ROWS[0]))
+        del kept
 
 
 PROGRAM = """

@@ -1,7 +1,10 @@
 """Any model by MuJoCo C from inside compiled programs, beside plain loops over `mj_step`."""
 
 import copy
+import gc
 import pickle
+import warnings
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +13,11 @@ import numpy as np
 import pytest
 from any_model import FIGURE
 from conftest import refuses
+from mujoco.batch import DATA_FIELDS
 
 from mjx_dher.envs import Simulator, make
 from mjx_dher.envs.engines import Controls, native
+from mjx_dher.envs.engines.fields import REJECTED
 
 # Whatever a state can have: an actuator with activation, a mocap body with a weld, a tendon, a delayed sensor, a keyframe.
 RICH = """
@@ -62,8 +67,10 @@ def loop(model, first, controls, substeps):
             mujoco.mj_step(model, data)
         state = {name: np.float32(getattr(data, name)) for name in (*STATE, "xpos", "sensordata")}
         states.append(state)
+        time, history = data.time, data.history.copy()
         data = mujoco.MjData(model)
-        load(model, data, native.Data(**{name: state[name] for name in STATE}, derived={}))
+        load(model, data, native.Data(**{name: state[name] for name in STATE}, residue=None, derived={}))
+        data.time, data.history[:] = time, history  # float64 between steps, too
     return states
 
 
@@ -153,6 +160,7 @@ def test_bad_arguments_are_rejected():
         (lambda model: Simulator(model, derived="xpos"), ["derived", "xpos"]),
         (lambda model: Simulator(model, derived=["xposs"]), ["derived", "xposs", "xpos"]),
         (lambda model: Simulator(model, derived=["qpos"]), ["derived", "qpos"]),
+        (lambda model: Simulator(model, derived=["qfrc_inverse"]), ["derived", "qfrc_inverse", "mj_inverse"]),
         (lambda model: Simulator(model, substeps=0), ["substeps", 0]),
         (lambda model: Simulator(model, num_threads=0), ["num_threads", 0]),
         (lambda model: Simulator(model).make_data("down"), ["keyframe", "down"]),
@@ -169,3 +177,111 @@ def test_bad_arguments_are_rejected():
 def asleep(model):
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     return model
+
+
+FALLING = RICH.replace('pos="0 0 1"><freejoint/>', 'pos="0 0 0.09"><freejoint/>').replace('pos="0 0 1"', 'pos="0 0 0.1"')
+CLOTH = """
+<mujoco><option integrator="implicit"/><worldbody><geom type="plane" size="5 5 .1"/><camera name="c"/><light/>
+<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" pos="0 0 .02" radius=".03" name="f" dim="2"><edge equality="true"/>
+<contact selfcollide="none"/></flexcomp><body gravcomp="1"><freejoint/><site name="s"/><geom size="0.1" pos="2 0 2"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize("xml", [FALLING, CLOTH], ids=["box", "cloth"])
+def test_every_derived_field_is_what_mujoco_computes_or_rejected(xml):
+    """Of two simulations in turn on one thread, so that one's numbers would show in the other's."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    names = sorted(set(DATA_FIELDS) - set(STATE) - set(REJECTED))
+    assert {"cfrc_ext", "cfrc_int", "cacc", "subtree_linvel", "subtree_angmom", "energy", "sensordata", "xpos"} <= set(names)
+    sim = Simulator(model, derived=names, num_threads=1)
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), sim.make_data())
+    many = many.replace(qvel=jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (2, model.nv)), jnp.float32))
+    functions = {name: jax.jit(jax.vmap(getattr(sim, name))) for name in ("step", "forward")}
+    model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+    for function in ("step", "forward", "step"):
+        seen = functions[function](many)
+        for i in range(2):
+            data = mujoco.MjData(model)
+            load(model, data, jax.tree.map(lambda x, i=i: x[i], many))
+            getattr(mujoco, f"mj_{function}")(model, data)
+            mujoco.mj_rnePostConstraint(model, data)
+            mujoco.mj_subtreeVel(model, data)
+            for name in names:
+                value = np.float32(getattr(data, name)).reshape(sim._shapes[name])
+                # XLA takes numbers below 1e-38 for 0.
+                np.testing.assert_allclose(seen.derived[name][i], value, rtol=0, atol=2e-38, err_msg=f"{name} after {function}")
+        many = seen
+    assert np.abs(seen.derived["energy"]).min() > 1e-4
+    assert np.abs(seen.derived["cfrc_ext"]).max() > 1 or xml is CLOTH  # it touches the floor
+
+
+@pytest.mark.parametrize("start", [0.0, 1e5, 1e9])
+def test_time_advances_and_delays_last_as_in_a_loop_without_pause(start):
+    model = mujoco.MjModel.from_xml_string(RICH)
+    sim = Simulator(model, derived=["sensordata"], num_threads=1)
+    data = mujoco.MjData(model)
+    data.time = start
+    for _ in range(3):  # until the history has times of its own
+        mujoco.mj_step(model, data)
+    exact = np.concatenate([[data.time], data.history])
+    first = sim.make_data().replace(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in STATE})
+    first = first.replace(residue=jnp.asarray(native._residue(exact), jnp.float32))
+    last = jax.jit(lambda data: jax.lax.fori_loop(0, 100, lambda _, x: sim.step(x), data))(first)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    np.testing.assert_array_equal(last.time, np.float32(data.time))
+    np.testing.assert_array_equal(np.float64(last.time) + np.float64(last.residue[:, 0]).sum(), data.time)
+    np.testing.assert_allclose(last.derived["sensordata"], data.sensordata, atol=1e-5)
+    assert abs(data.sensordata[0] - data.qpos[7]) > 1e-4  # the delay shows
+
+
+def test_a_time_that_is_set_begins_there():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), num_threads=1)
+    late = sim.step(sim.make_data().replace(time=jnp.float32(1e5)))
+    assert sim.step(late.replace(time=jnp.float32(0))).time == np.float32(0.004)
+
+
+SPHERES = "".join(f'<body pos="{i % 10 * 0.3} {i // 10 * 0.3} .09"><freejoint/><geom size=".1"/></body>' for i in range(60))
+CROWD = f'<mujoco><size memory="{{}}K"/><worldbody><geom type="plane" size="5 5 .1"/>{SPHERES}</worldbody></mujoco>'
+
+
+def test_lost_contacts_are_reported_and_other_people_s_warnings_left_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = mujoco.get_mju_user_warning()
+    full, room = (Simulator(mujoco.MjModel.from_xml_string(CROWD.format(size)), num_threads=1) for size in (80, 2000))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        room.step(room.make_data())
+        room.check()
+    for function in ("step", "forward"):
+        with pytest.warns(UserWarning, match="contacts") if function == "step" else warnings.catch_warnings():
+            data = jax.block_until_ready(getattr(full, function)(full.make_data()))
+        with refuses("contacts", 2, "memory"):  # one of them in make_data
+            full.check()
+    full.check()
+    wild = room.step(room.make_data().replace(qvel=data.qvel * jnp.nan))
+    assert not np.isfinite(wild.qvel).all()
+    assert mujoco.get_mju_user_warning() is before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), num_threads=1)
+    data, program = sim.make_data(), jax.jit(sim.step)
+    expected = program(data)
+    compiled = program.lower(data).compile()
+    row = np.concatenate([np.ravel(getattr(data, name)) for name in (*STATE, "residue")])
+    for size in range(1, 3 + native._KEPT):
+        sim._on_step(np.tile(row, (size, 1)))
+    assert len(sim._batches) == native._KEPT
+    kept = [weakref.ref(sim), weakref.ref(next(iter(sim._batches.values())).batch)]
+    twin = copy.copy(sim)  # of the same name
+    del sim, program
+    jax.clear_caches()
+    gc.collect()
+    assert [ref() for ref in kept] == [None, None]
+    np.testing.assert_array_equal(compiled(data).qpos, expected.qpos)
+    del twin
+    with refuses("simulator", "no longer exists", error=(jax.errors.JaxRuntimeError, ValueError)):
+        jax.block_until_ready(compiled(data))

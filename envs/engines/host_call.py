@@ -1,13 +1,16 @@
 """NumPy functions that compiled JAX programs on a CPU look up by a name.
 
 `jax.pure_callback` puts a function's address into the program, which JAX therefore cannot keep for the next process. Here the
-program holds a name, through XLA's foreign function interface. The structs below are declared in xla/ffi/api/c_api.h, a stable
-binary interface.
+program holds a name, as an attribute of one call of XLA's foreign function interface. The structs below are declared in
+xla/ffi/api/c_api.h, a stable binary interface.
 """
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import threading
+import weakref
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -17,8 +20,9 @@ import numpy as np
 from mjx_dher.types import Array
 
 _Function = Callable[[np.ndarray], np.ndarray]  # inputs [..., m] -> outputs [..., n], float32
-_functions: dict[str, _Function] = {}
-_handlers: dict[str, Any] = {}  # C functions, which must not be freed
+_methods: dict[str, list[weakref.WeakMethod[_Function]]] = {}
+_lock = threading.Lock()
+_TARGET = "mjx_dher_host"
 _MAJOR, _MINOR = 0, 1  # of the interface that this is written for: later minor versions add to the ends of structs
 _METADATA, _EXECUTE = 1, 3
 _INTERNAL = 13  # error code
@@ -59,6 +63,14 @@ class _Buffers(_Struct):
     _fields_ = (("size", _int64), ("types", _pointer), ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))))
 
 
+class _Text(ctypes.Structure):
+    _fields_ = (("begin", _pointer), ("length", ctypes.c_size_t))
+
+
+class _Attributes(_Struct):
+    _fields_ = (("size", _int64), ("types", _pointer), ("names", _pointer), ("items", ctypes.POINTER(ctypes.POINTER(_Text))))
+
+
 class _Error(_Struct):
     _fields_ = (("message", ctypes.c_char_p), ("code", _int))
 
@@ -78,36 +90,50 @@ class _Frame(_Struct):
         ("stage", _int),
         ("arguments", _Buffers),
         ("results", _Buffers),
+        ("attributes", _Attributes),
     )
 
 
-_handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))
+def register(name: str, method: _Function) -> None:
+    """Makes a bound method available to programs as `name`, for as long as its object lives.
 
-
-def register(name: str, function: _Function) -> None:
-    """Makes `function` the one that programs call under `name`, instead of an earlier one.
-
-    It must use NumPy alone: calls of JAX in a callback could deadlock.
+    All methods of one name must compute the same. They must use NumPy alone: calls of JAX in a callback could deadlock.
     """
-    _functions[name] = function
-    if name not in _handlers:
-        _handlers[name] = _handler(lambda frame: _handle(name, frame.contents))
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.cast(_handlers[name], _pointer)), platform="cpu")
+    _register_target()
+    with _lock:
+        for key in [key for key, methods in _methods.items() if not any(each() for each in methods)]:
+            del _methods[key]
+        _methods[name] = [*_methods.get(name, ()), weakref.WeakMethod(method)]  # others may be reading the list before
 
 
 def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
-    """Calls the function registered under `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
+    """Calls the method registered under `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
 
-    Under `vmap` it is called once, with [..., m]. A program for another device than a CPU holds the function's address.
+    Under `vmap` it is called once, with [..., m]. A program for another device than a CPU is not kept for the next process.
     """
     result = jax.ShapeDtypeStruct(shape, np.float32)
-    inputs = inputs.astype(np.float32)  # which the function reads them as; JAX may compute in 64 bits
+    inputs = inputs.astype(np.float32)  # which the method reads them as; JAX may compute in 64 bits
     if jax.default_backend() != "cpu":
-        return jax.pure_callback(_functions[name], result, inputs, vmap_method="broadcast_all")
-    return jax.ffi.ffi_call(name, result, vmap_method="broadcast_all")(inputs)
+        return jax.pure_callback(functools.partial(_answer, name), result, inputs, vmap_method="broadcast_all")
+    return jax.ffi.ffi_call(_TARGET, result, vmap_method="broadcast_all")(inputs, name=name)
 
 
-def _handle(name: str, frame: Any) -> int | None:
+def _answer(name: str, inputs: np.ndarray) -> np.ndarray:
+    method = next(filter(None, (each() for each in _methods.get(name, ()))), None)
+    if method is None:
+        raise RuntimeError("the simulator that this program calls no longer exists; keep it for as long as the program")
+    return method(inputs)
+
+
+@functools.cache
+def _register_target() -> Any:
+    """Tells XLA of `_handle`. Returns the C function, which must not be freed."""
+    handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))(lambda frame: _handle(frame.contents))
+    jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(ctypes.cast(handler, _pointer)), platform="cpu")
+    return handler
+
+
+def _handle(frame: Any) -> int | None:
     """Answers a call of XLA with this version or the outputs. Returns None, or an error."""
     try:
         extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension))
@@ -115,13 +141,15 @@ def _handle(name: str, frame: Any) -> int | None:
             version = extension.contents.metadata.contents.version
             version.major, version.minor = _MAJOR, _MINOR
         elif frame.stage == _EXECUTE:
-            outputs, expected = _functions[name](_view(frame.arguments)), _view(frame.results)
+            name = frame.attributes.items[0].contents
+            text = ctypes.string_at(name.begin, name.length).decode()
+            outputs, expected = _answer(text, _view(frame.arguments)), _view(frame.results)
             if np.shape(outputs) != expected.shape:
                 raise ValueError(f"a function that JAX calls must give {list(expected.shape)}; it gives {np.shape(outputs)}")
             expected[...] = outputs
     except Exception as error:
-        text = f"{type(error).__name__}: {error}".encode()
-        described = _Error(ctypes.sizeof(_Error), None, text, _INTERNAL)
+        message = f"{type(error).__name__}: {error}".encode()
+        described = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
         return frame.api.contents.make_error(ctypes.byref(described))
     return None
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import copy
-import ctypes
 import dataclasses
-import functools
 import hashlib
 import math
-import os
 import threading
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,11 +15,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from mujoco.batch import DATA_FIELDS, Batch
+from mujoco.batch import Batch
 
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes
-from mjx_dher.lookup import check_name
+from mjx_dher.envs.engines.fields import LATE, derived_fields
 from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -35,7 +33,7 @@ class Data:
     `data.replace(ctrl=...)` to set a field.
     """
 
-    time: Array  # [] s
+    time: Array  # [] s; `residue` has what float32 leaves out
     qpos: Array  # [nq]
     qvel: Array  # [nv]
     act: Array  # [na]
@@ -49,13 +47,19 @@ class Data:
     mocap_quat: Array  # [nmocap, 4]
     userdata: Array  # [nuserdata]
     plugin_state: Array  # [npluginstate]
+    residue: Array  # [2, 1 + nhistory] what the float32 of `time` and `history` leaves out, in two parts; 0 if you set those
     derived: dict[str, Array]  # the fields of MjData that the simulator was asked for, with their shapes there
 
 
-_STATE = tuple(name for name in Data.__dataclass_fields__ if name != "derived")
+_STATE = tuple(name for name in Data.__dataclass_fields__ if name not in ("residue", "derived"))
+_EXACT = ("time", "history")  # float64 between steps, too: a time in float32 would stop, and delays with it
 # What `advance` passes: fields of `Physics` by MuJoCo's names, and the controls.
 _PHYSICS = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "act": "act"}
 _CONTROLS = ("ctrl", "mocap_pos", "mocap_quat")
+
+
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+_KEPT = 8  # batches of a simulator, of the sizes that were used last
 
 
 class _Views(NamedTuple):
@@ -64,6 +68,7 @@ class _Views(NamedTuple):
     batch: Batch
     inputs: list[np.ndarray]
     outputs: list[np.ndarray]
+    exact: list[np.ndarray]  # of `_EXACT`, each [nsim, n]; empty for `advance`
 
 
 class Simulator:
@@ -94,33 +99,32 @@ class Simulator:
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
             raise ValueError(f"model must be a mujoco.MjModel; got a {type(model).__name__}")
-        if isinstance(derived, str):
-            raise ValueError(f"derived must be a list of names; got {derived!r}")
         check_number("substeps", substeps, "[1, 1000000]")
         if num_threads is not None:
             check_number("num_threads", num_threads, "[1, 4096]")
-        for name in derived:
-            check_name("derived", name, sorted(set(DATA_FIELDS) - set(_STATE)))
         self._model = copy.copy(model)
         # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._substeps, self._derived = substeps, tuple(dict.fromkeys(derived))
+        if "energy" in derived:
+            self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
+        self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
         self._num_threads = num_threads or usable_cores()
         self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived)}"
         batch = Batch(self._model, 1, 1)
         self._shapes = {name: batch.bind(name).shape[1:] for name in (*_STATE, *self._derived)}
+        self._shapes["residue"] = (2, 1 + model.nhistory)
         self._begin()
 
     def _begin(self) -> None:
         self._batches: dict[tuple[bool, int], _Views] = {}
         self._lock = threading.Lock()  # a Batch serves one caller at a time
-        _drop_warnings()
-        for function in ("step", "forward", "advance"):
-            host_call.register(f"{self._name}_{function}", functools.partial(self._on_host, function))
+        self._lost, self._warned = 0, False  # timesteps that left out contacts since the last `check`
+        for function, method in (("step", self._on_step), ("forward", self._on_forward), ("advance", self._on_advance)):
+            host_call.register(f"{self._name}_{function}", method)
 
     def __getstate__(self) -> dict[str, Any]:
         """The state of a copy or pickle, without locks and batches, which cannot be copied."""
-        return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock")}
+        return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock", "_lost", "_warned")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -141,8 +145,14 @@ class Simulator:
             except (KeyError, IndexError, TypeError) as error:
                 raise ValueError(f"keyframe {keyframe!r} is none of the model's {self._model.nkey}; {error}") from error
             mujoco.mj_resetDataKeyframe(self._model, data, key)
+        for warning in data.warning:
+            warning.number = 1
         mujoco.mj_forward(self._model, data)
-        values = {name: np.asarray(getattr(data, name)).reshape(shape) for name, shape in self._shapes.items()}
+        self._note_lost(sum(data.warning[kind].number - 1 for kind in _FULL))
+        for compute in self._late():
+            compute(self._model, data)
+        values = {name: np.asarray(getattr(data, name)).reshape(self._shapes[name]) for name in (*_STATE, *self._derived)}
+        values["residue"] = _residue(np.concatenate([values[name].ravel() for name in _EXACT]))
         return self._data({name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
 
     def step(self, data: Data, ctrl: Array | None = None) -> Data:
@@ -174,24 +184,32 @@ class Simulator:
         return Physics(**{field: after[name] for name, field in _PHYSICS.items()})
 
     def check(self) -> None:
-        pass  # nothing goes wrong unnoticed
+        """Raises ValueError if contacts were lost since the last call, because they did not fit into the model's memory."""
+        with self._lock:
+            lost, self._lost = self._lost, 0
+        if lost:
+            raise ValueError(_lost_contacts(self._model, lost))
 
     def _update(self, function: str, data: Data) -> Data:
         if not isinstance(data, Data):
             raise ValueError(f"data must be a Data, as make_data gives it; got a {type(data).__name__}")
-        values = {name: getattr(data, name) for name in _STATE}
+        values = {name: getattr(data, name) for name in (*_STATE, "residue")}
         for name, value in values.items():
             check_shape(name, value, self._shapes[name])
         return self._data(self._call(function, values))
 
     def _data(self, values: dict[str, Array]) -> Data:
-        return Data(**{name: values[name] for name in _STATE}, derived={name: values[name] for name in self._derived})
+        state = {name: values[name] for name in (*_STATE, "residue")}
+        return Data(**state, derived={name: values[name] for name in self._derived})
+
+    def _late(self) -> list[Any]:
+        return list(dict.fromkeys(LATE[name] for name in self._derived if name in LATE))
 
     def _fields(self, function: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Returns the names of the fields that a function takes and returns, in the order of a packed row."""
         if function == "advance":
             return (*_PHYSICS, *_CONTROLS), tuple(_PHYSICS)
-        return _STATE, (*_STATE, *self._derived)
+        return (*_STATE, "residue"), (*_STATE, *self._derived, "residue")
 
     def _call(self, function: str, values: dict[str, Array]) -> dict[str, Array]:
         """Calls a function of the host: one array in and one out, because each costs the call some 20 microseconds."""
@@ -201,44 +219,102 @@ class Simulator:
         parts = jnp.split(host_call.call(f"{self._name}_{function}", (ends[-1],), row), ends[:-1])
         return {name: part.reshape(self._shapes[name]) for name, part in zip(outputs, parts, strict=True)}
 
+    def _on_step(self, packed: Any) -> np.ndarray:
+        return self._on_host("step", packed)
+
+    def _on_forward(self, packed: Any) -> np.ndarray:
+        return self._on_host("forward", packed)
+
+    def _on_advance(self, packed: Any) -> np.ndarray:
+        return self._on_host("advance", packed)
+
     def _on_host(self, function: str, packed: Any) -> np.ndarray:
         """Computes a function for `packed` [..., row]."""
         rows = np.asarray(packed).reshape(-1, packed.shape[-1])
-        with self._lock:
-            batch, inputs, outputs = self._views(function, len(rows))
+        with self._lock, np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blew up
+            views = self._views(function, len(rows))
             begin = 0
-            for view in inputs:
+            for view in views.inputs:
                 end = begin + math.prod(view.shape[1:])
                 view[...] = rows[:, begin:end].reshape(view.shape)
                 begin = end
+            _add(views.exact, rows[:, begin:])
             if function == "forward":
-                batch.forward()
+                views.batch.forward()
             else:
-                batch.step(nstep=self._substeps)
-            with np.errstate(over="ignore"):  # of a simulation that blew up
-                columns = [view.reshape(len(rows), -1) for view in outputs]
-                result = np.concatenate(columns, axis=1, dtype=np.float32)
+                views.batch.step(nstep=self._substeps)
+            self._note_lost(int((views.batch.warning[:, _FULL, 1] - 1).sum()))
+            views.batch.warning[..., 1] = 1
+            columns = [view.reshape(len(rows), -1) for view in self._results(function, views)]
+            result = np.concatenate(columns, axis=1, dtype=np.float32)
         return result.reshape(*packed.shape[:-1], -1)
+
+    def _results(self, function: str, views: _Views) -> list[np.ndarray]:
+        """Returns the fields of a row that a function returns, each [nsim, ...]."""
+        outputs = list(views.outputs)
+        if views.exact:
+            outputs.append(_residue(np.concatenate(views.exact, axis=1)))
+        late = [name for name in self._derived if name in LATE and math.prod(self._shapes[name])]
+        if function == "advance" or not late:
+            return outputs
+        functions, data = self._late(), mujoco.MjData(self._model)
+        names = [name for name in self._fields(function)[1] if math.prod(self._shapes[name])]
+        filled = {name: np.empty((views.batch.nsim, *self._shapes[name])) for name in late}
+        for index in range(views.batch.nsim):
+            views.batch.get_data(index, data)
+            for compute in functions:
+                compute(self._model, data)
+            for name in late:
+                filled[name][index] = getattr(data, name)
+        return [filled.get(name, output) for name, output in zip(names, outputs, strict=True)]
+
+    def _note_lost(self, lost: int) -> None:
+        """Notes timesteps that left out contacts, and warns the first time."""
+        self._lost += lost
+        if lost and not self._warned:
+            self._warned = True
+            warnings.warn(_lost_contacts(self._model, lost), stacklevel=2)
 
     def _views(self, function: str, nsim: int) -> _Views:
         key = function == "advance", nsim  # what `advance` does not write must stay as it was made: it has its own batches
-        if key not in self._batches:
-            batch = Batch(self._model, nsim, self._num_threads)
-            inputs, outputs = (
-                [batch.bind(name) for name in names if math.prod(self._shapes[name])] for names in self._fields(function)
-            )
-            self._batches[key] = _Views(batch, inputs, outputs)
-        return self._batches[key]
+        views = self._batches.pop(key, None) or self._made(function, nsim)
+        self._batches[key] = views
+        if len(self._batches) > _KEPT:
+            del self._batches[next(iter(self._batches))]
+        return views
+
+    def _made(self, function: str, nsim: int) -> _Views:
+        persistent = function != "advance" and bool(self._late())
+        batch = Batch(self._model, nsim, self._num_threads, persistent)
+        batch.warning[..., 1] = 1  # MuJoCo writes MUJOCO_LOG.TXT when a number of warnings leaves 0
+        inputs, outputs = (
+            [batch.bind(name) for name in names if name != "residue" and math.prod(self._shapes[name])]
+            for names in self._fields(function)
+        )
+        exact = [] if function == "advance" else [batch.bind(name).reshape(nsim, -1) for name in _EXACT]
+        return _Views(batch, inputs, outputs, exact)
 
 
-def _drop_warnings() -> None:
-    """Keeps MuJoCo from writing MUJOCO_LOG.TXT into the current folder: a simulation that blows up shows in its state.
+def _residue(values: np.ndarray) -> np.ndarray:
+    """Returns what the float32 of `values` [..., n] leaves out, as two parts [..., 2, n] that are float32 numbers."""
+    first = values - values.astype(np.float32)
+    return np.stack([first, first - first.astype(np.float32)], axis=-2)
 
-    The callback is a function of C. MuJoCo's threads would have to wait for one of Python.
-    """
-    if os.name == "posix" and mujoco.get_mju_user_warning() is None:
-        ignore = ctypes.CFUNCTYPE(None, ctypes.c_char_p)(("strlen", ctypes.CDLL(None)))
-        mujoco.set_mju_user_warning(ignore)
+
+def _add(exact: list[np.ndarray], residue: np.ndarray) -> None:
+    """Adds `residue` [nsim, 2 n] to fields [nsim, n in all] where it belongs to their values."""
+    parts = residue.reshape(len(residue), 2, -1).astype(np.float64).sum(axis=1) if exact else residue
+    for view in exact:
+        part, parts = parts[:, : view.shape[1]], parts[:, view.shape[1] :]
+        whole = view + part
+        view[...] = np.where(whole.astype(np.float32) == view, whole, view)
+
+
+def _lost_contacts(model: mujoco.MjModel, lost: int) -> str:
+    return (
+        f"MuJoCo left out contacts or other constraints {lost} times, because the model's memory is too small"
+        f' ({model.narena:,} bytes): give it more, such as <size memory="{max(1, 4 * model.narena // 2**20)}M"/>'
+    )
 
 
 def _digest(model: mujoco.MjModel, *settings: Any) -> str:

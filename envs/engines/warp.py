@@ -7,6 +7,7 @@ Only the state goes in and out; `mjx.step` would pass some 170 arrays from Warp 
 import concurrent.futures
 import copy
 import threading
+import weakref
 from typing import Any
 
 import jax
@@ -81,6 +82,7 @@ class WarpEngine:
 
     def _jax_callable(self) -> Any:
         """Makes a JAX function that advances a batch and allocates the batch's memory on its first call."""
+        engine = weakref.ref(self)  # Warp keeps the function for ever
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -91,9 +93,11 @@ class WarpEngine:
             qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
             warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
         ):
-            self._wait()
-            with self._lock:
-                self._simulation(qpos.device, qpos.shape[0]).advance(
+            if (me := engine()) is None:
+                raise RuntimeError("the engine that this program calls no longer exists; keep it for as long as the program")
+            me._wait()
+            with me._lock:
+                me._simulation(qpos.device, qpos.shape[0]).advance(
                     (qpos, qvel, warmstart), inputs, (qpos_out, qvel_out, warmstart_out)
                 )
 

@@ -61,7 +61,7 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
     return _compile(name, tuple(sorted(options.items())))
 
 
-@functools.cache
+@functools.lru_cache(maxsize=16)  # an environment holds its own for as long as it lives
 def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 
