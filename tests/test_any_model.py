@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher.envs import Simulator
 from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines import mjx as mjx_engine
 
 SUBSTEPS = 10
 
@@ -122,6 +124,22 @@ def test_what_an_engine_cannot_do_is_rejected_when_it_is_made():
     cylinder = arm().replace('type="box" size=".02 .02 .04"', 'type="cylinder" size=".02 .04" contype="1"')
     with pytest.raises(ValueError, match=r"engine jax: MJX .*CYLINDER.*; use engine native"):
         make_engine("jax", mujoco.MjModel.from_xml_string(cylinder), SUBSTEPS)
+
+
+def test_what_mjx_ignores_is_rejected_with_the_element():
+    for name in mjx_engine._IGNORED:
+        model = mujoco.MjModel.from_xml_string(arm())
+        holder, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
+        if np.ndim(getattr(holder, field)):
+            getattr(holder, field)[:1] = 1
+        else:
+            setattr(holder, field, 1)
+        if np.size(getattr(holder, field)):  # it has no tendons and no pairs
+            with pytest.raises(ValueError, match=r"engine jax.*; use engine native"):
+                make_engine("jax", model, SUBSTEPS)
+    model.actuator_armature[1] = 1
+    with refuses("engine", "jax", "actuator_armature", "actuator 1"):
+        make_engine("jax", model, SUBSTEPS)
 
 
 def test_arrays_of_another_shape_are_rejected():

@@ -1,5 +1,7 @@
 """The kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,11 +12,13 @@ from conftest import refuses
 from mjx_dher import envs
 from mjx_dher.envs import engines
 from mjx_dher.envs.engines.base import Controls, Physics
+from mjx_dher.envs.engines.features import fields
 from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
-from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps, unsupported
+from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps
+from mjx_dher.envs.engines.fused.support import has_default, is_read, unsupported
 from mjx_dher.system.warp_setup import wp
 
 TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
@@ -179,38 +183,88 @@ contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" conty
 <equality><weld body1="t" body2="b" relpose="0 0 0 1 0 0 0"/></equality>
 <contact><pair geom1="g" geom2="o" condim="{}"/></contact></mujoco>
 """
-MOTOR = '<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'
 
 
-def test_unsupported_features_are_named():
+def welded(extra="", shape="box", condim=3):
+    return mujoco.MjModel.from_xml_string(WELDED.format(extra, shape, condim))
+
+
+def test_unsupported_features_are_named_with_their_elements():
+    motor = '<actuator><general name="m" joint="j" {}/></actuator>'
     cases = [
-        (WELDED.format("", "sphere", 3), "contacts other than of boxes and cylinders with boxes and planes"),
-        (WELDED.format("", "box", 6), "contacts with rolling friction"),
-        (WELDED.format("", "cylinder", 3), "contacts of cylinders and boxes without nativeccd=disable"),
-        (WELDED.format('<option integrator="implicitfast"/>', "box", 3), "an integrator other than Euler"),
-        (WELDED.format('<option cone="elliptic"/>', "box", 3), "elliptic friction cones"),
-        (WELDED.format('<option><flag gravity="disable"/></option>', "box", 3), "options disabled or enabled"),
-        (WELDED.format('<option density="1.2"/>', "box", 3), "a medium"),
-        (WELDED.format('<default><joint frictionloss="1"/></default>', "box", 3), "friction in joints"),
-        (WELDED.format('<default><joint stiffness="1 2"/></default>', "box", 3), "springs or damping that are not linear"),
-        (WELDED.format('<default><joint actuatorfrcrange="-1 1"/></default>', "box", 3), "limits of joint torques"),
-        (WELDED.format('<option noslip_iterations="3"/>', "box", 3), "noslip iterations"),
-        (WELDED.format('<sensor><jointpos joint="j"/></sensor>', "box", 3), "sensors"),
-        (
-            WELDED.format('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>', "box", 3),
-            "actuators other",
-        ),
-        ("<mujoco/>", "equality constraints other than exactly one weld"),
+        (welded(shape="sphere"), ["contacts of sphere and box", "'g'", "'o'"]),
+        (welded(condim=6), ["rolling friction", "'g'"]),
+        (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
+        (welded('<option integrator="implicitfast"/>'), ["integrator"]),
+        (welded('<option cone="elliptic"/>'), ["elliptic"]),
+        (welded('<option solver="CG"/>'), ["solver"]),
+        (welded('<option><flag gravity="disable"/></option>'), ["options disabled"]),
+        (welded('<option density="1.2"/>'), ["medium"]),
+        (welded('<default><joint frictionloss="1"/></default>'), ["friction in joints", "'j'"]),
+        (welded('<default><joint stiffness="1 2"/></default>'), ["springs", "'j'"]),
+        (welded('<default><joint actuatorfrcrange="-1 1"/></default>'), ["limits of joint torques", "'j'"]),
+        (welded('<option noslip_iterations="3"/>'), ["noslip"]),
+        (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints"]),
+        (welded(motor.format('dyntype="filter"')), ["activations", "actuators with a state", "'m'"]),
+        (welded(motor.format('delay="0.006" nsample="4"')), ["delays", "'m'"]),
+        (welded(motor.format('gear="-1"')), ["backwards", "'m'"]),
+        (mujoco.MjModel.from_xml_string("<mujoco/>"), ["exactly one weld"]),
     ]
-    for model, what in cases:
-        assert any(name.startswith(what) for name in unsupported(mujoco.MjModel.from_xml_string(model))), what
-    assert unsupported(mujoco.MjModel.from_xml_string(WELDED.format("", "box", 3))) == []
+    for model, parts in cases:
+        for part in parts:
+            assert part in " ".join(unsupported(model)), part
+    assert unsupported(welded()) == []
+    assert unsupported(welded('<sensor><jointpos joint="j"/></sensor>')) == []  # nobody reads it
+    for task in ("reach", "push", "slide", "pick_and_place"):
+        assert unsupported(envs.make(task, engine="native").model) == []
+
+
+class Recorded:
+    """A model, or its options, that notes which fields are read."""
+
+    def __init__(self, held, seen, prefix=""):
+        self._held, self._seen, self._prefix = held, seen, prefix
+
+    def __getattr__(self, name):
+        value = getattr(self._held, name)
+        if name in ("opt", "stat"):
+            return Recorded(value, self._seen, f"{name}.")
+        self._seen.add(self._prefix + name)
+        return value
+
+
+def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
+    """A field that a newer MuJoCo adds, too."""
+    seen = set()
+    model = envs.make("slide", engine="native").model
+    recorded = Recorded(model, seen)
+    contacts, dofs = setup.contacts_of(recorded), setup.dofs_of(recorded)
+    setup.bodies_of(recorded)
+    setup.layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs)
+    read = {name for name, _ in fields(model) if is_read(name)}
+    assert read - seen == {"opt.disableflags", "actuator_biastype", "eq_data"}  # which decide whether a model is taken
+    assert seen - read <= {"stat.meaninertia"}  # which follows from the masses
+    model = welded('<actuator><motor name="m" joint="j"/></actuator>')
+    checked = [name for name, _ in fields(model) if has_default(name)]
+    assert len(checked) > 40
+    assert {"jnt_actfrclimited", "geom_surfacevel", "actuator_armature", "pair_solreffriction", "opt.disableactuator"} <= {
+        *checked
+    }
+    for name in checked:
+        if name in ("na", "nflex", "nhistory", "nplugin", "ntendon"):
+            continue  # cannot be set
+        changed = copy.copy(model)
+        holder, field = (changed.opt, name[4:]) if name.startswith("opt.") else (changed, name)
+        if np.ndim(value := getattr(holder, field)):
+            value[...] = np.where(value == 1, 0, 1)
+        else:
+            setattr(holder, field, value + 1)
+        assert unsupported(changed), name
 
 
 def test_an_unsupported_model_is_rejected():
-    model = mujoco.MjModel.from_xml_string(WELDED.format("", "sphere", 3))
     with refuses("engine", "warp", "native"):
-        engines.make_engine("warp", model, 20, allow_cpu=True)
+        engines.make_engine("warp", welded(shape="sphere"), 20, allow_cpu=True)
 
 
 def test_most_rows_are_what_all_pairs_can_give_at_once():

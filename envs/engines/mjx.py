@@ -14,12 +14,21 @@ import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
+from mjx_dher.envs.engines.features import beyond_defaults
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
 from mjx_dher.validation import check_count
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx
+
+
+# Fields of MjModel that MJX 3.17 ignores without an error.
+_IGNORED = (
+    *("opt.noslip_iterations", "opt.disableactuator", "actuator_armature", "actuator_damping", "actuator_dampingpoly"),
+    *("actuator_actearly", "dof_dampingpoly", "jnt_stiffnesspoly", "tendon_dampingpoly", "tendon_stiffnesspoly"),
+    *("geom_surfacevel", "geom_adhesion", "geom_fluid", "geom_gap", "pair_gap", "pair_adhesion"),
+)
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -138,6 +147,8 @@ class MjxEngine:
     def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5):
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
+        if ignored := beyond_defaults(model, _IGNORED.__contains__):
+            raise ValueError(f"engine jax: MJX ignores features of the model: {', '.join(ignored)}; use engine native")
         model = with_stand_ins(model)
         _grow_for_margins(model)
         model.opt.iterations = iterations

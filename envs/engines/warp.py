@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
-from mjx_dher.envs.engines.fused import simulation
+from mjx_dher.envs.engines.fused import simulation, support
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import load, prepare, wp
 from mjx_dher.validation import check_count
@@ -28,7 +28,7 @@ class WarpEngine:
     in which threads finish.
 
     Args:
-      model: the compiled MJCF; `fused.simulation.unsupported` lists the features that it must not have.
+      model: the compiled MJCF; `fused.support.unsupported` lists the features that it must not have.
       substeps: MuJoCo timesteps an environment step.
       iterations: maximum Newton iterations of the constraint solver; each environment stops by itself, most after one or two.
       ls_iterations: maximum steps of the solver's line search.
@@ -53,7 +53,7 @@ class WarpEngine:
         prepare()
         if not allow_cpu:
             _check_gpu()
-        if left_out := simulation.unsupported(model):
+        if left_out := support.unsupported(model):
             raise ValueError(f"engine warp does not support features of the model: {', '.join(left_out)}; use engine native")
         self.most_constraints = simulation.most_rows(model)
         self._constraints = self.most_constraints if constraints is None else constraints

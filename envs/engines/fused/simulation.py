@@ -3,7 +3,6 @@
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from mjx_dher.envs.engines.fused import kernel, setup
 from mjx_dher.system.warp_setup import load, wp
@@ -81,71 +80,3 @@ def most_warps(size: int, shared: int) -> int:
 def most_rows(model: mujoco.MjModel) -> int:
     """The most constraint rows that an environment can have."""
     return int(setup.world_of(model, setup.contacts_of(model), 10**6).rows)
-
-
-# Model features by name -> whether a model has them.
-_OLDER_CCD = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the flag of the older algorithm for convex shapes, which this one has
-_KNOWN_FLAGS = _OLDER_CCD | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # the solver has no islands
-_KNOWN_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
-
-
-def unsupported(model: mujoco.MjModel) -> list[str]:
-    """Names of the model's features that the fused kernel does not support."""
-    opt, scalar = model.opt, np.isin(model.jnt_type, [int(joint) for joint in _KNOWN_JOINTS[:2]])
-    features = {
-        "an integrator other than Euler": opt.integrator != mujoco.mjtIntegrator.mjINT_EULER,
-        "elliptic friction cones": opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "options disabled or enabled": opt.disableflags & ~_KNOWN_FLAGS or opt.enableflags,
-        "tendons": model.ntendon,
-        "flexes": model.nflex,
-        "sensors": model.nsensor,
-        "plugins": model.nplugin,
-        "a medium": opt.density or opt.viscosity or np.any(opt.wind),
-        "gravity compensation": np.any(model.body_gravcomp),
-        "ball joints": not np.all(np.isin(model.jnt_type, [int(joint) for joint in _KNOWN_JOINTS])),
-        "bodies with several joints": np.any(model.body_jntnum > 1),
-        "springs of free joints": np.any(model.jnt_stiffness[~scalar]),
-        "springs or damping that are not linear": np.any(model.jnt_stiffnesspoly) or np.any(model.dof_dampingpoly),
-        "friction in joints": np.any(model.dof_frictionloss),
-        "limits of free joints": np.any(model.jnt_limited[~scalar]),
-        "limits of joint torques": np.any(model.jnt_actfrclimited),
-        "delays": model.nhistory,
-        "noslip iterations": opt.noslip_iterations,
-        "more than 31 degrees of freedom": model.nv > 31,
-        "equality constraints other than exactly one weld of a mocap body": not _has_plain_weld(model),
-        "actuators other than on joints, affine and without a state": not _has_plain_actuators(model),
-        **_contact_features(model),
-    }
-    return [name for name, present in features.items() if present]
-
-
-def _has_plain_weld(model: mujoco.MjModel) -> bool:
-    """Whether the only equality constraint welds the only mocap body to another body with the same frame."""
-    if model.neq != 1 or model.nmocap != 1 or model.eq_type[0] != mujoco.mjtEq.mjEQ_WELD or not model.eq_active0[0]:
-        return False
-    bodies = model.eq_objtype[0] == mujoco.mjtObj.mjOBJ_BODY and model.body_mocapid[model.eq_obj1id[0]] == 0
-    return bool(bodies and np.allclose(model.eq_data[0, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]))
-
-
-def _has_plain_actuators(model: mujoco.MjModel) -> bool:
-    joints = model.actuator_trnid[:, 0]
-    return bool(
-        np.all(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
-        and np.all(np.isin(model.jnt_type[joints], [int(joint) for joint in _KNOWN_JOINTS[:2]]))
-        and np.all(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
-        and np.all(np.isin(model.actuator_biastype, [int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)]))
-        and np.all(model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE))
-        and np.all(model.actuator_gear[:, 0] > 0)
-    )
-
-
-def _contact_features(model: mujoco.MjModel) -> dict[str, Any]:
-    kinds = [setup.pair_types(model, *pair) for pair in zip(model.pair_geom1, model.pair_geom2)]
-    return {
-        "contacts of geoms that no pair lists": np.any(model.geom_contype) and np.any(model.geom_conaffinity),
-        "contacts other than of boxes and cylinders with boxes and planes": set(kinds) - set(setup.CONTACT_KINDS),
-        "contacts of cylinders and boxes without nativeccd=disable": ("CYLINDER", "BOX") in kinds
-        and not model.opt.disableflags & _OLDER_CCD,
-        "contacts with rolling friction": np.any(model.pair_dim > 4),
-        "contacts with a gap or adhesion": np.any(model.pair_gap) or np.any(model.pair_adhesion),
-    }

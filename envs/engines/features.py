@@ -1,0 +1,99 @@
+"""Fields of MuJoCo's MjModel that an engine leaves out, and so must have their defaults."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+_WORDS = {
+    "opt.integrator": "an integrator other than Euler",
+    "opt.cone": "elliptic friction cones",
+    "opt.solver": "a solver other than Newton's",
+    "opt.enableflags": "options enabled",
+    "opt.density": "a medium",
+    "opt.viscosity": "a medium",
+    "opt.noslip_iterations": "noslip iterations",
+    "opt.disableactuator": "disabled groups of actuators",
+    "ntendon": "tendons",
+    "nflex": "flexes",
+    "nplugin": "plugins",
+    "nhistory": "delays",
+    "na": "activations",
+    "actuator_dyntype": "actuators with a state",
+    "actuator_trntype": "actuators that are not on joints",
+    "actuator_gaintype": "actuators whose gain varies",
+    "actuator_delay": "delays",
+    "body_gravcomp": "gravity compensation",
+    "dof_frictionloss": "friction in joints",
+    "dof_dampingpoly": "damping that is not linear",
+    "jnt_stiffnesspoly": "springs that are not linear",
+    "jnt_actfrclimited": "limits of joint torques",
+    "pair_gap": "contacts with a gap",
+    "pair_solreffriction": "contacts with a softness of friction",
+}
+_NEUTRAL = """
+<mujoco><worldbody><body name="t" mocap="true"/><body name="b"><joint name="j"/><geom name="g" size="1"/></body>
+<geom name="h" size="1"/></worldbody><equality><weld body1="t" body2="b"/></equality>
+<contact><pair geom1="g" geom2="h"/></contact><tendon><fixed><joint joint="j" coef="1"/></fixed></tendon>
+<actuator><motor joint="j"/></actuator></mujoco>
+"""  # an element of each kind, with its defaults
+
+
+def fields(model: mujoco.MjModel) -> Iterator[tuple[str, Any]]:
+    """Names and values of a model's fields, and of its options as `opt.NAME`."""
+    for prefix, holder in (("", model), ("opt.", model.opt)):
+        for name in dir(holder):
+            if not name.startswith("_") and name != "opt" and not callable(value := getattr(holder, name)):
+                yield prefix + name, value
+
+
+@functools.cache
+def _defaults() -> dict[str, Any]:
+    """Defaults of fields: one element's for a field that each element of its kind has."""
+    per_element = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "pair_", "tendon_")
+    values = dict(fields(mujoco.MjModel.from_xml_string(_NEUTRAL)))
+    # The world's body comes first, and the actuator's default pushes its joint.
+    return {
+        name: value[0] if name.startswith(per_element) else 0 if _is_count(name) else value for name, value in values.items()
+    }
+
+
+def _is_count(name: str) -> bool:
+    return name.startswith("n") and name.islower() and "." not in name
+
+
+def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> list[str]:
+    """Features of a model whose fields do not have their defaults, with the elements that have them.
+
+    Args:
+      model: the compiled MJCF.
+      concerns: whether a field, by its name, is looked at.
+    """
+    found = []
+    defaults = _defaults()
+    for name, value in fields(model):
+        if not concerns(name):
+            continue
+        words, default = _WORDS.get(name, name), defaults.get(name)
+        if default is None or np.ndim(value) == np.ndim(default):
+            if default is None or not np.array_equal(value, default):
+                found.append(words)
+        elif np.any(different := value != default):
+            found.append(with_names(words, model, name.split("_")[0], np.unique(np.nonzero(different)[0])))
+    return list(dict.fromkeys(found))
+
+
+def with_names(what: str, model: mujoco.MjModel, kind: str, indices: Any) -> str:
+    """Returns `what` followed by names of elements, or by their numbers if they have none."""
+    if kind == "dof":
+        kind, indices = "jnt", np.unique(model.dof_jntid[indices])
+    if kind == "pair":
+        kind, indices = "geom", np.unique([model.pair_geom1[indices], model.pair_geom2[indices]])
+    word = {"jnt": "joint", "eq": "equality"}.get(kind, kind)
+    names = [getattr(model, word)(int(index)).name for index in indices]
+    shown = [repr(name) if name else f"{word} {index}" for name, index in zip(names, indices)]
+    return f"{what} ({', '.join([*shown[:5], '...'] if len(shown) > 5 else shown)})"
