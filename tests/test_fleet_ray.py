@@ -104,6 +104,33 @@ def test_nodes_with_another_version_or_storage_of_their_own_are_refused(bench, t
         assert "must have the driver's code: version of mjx_dher is 0.0." in told
 
 
+def test_local_listens_on_loopback_alone_and_keeps_strangers_out():
+    """Every listening socket of Ray's processes, and their folder; a caller without the token of this run."""
+    pytest.importorskip("ray")
+    pytest.importorskip("psutil")
+    code = """
+import os, pathlib, re, subprocess, sys
+from mjx_dher.fleet import cluster
+with cluster.joined("local", None) as here:
+    here.look(False)  # a worker has started
+    import ray, psutil
+    assert ray.nodes()[0]["NodeManagerAddress"] == "127.0.0.1"
+    family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    listening = [c.laddr for p in family for c in p.net_connections() if c.status == "LISTEN"]
+    assert len(listening) > 4
+    assert {place.ip for place in listening} <= {"127.0.0.1", "::ffff:127.0.0.1"}, listening
+    folder = pathlib.Path(ray._private.worker._global_node.get_temp_dir_path()).parent
+    assert folder.stat().st_mode & 0o77 == 0
+    call = f"import ray; ray.init(address='{ray.get_runtime_context().gcs_address}')"
+    environment = {k: v for k, v in os.environ.items() if k != "RAY_AUTH_TOKEN"} | {"HOME": str(folder / "nobody")}
+    stranger = subprocess.run([sys.executable, "-c", call], env=environment, capture_output=True, text=True)
+    assert stranger.returncode and "uthentic" in stranger.stderr, stranger.stderr
+assert not folder.exists()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.returncode == 0, ended.stderr
+
+
 def test_an_address_where_something_else_answers_is_refused_within_seconds(bench, tmp_path, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as server:
         told = refused(bench, tmp_path / "a", "--ray", f"127.0.0.1:{server.getsockname()[1]}", seconds=40)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import secrets
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,21 +72,25 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
       ValueError: there is no such cluster, this machine is not part of it, or the code cannot be sent.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if address != LOCAL:
-        _check_answers(address)
-    import ray
+    options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
+    with contextlib.ExitStack() as stack:
+        if address == LOCAL:
+            private = stack.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True))
+            place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
+            options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}
+            # Ray then listens on 127.0.0.1 alone, and only processes with this token can call it.
+            os.environ.update({"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"})
+            os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        else:
+            _check_answers(address)
+        import ray
 
-    runtime: dict[str, Any] = {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}
-    options: dict[str, Any] = {"include_dashboard": False, "object_store_memory": STORE_BYTES} if address == LOCAL else {}
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=runtime, **options)
-    except Exception as error:  # Ray raises errors of many kinds
-        ray.shutdown()
-        raise ValueError(f"ray: the cluster at {address} cannot be joined ({_first_line(error)})") from error
-    try:
+        stack.callback(ray.shutdown)
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+        except Exception as error:  # Ray raises errors of many kinds
+            raise ValueError(f"ray: the cluster at {address} cannot be joined ({_first_line(error)})") from error
         yield Cluster()
-    finally:
-        ray.shutdown()
 
 
 def _check_answers(address: str) -> None:
