@@ -81,6 +81,11 @@ def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict
 _MEMBERS = ("action_size", "episode_length", "reset", "step", "compute_reward")  # of types.Env
 
 
+def takes_engine(name: str) -> bool:
+    """Whether the constructor of an environment, as `make` finds it, has the argument `engine`."""
+    return _takes_engine(load("env", name))
+
+
 def _takes_engine(constructor: Callable[..., Any]) -> bool:
     parameters = inspect.signature(constructor).parameters.values()
     return any(parameter.name == "engine" or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import HParams
+from mjx_dher.contract import STEP_SECONDS, step_seconds
 from mjx_dher.types import Array, Batch, DistanceFn, PyTree, ReachedFn, RewardFn
 
 _ROWS_AT_ONCE = 256  # episodes that `of_each_episode` computes at a time: their activations need memory
@@ -45,6 +46,7 @@ class Context(NamedTuple):
     ends_at_goal: bool = False  # whether reaching the goal ends an episode
     reached_fn: ReachedFn | None = None  # the environment's own `reached`
     goal_distance: DistanceFn = euclidean
+    dt: float = STEP_SECONDS  # s that a step takes
     progress: Array | float = 0.0  # [] share of the run's updates that have been made
     values: Values | None = None  # for a method that says `uses_values`, else None
 
@@ -72,7 +74,8 @@ def of_env(env: Any, hparams: HParams, **fields: Any) -> Context:
     if spec is not None:
         fields = {"reward_range": spec.reward_range, "ends_at_goal": spec.ends_at_goal, **fields}
     distance = getattr(env, "goal_distance", euclidean)
-    return Context(env.compute_reward, hparams, reached_fn=getattr(env, "reached", None), goal_distance=distance, **fields)
+    fields = {"dt": step_seconds(env), "reached_fn": getattr(env, "reached", None), "goal_distance": distance, **fields}
+    return Context(env.compute_reward, hparams, **fields)
 
 
 def reached_fn(env: Any) -> ReachedFn:

@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.types import Env, EnvSpec, Episode, check_size
+from mjx_dher.validation import check_number
 
+STEP_SECONDS = 0.04  # s, of an environment without `dt`
 FLAGS = ("failed", "done", "terminal")  # optional fields of a state, [] bool
 
 
@@ -73,6 +75,13 @@ def check_env_parts(env: Any) -> None:
             raise ValueError(f"an environment has reset, step and compute_reward; {env!r} has no {name}")
     for name in ("action_size", "episode_length"):
         check_size(name, getattr(env, name, None))
+
+
+def step_seconds(env: Any) -> float:
+    """Seconds that a step of `env` takes in real time: its `dt`, or 0.04. Raises ValueError for a `dt` out of range."""
+    dt = getattr(env, "dt", STEP_SECONDS)
+    check_number("dt", dt, "(0, 3600]", float)
+    return float(dt)
 
 
 def check_first(state: Any, leading: tuple[int, ...]) -> None:

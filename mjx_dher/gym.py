@@ -1,21 +1,19 @@
 """Gymnasium environments of the tasks: single ones by `gymnasium.make`, vectorised ones by `gymnasium.make_vec`.
 
     gymnasium.make("mjx_dher.gym:mjx_dher/FetchPush-v0")
+    gymnasium.make("mjx_dher.gym:mjx_dher/Env-v0", name="my_module:MyTask")
 
 Importing this module registers them. It loads neither JAX nor MuJoCo; making an environment does.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections import deque
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mjx_dher.lookup import check_name, missing_extra
-from mjx_dher.tools import render
 from mjx_dher.tools.gym_cache import Programs, programs
 from mjx_dher.validation import check_count
 
@@ -24,14 +22,16 @@ try:
     from gymnasium.utils import seeding
     from gymnasium.vector import AutoresetMode
     from gymnasium.vector.utils import batch_space
+    from gymnasium.wrappers import TimeLimit
 except ImportError as error:
     raise ImportError(f"{missing_extra('mjx_dher.gym', 'gymnasium 1.1 or newer', 'gym')} ({error})") from error
 
 if TYPE_CHECKING:
     from mjx_dher.envs import State
+    from mjx_dher.tools.render import Painter
     from mjx_dher.types import EnvSpec
 
-__all__ = ["IDS", "GymEnv", "GymVectorEnv", "episode_seed"]
+__all__ = ["ENV_ID", "IDS", "GymEnv", "GymVectorEnv", "episode_seed", "make_custom"]
 
 IDS = {
     "mjx_dher/FetchPush-v0": "push",
@@ -39,6 +39,7 @@ IDS = {
     "mjx_dher/FetchSlide-v0": "slide",
     "mjx_dher/FetchReach-v0": "reach",
 }
+ENV_ID = "mjx_dher/Env-v0"  # of any environment: its `name` is an argument
 HORIZON = 50  # steps; the tasks' default episode_length, which cannot be read without loading JAX
 PICTURE = 480  # width and height of a picture, pixels
 
@@ -101,7 +102,7 @@ class _GoalApi:
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
     """A single environment. `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
 
-    Observations are float32, as the state is. Actions outside [-1, 1] are clipped.
+    Observations are float32, as the state is. Actions outside [-1, 1] are clipped. A copy or a pickle opens its own renderer.
 
     Args:
       name: one of `envs.list_envs()`, or module:attribute.
@@ -109,23 +110,23 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
       **options: arguments of `envs.make`: `engine`, `reward_type`, ...
 
     Raises:
-      ValueError: as for `envs.make`, or the environment cannot be drawn, at all or on this machine.
+      ValueError: as for `envs.make`.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": render.FPS}  # noqa: RUF012 - gymnasium's
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - gymnasium's
 
     def __init__(self, name: str, render_mode: str | None = None, **options: Any):
         if render_mode is not None:
             check_name("render_mode", render_mode, ("rgb_array",))
-            render.choose_gl()
         self._compiled = programs(name, options)
-        if render_mode is not None:
-            render.check_drawable(self._compiled.env)
+        self.metadata = {**self.metadata, "render_fps": self._compiled.fps}
         self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self._compiled.spec)
         self._state: Any = None
-        self._qpos: deque[np.ndarray] = deque()  # configurations to be drawn
-        self._pictures: Generator[np.ndarray] | None = None  # renderer of this episode
+        self._painter: Painter | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_painter": None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Starts an episode; returns its first observation and info, with `is_success` as in `step`.
@@ -136,7 +137,6 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
         self._compiled.check()
-        self.close()
         self._state = self._compiled.reset(episode_seed(self.np_random))
         obs, _, info = _to_numpy(self._state)
         return obs, {key: value.item() for key, value in info.items()}
@@ -157,30 +157,35 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return obs, reward.item(), terminated, truncated, {key: value.item() for key, value in info.items()}
 
     def render(self) -> np.ndarray:
-        """Draws a picture [480, 480, 3] uint8 of the state, with the goal as a red ball.
+        """Draws a picture [480, 480, 3] uint8 of the state, with the goal as a red ball. The first call opens a renderer.
 
         Raises:
-          ValueError: the environment was made without render_mode="rgb_array".
+          ValueError: the environment was made without render_mode="rgb_array", or cannot be drawn, at all or on this machine.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self.render_mode is None:
             raise ValueError('to be drawn, an environment must be made with render_mode="rgb_array"')
         if self._state is None:
             raise gymnasium.error.ResetNeeded("reset must be called before render")
-        if self._pictures is None:
-            # One renderer per episode: opening it takes longer than drawing a picture.
+        if self._painter is None:
+            from mjx_dher.tools import render
+
             env: Any = self._compiled.env  # Any: a GoalEnv need not have a model
-            goal, qpos = np.asarray(self._state.obs["desired_goal"]), self._qpos
-            configurations = (qpos.popleft() for _ in itertools.count())
-            self._pictures = render.draw_frames(env.model, configurations, goal, PICTURE, PICTURE)
-        self._qpos.append(np.asarray(self._state.physics.qpos))
-        return next(self._pictures)
+            render.check_drawable(env)
+            self._painter = render.Painter(env.model, PICTURE, PICTURE)
+        return self._painter.draw(np.asarray(self._state.physics.qpos), np.asarray(self._state.obs["desired_goal"]))
 
     def close(self) -> None:
-        """Closes the renderer. An environment with a render mode must be closed before the program ends."""
-        if self._pictures is not None:
-            self._pictures.close()
-            self._pictures = None
+        """Closes the renderer. An environment that was drawn must be closed before the program ends."""
+        if self._painter is not None:
+            self._painter.close()
+            self._painter = None
+
+
+def make_custom(name: str, render_mode: str | None = None, **options: Any) -> gymnasium.Env[Obs, np.ndarray]:
+    """Makes a `GymEnv`, truncated after the environment's own `episode_length`: the entry point of `ENV_ID`."""
+    env = GymEnv(name, render_mode, **options)
+    return TimeLimit(env, env._compiled.spec.episode_length)
 
 
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):
@@ -339,10 +344,7 @@ def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[
     return [None if one is None else int(one) for one in seed]  # gymnasium takes no integers of NumPy's
 
 
+_VECTOR: dict[str, Any] = {"vector_entry_point": "mjx_dher.gym:GymVectorEnv"}
 for _id, _name in IDS.items():
-    _options: dict[str, Any] = {
-        "max_episode_steps": HORIZON,
-        "vector_entry_point": "mjx_dher.gym:GymVectorEnv",
-        "kwargs": {"name": _name},
-    }
-    gymnasium.register(_id, "mjx_dher.gym:GymEnv", **_options)
+    gymnasium.register(_id, "mjx_dher.gym:GymEnv", max_episode_steps=HORIZON, kwargs={"name": _name}, **_VECTOR)
+gymnasium.register(ENV_ID, "mjx_dher.gym:make_custom", **_VECTOR)

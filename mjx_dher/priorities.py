@@ -23,7 +23,6 @@ from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
 
 CANDIDATES = 4  # transitions that are drawn for each that a priority of transitions chooses
-STEP_SECONDS = 0.04  # s, of the Fetch tasks
 GRAVITY = 9.81  # m/s^2
 
 # priority(episode, context) -> weight [], 0 or more
@@ -200,9 +199,8 @@ def energy(episode: Episode, context: Context) -> Array:
     with v_t from differences of achieved goals. Losses do not count, nor does rotation, which positions do not show. A goal of
     fewer than three coordinates has no height.
     """
-    del context
     achieved = episode.achieved_goal
-    kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / STEP_SECONDS), axis=-1)
+    kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / context.dt), axis=-1)
     potential = GRAVITY * (achieved[:, 2] - achieved[0, 2]) if achieved.shape[-1] > 2 else jnp.zeros_like(kinetic)
     total = potential + kinetic
     return jnp.sum(jnp.maximum(total[1:] - total[:-1], 0.0))

@@ -153,6 +153,7 @@ class Env(Protocol):
       spec: an `EnvSpec`. Without it, rewards lie in [-1, 0] and every episode has `episode_length` steps.
       reached(achieved_goal, desired_goal): whether the goal is reached, bool [...]. Default: the reward is at its maximum.
       goal_distance(achieved_goal, desired_goal): distance [...] for metrics, `weighted` and logs. Default: Euclidean.
+      dt: seconds that a step takes, for videos, the viewer, gymnasium and `energy`. Default: 0.04.
       with_goal(state, goal): a first state with another desired goal [G]; goal generators need it.
       check(): called on the host after each epoch; raises ValueError if steps were silently wrong.
     """

@@ -39,7 +39,7 @@ def blocks(language):
 # Blocks that other tests run: the document, and the test.
 ELSEWHERE = {
     "README.md": "test_readme.py",
-    "docs/gymnasium.md": "test_gym.py",
+    "docs/gymnasium.md": "test_gym_use.py",
     "docs/policies.md": "test_export.py",
     "docs/tutorial.md": "test_examples.py",
 }

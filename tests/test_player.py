@@ -8,9 +8,10 @@ from conftest import refuses
 
 from mjx_dher import envs
 from mjx_dher.viewer import panel
-from mjx_dher.viewer.player import HOLD, MOST_STEPS, SHOWN, Game, Player, Tally, bounds, make_game
+from mjx_dher.viewer.player import Game, Player, Tally, bounds, make_game
 
 LENGTH = 4  # steps of an episode
+HOLD, SHOWN = 15, 250  # steps for which the end of an episode is shown, and that the curves show
 REACH = 0.05  # m
 
 
@@ -45,9 +46,17 @@ def test_it_keeps_time():
     assert (player.clock, player.episodes) == (4, Tally(1, 1))
 
 
+def test_the_environment_says_how_long_a_step_takes():
+    player = Player(GAME._replace(env=SimpleNamespace(**vars(GAME.env), dt=0.01)), follow)
+    assert player.advance(0.04) == 4
+    assert player.advance(3600) == 40
+    assert player.history.maxlen == 1000  # 10 s
+    assert [time for time, _, _ in player.history][:3] == [0.0, 0.01, 0.02]
+
+
 def test_time_that_a_slow_machine_loses_is_not_made_up():
     player = Player(GAME, follow)
-    assert player.advance(3600) == MOST_STEPS
+    assert player.advance(3600) == 10
     assert player.advance(0.04) == 1
 
 

@@ -39,11 +39,21 @@ def test_every_function_says_why_and_since_when():
     functions = [
         f for _, f in inspect.getmembers(private_api, callable) if getattr(f, "__module__", "") == private_api.__name__
     ]
-    assert len(functions) == 5
+    assert len(functions) == 6
     for function in functions:
         doc = inspect.getdoc(function)
-        assert re.search(r"\nPrivate: .*\nWhy: .*\nNeeded by: (mujoco-mjx|warp-lang|orbax-checkpoint) \d", doc, re.DOTALL)
+        assert re.search(r"\nPrivate: .*\nWhy: .*\nNeeded by: (mujoco|mujoco-mjx|warp-lang|orbax-checkpoint) \d", doc, re.S)
         assert "https://github.com/" in doc or "No upstream issue known" in doc
+
+
+def test_mujoco_still_chooses_how_to_draw_when_it_is_imported(monkeypatch):
+    contexts = sys.modules[mujoco.Renderer.__module__].gl_context
+    before = contexts.GLContext
+    monkeypatch.setenv("MUJOCO_GL", "egl" if before.__module__ != "mujoco.egl" else "glfw")
+    assert contexts.GLContext is before, no_longer_needed("MuJoCo reads MUJOCO_GL when it draws", "drawing_with")
+    with private_api.drawing_with("glfw"):
+        assert contexts.GLContext.__module__ == "mujoco.glfw"
+    assert contexts.GLContext is before
 
 
 def chain(length):

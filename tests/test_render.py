@@ -1,6 +1,7 @@
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -107,7 +108,7 @@ def test_a_thing_moved_is_drawn_moved(drawn, what, colour):
 
 def test_the_command_writes_every_frame(drawn):
     folder, _, printed = drawn
-    assert frames_in(folder / "run.gif", 96, 64) == 2 * (51 + render.HOLD)
+    assert frames_in(folder / "run.gif", 96, 64) == 2 * (51 + 10)
     assert "push: 2 episodes, seed 1, physics native, drawn with " in printed
     assert f"of 2; wrote {folder / 'run.gif'}\n" in printed
 
@@ -121,7 +122,8 @@ def test_without_a_run_a_task_is_played_with_random_actions(drawn):
 
 def frames_in(path, width, height):
     """Counts the pictures of this size in a file."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "image2pipe", "-c:v", "ppm", "-"]
+    form = ["-fps_mode", "passthrough", "-f", "image2pipe", "-c:v", "ppm"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), *form, "-"]
     return subprocess.run(command, capture_output=True, check=True).stdout.count(f"P6\n{width} {height}\n255\n".encode())
 
 
@@ -135,9 +137,22 @@ def moving(count):
 
 @pytest.mark.parametrize(("suffix", "count"), [(".mp4", 12), (".gif", 12), (".GIF", 12), (".png", 1)])
 def test_what_is_written_can_be_read(tmp_path, suffix, count):
-    render.write_frames(tmp_path / f"out{suffix}", moving(count))
+    render.write_frames(tmp_path / f"out{suffix}", moving(count), 25.0)
     assert frames_in(tmp_path / f"out{suffix}", 96, 64) == count
     assert os.listdir(tmp_path) == [f"out{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+@pytest.mark.parametrize(("fps", "frames"), [(10.0, 30), (33.0, 30), (200.0, 8)])
+def test_a_video_lasts_as_long_as_what_it_shows(tmp_path, suffix, fps, frames):
+    """Where there are more frames in a second than a file can show, some are left out."""
+    out = tmp_path / f"out{suffix}"
+    render.write_frames(out, moving(30), fps)
+    assert frames_in(out, 96, 64) == pytest.approx(frames, abs=2)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(out)]
+    told = subprocess.run(command, capture_output=True, check=False).stderr.decode()
+    seconds = float(re.search(r"Duration: 00:00:([\d.]+)", told).group(1))
+    assert seconds == pytest.approx(30 / fps, abs=0.05)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a disk that is full")
@@ -156,7 +171,7 @@ def test_a_full_disk_is_an_error(tmp_path, monkeypatch):
 
     monkeypatch.setattr(render.files, "atomic_write", to_full_disk)
     with refuses("out", out, "No space left"):
-        render.write_frames(out, moving(1))
+        render.write_frames(out, moving(1), 25.0)
     assert os.listdir(tmp_path) == []
 
 
@@ -168,9 +183,9 @@ def test_a_file_stays_whole_when_its_successor_fails(tmp_path):
     out = tmp_path / "out.mp4"
     out.write_text("before")
     with pytest.raises(RuntimeError, match="cannot draw"):
-        render.write_frames(out, breaks())
+        render.write_frames(out, breaks(), 25.0)
     with refuses("out", out):
-        render.write_frames(out, np.zeros((3, 65, 65, 3), np.uint8))  # H.264 takes even sizes only
+        render.write_frames(out, np.zeros((3, 65, 65, 3), np.uint8), 25.0)  # H.264 takes even sizes only
     assert out.read_text() == "before"
     assert os.listdir(tmp_path) == ["out.mp4"]
 
@@ -221,11 +236,36 @@ def test_a_way_to_draw_that_hangs_is_given_up():
     assert render.try_gl("egl", seconds=0.01) == "did not end within 0.01 s"
 
 
-def test_mujoco_must_not_have_chosen_already(monkeypatch):
+# MuJoCo is imported first, as by another environment, and so has chosen a way to draw that needs a screen.
+LATE = """
+import mujoco, sys
+from mjx_dher.tools import render
+scene = '<geom size=".1"/><camera name="front" pos="0 -1 0" xyaxes="1 0 0 0 0 1"/>'
+model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{scene}</worldbody></mujoco>")
+try:
+    pictures = list(render.draw_frames(model, [[]] * 2, [0.2, 0, 0], 64, 64))
+except ValueError as error:
+    print(error)
+    sys.exit(77 if "cannot draw here" in str(error) else 1)
+assert len(pictures) == 2 and pictures[0].std() > 1
+"""
+
+
+def test_it_draws_after_mujoco_was_imported():
+    variables = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    done = subprocess.run([sys.executable, "-c", LATE], cwd=ROOT, env=variables, capture_output=True, text=True, check=False)
+    if done.returncode == NO_GL:
+        pytest.skip(f"nothing on this machine can draw: {done.stdout.strip()}")
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+def test_a_way_to_draw_is_tried_once(monkeypatch):
+    tried = []
+    monkeypatch.setattr(render, "_DRAWN", set())
+    monkeypatch.setattr(render, "try_gl", lambda name: tried.append(name))
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setitem(sys.modules, "mujoco", object())
-    with refuses("MUJOCO_GL"):
-        render.choose_gl()
+    assert [render.choose_gl() for _ in range(3)] == ["egl"] * 3
+    assert tried == ["egl"]
 
 
 def test_the_missing_extra_is_named(monkeypatch):

@@ -71,6 +71,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
 def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> None:
     """Plays episodes and writes their pictures; random ones where there is no policy."""
+    from mjx_dher.contract import step_seconds
     from mjx_dher.policy.load import check_fits
     from mjx_dher.tools import render
 
@@ -94,6 +95,7 @@ def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> N
         soft_wrap=True,
     )
     qpos, goals, success = render.record_episodes(env, act, args.seed, args.episodes)
-    pictures = (env.model, qpos, goals, args.width, args.height)
-    render.write_frames(args.out, [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures))
+    pictures, fps = (env.model, qpos, goals, args.width, args.height), 1 / step_seconds(env)
+    frames = [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures, fps)
+    render.write_frames(args.out, frames, fps)
     console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)

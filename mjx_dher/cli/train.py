@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from mjx_dher import lookup, presets, spec
+from mjx_dher import envs, lookup, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import (
@@ -166,8 +166,7 @@ def resume_command(argv: list[str], console: Console) -> int:
         processes.broadcast(lambda: stack.enter_context(files.lock(args.run)))
         run, options = _to_resume(args, content, screen)
         prepare()
-        ran = content["physics"] if content["physics"] in spec.ENGINES else run.engine  # "none": the environment has none
-        env = make_env(run, args.engine or ran)
+        env = make_env(run, args.engine or (content["physics"] if envs.takes_engine(run.env) else None))
         return _train(env, run, args.run, options, args.curve, screen, content.get("devices", 1))
 
 

@@ -12,7 +12,8 @@ import functools
 import jax.numpy as jnp
 
 from mjx_dher.context import Context
-from mjx_dher.priorities import GRAVITY, STEP_SECONDS, displacements
+from mjx_dher.contract import STEP_SECONDS
+from mjx_dher.priorities import GRAVITY, displacements
 from mjx_dher.samplers import LearnedMetric, position
 from mjx_dher.types import Array, Episode
 

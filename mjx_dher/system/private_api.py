@@ -87,6 +87,27 @@ def mujoco_warp_shapes() -> SimpleNamespace:
     return SimpleNamespace(box_box=core.box_box, plane_cylinder=core.plane_cylinder)
 
 
+@contextlib.contextmanager
+def drawing_with(backend: str) -> Iterator[None]:
+    """Has a `mujoco.Renderer` that is made meanwhile draw with "egl", "osmesa" or "glfw"; other names change nothing.
+
+    Private: `GLContext` of the module `gl_context` that `mujoco.Renderer` uses, which is replaced meanwhile.
+    Why: MuJoCo reads MUJOCO_GL when it is first imported, and otherwise draws with glfw, which needs a screen. Any other code
+      of a program may import it first.
+    Needed by: mujoco 3.17.0. No upstream issue known.
+    """
+    import mujoco
+
+    module = sys.modules[mujoco.Renderer.__module__].gl_context
+    chosen = module.GLContext
+    if backend in ("egl", "osmesa", "glfw"):
+        module.GLContext = importlib.import_module(f"mujoco.{backend}").GLContext
+    try:
+        yield
+    finally:
+        module.GLContext = chosen
+
+
 def reset_call_id(callable_: Any) -> None:
     """Numbers the next trace of a `warp.jax_callable` as its first.
 

@@ -25,6 +25,7 @@ class Programs:
     options: tuple[tuple[str, Any], ...]
     env: GoalEnv
     spec: EnvSpec
+    fps: float  # steps in a second
     reset: Callable[[Any], State]  # seed [] -> state
     step: Callable[[State, np.ndarray], State]  # state, action [A] -> state
     reset_all: Callable[[Any], State]  # seeds [N] -> states [N, ...]
@@ -66,7 +67,7 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 
     from mjx_dher import rollout
-    from mjx_dher.contract import env_spec
+    from mjx_dher.contract import env_spec, step_seconds
 
     env = envs.make(name, **dict(options))
     spec = env_spec(env)
@@ -82,6 +83,7 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
         options=options,
         env=env,
         spec=spec,
+        fps=1.0 / step_seconds(env),
         reset=jax.jit(reset),
         step=jax.jit(env.step),
         reset_all=jax.jit(jax.vmap(reset)),

@@ -1,6 +1,6 @@
 """Rendering of episodes without a screen, as a video or as stills.
 
-The modules that draw are slow to import, so the functions import them. Call `choose_gl` before MuJoCo is imported.
+The modules that draw are slow to import, so the functions import them.
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ import itertools
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_dher import lookup
-from mjx_dher.system import files, subprocesses
+from mjx_dher.system import files, private_api, subprocesses
 
-FPS = 25  # frames per second, in real time: an action lasts 40 ms
-HOLD = 10  # repetitions of an episode's last frame, so that the eye can compare object and goal
+MOST_FPS = 50  # frames per second of a file: what a GIF can show
+HOLD_SECONDS = 0.4  # for which an episode's last frame is shown, so that the eye can compare object and goal
 STILLS = 5  # pictures side by side in a .png
 SIZES = range(64, 2049, 2)  # allowed widths and heights, pixels; H.264 requires even ones
 GL = ("egl", "osmesa", "glfw")  # values of MUJOCO_GL on Linux, in the order in which they are tried
 GL_SECONDS = 60.0  # time limit of trying one
+_DRAWN: set[str] = set()  # backends that have drawn in a child process
 GOAL_RADIUS = 0.03  # m; large enough to be seen around an object that has reached the goal
 GOAL_RGBA = (1.0, 0.1, 0.1, 0.6)
 
@@ -66,20 +67,19 @@ def ffmpeg() -> str:
 def choose_gl() -> str:
     """Sets MUJOCO_GL to the first backend that can draw without a screen on this machine, and returns its name.
 
-    If the user has set MUJOCO_GL, only that backend is tried.
+    If the user has set MUJOCO_GL, only that backend is tried. A backend is tried once in a process.
 
     Raises:
-      ValueError: no backend works, or MuJoCo was imported before a backend was chosen.
+      ValueError: no backend works.
     """
     requested = os.environ.get("MUJOCO_GL")
-    if not requested and "mujoco" in sys.modules:
-        raise ValueError("MuJoCo has been imported already: set MUJOCO_GL (egl or osmesa) before the program starts")
     if not requested and sys.platform != "linux":
         return "system"  # macOS and Windows have one backend, and it needs no screen
     failed = []
     for name in [requested] if requested else GL:
-        failure = try_gl(name)
+        failure = None if name in _DRAWN else try_gl(name)
         if failure is None:
+            _DRAWN.add(name)
             os.environ["MUJOCO_GL"] = name
             return name
         failed.append(f"{name} ({failure})")
@@ -148,12 +148,12 @@ def record_episodes(
     return qpos, goals, success
 
 
-def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
-    """Yields N * (T + 1 + HOLD) frames [height, width, 3] uint8 of all episodes. Arguments as in `stills`."""
+def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
+    """Yields the frames [height, width, 3] uint8 of all episodes, the last of each for `HOLD_SECONDS`. Arguments: `stills`."""
     for episode, goal in zip(qpos, goals):
         for frame in draw_frames(model, episode, goal, width, height):
             yield frame
-        for _ in range(HOLD):
+        for _ in range(round(HOLD_SECONDS * fps)):
             yield frame
 
 
@@ -171,54 +171,73 @@ def stills(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: 
     return np.concatenate(list(draw_frames(model, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
-def draw_frames(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Generator[np.ndarray]:
-    """Yields a picture [height, width, 3] uint8 of each configuration, with the goal as a red ball.
+def draw_frames(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
+    """Yields a picture [height, width, 3] uint8 of each configuration [nq]; arguments as for `Painter`."""
+    with contextlib.closing(Painter(model, width, height)) as painter:
+        for configuration in qpos:
+            yield painter.draw(configuration, goal)
+
+
+class Painter:
+    """Draws configurations of a model. Close it before the program ends.
 
     Args:
       model: the environment's `mujoco.MjModel`, with a camera "front".
-      qpos: [nq] each.
-      goal: [3] m.
       width, height: size of a picture, pixels.
+
+    Raises:
+      ValueError: MuJoCo cannot draw in this process.
     """
-    import mujoco
 
-    model = copy.copy(model)  # the buffer size is set below; that of the environment's model must not change
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    data = mujoco.MjData(model)
-    with mujoco.Renderer(model, height, width) as renderer:
-        for configuration in qpos:
-            data.qpos[:] = configuration
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
-            renderer.update_scene(data, camera="front")
-            scene = renderer.scene
-            ball = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(
-                ball,
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.array([GOAL_RADIUS, 0, 0]),
-                np.asarray(goal, float),
-                np.eye(3).ravel(),
-                np.array(GOAL_RGBA, np.float32),
-            )
-            ball.transparent, ball.emission = True, 0.5
-            scene.ngeom += 1
-            yield renderer.render()
+    def __init__(self, model: Any, width: int, height: int):
+        import mujoco
+
+        model = copy.copy(model)  # the buffer size is set below; that of the environment's model must not change
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._model, self._data = model, mujoco.MjData(model)
+        backend = choose_gl()
+        try:
+            with private_api.drawing_with(backend):
+                self._renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:  # of any library that draws
+            raise ValueError(f"MuJoCo cannot draw in this process with MUJOCO_GL={backend}: {error}") from error
+
+    def draw(self, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """A picture [height, width, 3] uint8 of a configuration [nq], with the goal [3] m as a red ball."""
+        import mujoco
+
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, camera="front")
+        scene = self._renderer.scene
+        ball, size = scene.geoms[scene.ngeom], np.array([GOAL_RADIUS, 0, 0])
+        place, colour = np.asarray(goal, float), np.array(GOAL_RGBA, np.float32)
+        mujoco.mjv_initGeom(ball, mujoco.mjtGeom.mjGEOM_SPHERE, size, place, np.eye(3).ravel(), colour)
+        ball.transparent, ball.emission = True, 0.5
+        scene.ngeom += 1
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Frees the renderer."""
+        self._renderer.close()
 
 
-def write_frames(out: Path, frames: Iterable[np.ndarray]) -> None:
-    """Writes `frames`, [height, width, 3] uint8 each, in the format of the suffix of `out`.
+def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Writes `frames`, [height, width, 3] uint8 each and `fps` a second, in the format of the suffix of `out`.
 
-    An error leaves an existing file as it was. (imageio_ffmpeg.write_frames reports no error if ffmpeg fails at the end.)
+    Of more than `MOST_FPS` frames a second some are left out. An error leaves an existing file as it was.
+    (imageio_ffmpeg.write_frames reports no error if ffmpeg fails at the end.)
 
     Raises:
       ValueError: the file cannot be written; the message includes ffmpeg's.
     """
     frames = iter(frames)
     first = next(frames)
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(FPS), "-i", "-"]
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(fps), "-i", "-"]
+    kept = ["-r", str(MOST_FPS)] if fps > MOST_FPS else []
     with files.atomic_write(out) as partial:
-        command = [ffmpeg(), "-v", "error", *source, *FORMATS[out.suffix.lower()], "-y", str(partial)]
+        command = [ffmpeg(), "-v", "error", *source, *kept, *FORMATS[out.suffix.lower()], "-y", str(partial)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdin is not None
             try:

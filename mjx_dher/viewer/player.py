@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_dher.tools.render import FPS, check_drawable
+from mjx_dher.contract import step_seconds
+from mjx_dher.tools.render import check_drawable
 
-SECONDS_PER_STEP = 1 / FPS  # of an environment, in real time
-HOLD = 15  # steps for which the end of an episode is shown before the next one begins
-SHOWN = 250  # steps that the curves show
-MOST_STEPS = 10  # that are made up for where the machine is too slow; the rest is dropped
+HOLD = 0.6  # s for which the end of an episode is shown before the next one begins
+SHOWN = 10.0  # s that the curves show
+MOST_SECONDS = 0.4  # that are made up for if the machine is too slow; the rest is dropped
 
 Act = Callable[[Mapping[str, np.ndarray]], np.ndarray]  # observation of one state -> action [A]
 Value = Callable[[Mapping[str, np.ndarray], np.ndarray], float]  # observation, action [A] -> what a critic expects
@@ -30,6 +30,15 @@ class Game(NamedTuple):
     step: Callable[[Any, Any], Any]  # state, action [A] -> state
     move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None where it cannot be moved
     move_object: Callable[[Any, Any], Any] | None  # the same
+
+    @property
+    def dt(self) -> float:
+        """Seconds that a step takes in real time."""
+        return step_seconds(self.env)
+
+    def steps(self, seconds: float) -> int:
+        """Number of steps that take `seconds` in real time, at least 1."""
+        return max(1, round(seconds / self.dt))
 
 
 def make_game(env: Any) -> Game:
@@ -100,7 +109,7 @@ class Player:
         self.episodes, self.own = Tally(), Tally()  # attempts after a reset, and after a hand
         self.note = ""
         # Of the last steps: time, s; distance to the goal, m; the critic's value, or NaN.
-        self.history: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=SHOWN)
+        self.history: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=game.steps(SHOWN))
         self._seed, self._steps, self._owed = seed, 0, 0.0
         self.new_episode()
 
@@ -115,12 +124,12 @@ class Player:
         """Plays for so many seconds of the clock on the wall, times the speed; returns the number of steps made."""
         if not self.playing:
             return 0
-        self._owed += seconds * self.speed / SECONDS_PER_STEP
-        steps = int(self._owed + 1e-6)
-        self._owed = self._owed - steps if steps <= MOST_STEPS else 0.0
-        for _ in range(min(steps, MOST_STEPS)):
+        self._owed += seconds * self.speed / self.game.dt
+        steps, most = int(self._owed + 1e-6), self.game.steps(MOST_SECONDS)
+        self._owed = self._owed - steps if steps <= most else 0.0
+        for _ in range(min(steps, most)):
             self.step()
-        return min(steps, MOST_STEPS)
+        return min(steps, most)
 
     def step(self) -> None:
         """Makes one step of the environment, or holds the end of an episode for one."""
@@ -136,7 +145,7 @@ class Player:
         failed, ended = self._failed, self._flag("done") or self._flag("terminal")
         if failed or ended or self.clock == self.length:
             (self.own if self.is_own else self.episodes).add(self.success)
-            self._held = HOLD if failed or ended or self.renew else 0
+            self._held = self.game.steps(HOLD) if failed or ended or self.renew else 0
         if failed:
             self.note = "The physics blew up; a new episode begins."
 
@@ -198,7 +207,7 @@ class Player:
         """Notes what is to be seen of the state."""
         self.obs = jax.tree.map(np.asarray, dict(self._state.obs))
         value = float("nan") if self.value is None else self.value(self.obs, self.act(self.obs))
-        now = self._steps * SECONDS_PER_STEP
+        now = self._steps * self.game.dt
         if self.history and self.history[-1][0] == now:  # moved, or begun anew, since the last step
             self.history.pop()
         self.history.append((now, self.distance, value))

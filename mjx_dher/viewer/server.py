@@ -13,7 +13,7 @@ import numpy as np
 from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
 from mjx_dher.viewer import address
 from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
-from mjx_dher.viewer.player import SECONDS_PER_STEP, Game, Player, bounds, make_game
+from mjx_dher.viewer.player import Game, Player, bounds, make_game
 from mjx_dher.viewer.scene import Poses, add
 from mjx_dher.viewer.sources import Cast, Source
 
@@ -76,7 +76,7 @@ class Viewer:
                 drawn = started if curves else drawn
                 with self._server.atomic():
                     self.show(curves)
-            time.sleep(max(0.002, SECONDS_PER_STEP / max(1.0, self.player.speed) / 2 - (time.monotonic() - started)))
+            time.sleep(max(0.002, self.player.game.dt / max(1.0, self.player.speed) / 2 - (time.monotonic() - started)))
 
     def choose(self, label: str) -> None:
         """Plays the policy by this name; one that cannot be played is told in the panel, and the one before goes on."""

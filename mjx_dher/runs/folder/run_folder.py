@@ -68,8 +68,9 @@ def _fresh(spec: RunSpec) -> Path:
 
 
 def engine_name(env: Any) -> str:
-    """Name of the physics that an environment runs on; "none" without an engine."""
-    return getattr(getattr(env, "engine", None), "name", "none")
+    """Name of the physics of an environment: of its `engine`, or of another attribute that is one; "none" without any."""
+    values = [getattr(env, "engine", None), *getattr(env, "__dict__", {}).values()]
+    return next((value.name for value in values if hasattr(value, "advance") and hasattr(value, "name")), "none")
 
 
 def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> None:
