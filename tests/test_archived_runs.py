@@ -24,7 +24,7 @@ TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes
 def archive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("archive")
     with tarfile.open(ROOT / "tests" / "data" / "runs_schema_2.tar.xz") as file:
-        file.extractall(folder, filter="data")
+        file.extractall(folder, **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))  # Python 3.11.0 to .3
     return folder
 
 
