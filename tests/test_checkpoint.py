@@ -1,5 +1,6 @@
 import dataclasses
 import errno
+import io
 import json
 import os
 import random
@@ -8,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -21,6 +24,7 @@ from mjx_dher.learners import ddpg
 from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
 from mjx_dher.runs.folder.checkpoint import CheckpointError
 from mjx_dher.runs.program import loop
+from mjx_dher.system import files
 from mjx_dher.system.files import write_json
 from probes import PointMass
 
@@ -183,14 +187,19 @@ def test_another_dtype_is_refused(saved, program):
         checkpoint.restore(saved[0], template)
 
 
-def test_a_checkpoint_in_orbax_s_default_format_is_read(saved, program, tmp_path, monkeypatch):
-    state = restore(saved[0], program).state
-    handler = orbax.checkpoint.PyTreeCheckpointHandler
-    with monkeypatch.context() as patch:
-        patch.setattr(orbax.checkpoint, "PyTreeCheckpointHandler", lambda use_ocdbt: handler(use_ocdbt=True))
-        checkpoint.save(tmp_path, state, 3, 1.0, keep=1)
-    assert list(tmp_path.rglob("manifest.ocdbt"))
-    assert bits(restore(tmp_path, program).state) == bits(state)
+@pytest.mark.parametrize("use_ocdbt", [False, True])
+def test_a_checkpoint_that_was_written_with_orbax_is_read(copy, program, use_ocdbt):
+    path = copy / "checkpoints" / "epoch-000003"
+    arrays = {file.stem: np.load(file) for file in files_of(path / "state")}
+    shutil.rmtree(path / "state")
+    with orbax.checkpoint.Checkpointer(orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=use_ocdbt)) as checkpointer:
+        checkpointer.save(path / "state", arrays)
+    assert bool(list(path.rglob("manifest.ocdbt"))) == use_ocdbt
+    inside = [file for file in files_of(path) if file.name != "manifest.json"]
+    change_manifest(path, files={file.relative_to(path).as_posix(): checkpoint._digest(file) for file in inside})
+    found = restore(copy, program)
+    assert (found.epoch, found.refused) == (3, {})
+    assert bits(found.state) == [array.tobytes() for array in arrays.values()]
 
 
 def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch):
@@ -202,25 +211,47 @@ def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch
 
 def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeypatch):
     state = restore(copy, program).state
-    write = checkpoint._write_arrays
+    truncate, opened = io.BufferedWriter.truncate, []
 
-    def fill(path, arrays):
-        write(path, arrays[:3])
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    class Full(io.BufferedWriter):
+        def truncate(self, *size):
+            opened.append(self)
+            if len(opened) == 4:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return truncate(self, *size)
 
-    monkeypatch.setattr(checkpoint, "_write_arrays", fill)
-    with refuses("epoch-000004", "No space left", "epoch-000003", error=CheckpointError):
+    monkeypatch.setattr(Path, "open", lambda path, mode="r", **options: Full(io.FileIO(path, mode)))
+    with refuses("epoch-000004", "No space left", "0003.npy", "epoch-000003", error=CheckpointError):
         checkpoint.save(copy, state, 4, 1.0, keep=1)
+    monkeypatch.undo()
     assert sorted(path.name for path in (copy / "checkpoints").iterdir()) == ["epoch-000002", "epoch-000003"]
     assert restore(copy, program).epoch == 3
 
 
-def test_a_disk_with_too_little_left_is_refused_before_anything_is_written(program, copy, monkeypatch):
+def disk_with(free, files=10**6, block=4096):
+    """`os.statvfs` of a disk with so many bytes and files left."""
+    return lambda path: SimpleNamespace(f_frsize=block, f_bavail=free // block, f_files=10**6, f_favail=files)
+
+
+@pytest.mark.parametrize("disk", [disk_with(40_000), disk_with(10**9, files=3), disk_with(10**6, block=1 << 20)])
+def test_a_disk_with_too_little_left_is_refused_before_anything_is_written(program, copy, monkeypatch, disk):
+    """The state has 20 kB in some 40 arrays, each of which takes a block."""
     state = restore(copy, program).state
-    monkeypatch.setattr(checkpoint.shutil, "disk_usage", lambda path: shutil._ntuple_diskusage(10**6, 10**6 - 1000, 1000))
-    with refuses("epoch-000004", "1.0 kB", error=CheckpointError):
+    monkeypatch.setattr(files.os, "statvfs", disk)
+    with refuses("epoch-000004", error=CheckpointError):
         checkpoint.save(copy, state, 4, 1.0, keep=1)
     assert restore(copy, program).epoch == 3
+
+
+def test_on_a_full_disk_older_checkpoints_make_room(program, copy, monkeypatch):
+    """But not the newest one."""
+    state = restore(copy, program).state
+    for epoch in (4, 5):
+        monkeypatch.setattr(
+            files.os, "statvfs", lambda path: disk_with(0 if len(run_folder.checkpoints(copy)) > 1 else 10**6)(path)
+        )
+        checkpoint.save(copy, state, epoch, 1.0, keep=3)
+        assert [run_folder.epoch_of(path) for path in run_folder.checkpoints(copy)] == [epoch, 3 if epoch == 4 else 4]
 
 
 # The command line.

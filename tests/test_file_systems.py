@@ -10,10 +10,13 @@ import subprocess
 import sys
 import warnings
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from conftest import ROOT
 
 from mjx_dher.cli import sentence
+from mjx_dher.runs.folder import checkpoint
 from mjx_dher.runs.folder.locks import Claims
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
@@ -152,3 +155,17 @@ def test_no_text_is_in_the_locale_s_encoding(folder):
     for path in (ROOT / folder).rglob("*.py"):
         calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
         assert not [f"{path}:{call.lineno}" for call in calls if is_in_the_locale_s_encoding(call)]
+
+
+def test_arrays_of_every_kind_come_back_to_the_bit_and_zeros_take_no_space(tmp_path):
+    """A piece of zeros is a hole of the file: at the start, in the middle, at the end, and whole."""
+    ring = np.zeros((4, 1 << 20), np.uint8)
+    ring[1, 7] = ring[3, 0] = 1
+    folded = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    half = np.asarray(jnp.arange(5, dtype=jnp.bfloat16))
+    others = [np.zeros((0, 3)), np.array(-0.0, np.float32), np.array(True), np.frombuffer(b"abc", np.int8)]
+    arrays = [ring, ring[::2], folded, half, np.zeros(1 << 22, np.float32), *others]
+    checkpoint._write_arrays(tmp_path / "x", arrays)
+    read = checkpoint._read_arrays(tmp_path / "x", [str(array.dtype) for array in arrays])
+    assert [(x.dtype, x.shape, x.tobytes()) for x in read] == [(x.dtype, x.shape, x.tobytes()) for x in arrays]
+    assert sum(path.stat().st_blocks * 512 for path in tmp_path.rglob("*.npy")) < 4 << 20  # of 22 MB

@@ -3,7 +3,6 @@
 import importlib.metadata
 import importlib.util
 import inspect
-import logging
 import re
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import orbax.checkpoint
 import pytest
 from conftest import ROOT
 from mujoco import mjx
@@ -141,61 +139,6 @@ def test_warp_still_writes_the_number_of_a_trace_into_the_program():
 
 
 def test_orbax_still_has_its_older_interface_only():
-    """Outside of `experimental`; and OCDBT is the default format, about which the older one warns."""
-    name = "array_checkpointer: write its arrays by orbax.checkpoint.v1"
+    """Outside of `experimental`."""
+    name = "array_checkpointer: read the arrays by orbax.checkpoint.v1"
     assert importlib.util.find_spec("orbax.checkpoint.v1") is None, no_longer_needed("orbax's new interface is stable", name)
-    default = inspect.signature(orbax.checkpoint.PyTreeCheckpointHandler).parameters["use_ocdbt"].default
-    assert default is True, no_longer_needed("OCDBT is not orbax's default any more", "array_checkpointer")
-
-
-def test_orbax_still_warns_in_the_older_format(tmp_path):
-    records = []
-    handler = logging.Handler()
-    handler.emit = records.append
-    logger = logging.getLogger("absl")
-    with private_api.array_checkpointer() as checkpointer:
-        level = logger.level
-        logger.addHandler(handler)
-        try:
-            checkpointer.save(tmp_path / "silent", {"a": np.zeros(3)})
-            assert not records
-            assert not list(tmp_path.rglob("manifest.ocdbt"))
-            logger.setLevel(logging.WARNING)
-            checkpointer.save(tmp_path / "loud", {"a": np.zeros(3)})
-        finally:
-            logger.removeHandler(handler)
-            logger.setLevel(level)
-    assert records, "no longer needed: orbax does not warn; delete the line of private_api.array_checkpointer that silences it"
-
-
-GROWTH = """
-import logging, shutil, sys
-import numpy as np, orbax.checkpoint
-from mjx_dher.system import memory
-memory.keep_heap_small()
-logging.getLogger("absl").setLevel(logging.CRITICAL)
-held = []
-for index in range(600):
-    handler = orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=sys.argv[1] == "ocdbt")
-    with orbax.checkpoint.Checkpointer(handler) as checkpointer:
-        checkpointer.save(f"{sys.argv[2]}/{index}", {f"{i:04d}": np.full(100, i, np.float32) for i in range(60)})
-    shutil.rmtree(f"{sys.argv[2]}/{index}")
-    memory.release()
-    if index in (199, 599):
-        held.append(memory.used_bytes())
-print((held[1] - held[0]) / 400)
-"""
-
-
-@pytest.mark.slow
-def test_a_process_still_keeps_memory_of_every_checkpoint_in_ocdbt(tmp_path):
-    """Measured: 19 kB for each, and 6 kB in the older format."""
-
-    def kept(form):
-        command = [sys.executable, "-c", GROWTH, form, str(tmp_path)]
-        return float(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
-
-    what = "OCDBT keeps no more memory than the older format"
-    assert kept("ocdbt") > 2 * max(kept("older"), 1e3), no_longer_needed(
-        what, "array_checkpointer, for orbax's default handler"
-    )

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
 
 from mjx_dher.config import Config
+from mjx_dher.runs.program.loop import Progress
+from mjx_dher.spec import RunSpec
 
 
 def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
@@ -42,3 +47,34 @@ def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
         " these keep their own",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}
+
+
+class Watch:
+    """Failures and warnings of runs side by side."""
+
+    def __init__(
+        self,
+        specs: Sequence[RunSpec],
+        folders: Sequence[Path],
+        report: Callable[[str], None],
+        failed: dict[int, tuple[int, str]],
+    ):
+        self.failed = failed  # lane -> the epoch in which it failed, and why; it is added to
+        self._specs, self._report = specs, report
+        self._names = [f"{folder.name}: " if len(specs) > 1 else "" for folder in folders]
+        self._warned: set[tuple[int, str]] = set()
+
+    def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
+        """Records the lanes that failed in an epoch, and reports each kind of warning once."""
+        finite = np.atleast_1d(progress.finite)
+        for lane, (spec, row) in enumerate(zip(self._specs, rows)):
+            if lane in self.failed:
+                continue
+            if reason := failure(row, spec.config, bool(finite[lane])):
+                self.failed[lane] = progress.epoch, reason
+                self._report(f"{self._names[lane]}failed in epoch {progress.epoch}: {reason}")
+                continue
+            for kind, text in warnings(row, spec.config).items():
+                if (lane, kind) not in self._warned:
+                    self._warned.add((lane, kind))
+                    self._report(f"{self._names[lane]}epoch {progress.epoch}: {text}")

@@ -171,12 +171,15 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec)) for spec in specs]
     checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
-    start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams))
-    _refuse_ended(session.env, specs[0], start)
+    num_epochs = config_lib.num_epochs(specs[0].config, session.env.episode_length)
+    will_save = 0 < options.checkpoint_every < num_epochs
+    start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
+    _refuse_ended(specs[0], start, num_epochs)
     for folder in folders if processes.leads() else ():  # before anything that a result tells of is touched
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
-    watch = Watch(specs, folders, session.report, checkpoints.failed)
+    report_once = functools.cache(session.report)
+    watch = diagnostics.Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = zip(ended, specs, folders, runs) if processes.leads() else ()
@@ -190,7 +193,11 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
             if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs) or options.is_reached(success):
                 break
             if program.lanes == 1:
-                _save_policy(program, processes.collect(progress.state.learner), specs[0], folders[0], runs[0])
+                learner = processes.collect(progress.state.learner)
+                try:
+                    _save_policy(program, learner, specs[0], folders[0], runs[0])
+                except OSError as error:  # the run can go on without one
+                    report_once(f"cannot write the policy ({error})")
             session.on_epoch(specs, progress)
             if session.should_stop():
                 session.report(f"saved {checkpoints.save(progress)}")
@@ -212,9 +219,8 @@ def _success_rates(folder: Path) -> list[float]:
     return [row["success_rate"] for row in loggers.read_rows(folder / loggers.METRICS_FILE)]
 
 
-def _refuse_ended(env: Env, spec: RunSpec, start: Start) -> None:
+def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
     """Raises ValueError if all epochs of `total_steps` have ended."""
-    num_epochs = config_lib.num_epochs(spec.config, env.episode_length)
     if start.epoch >= num_epochs:
         raise ValueError(
             f"nothing is left to train: {start.epoch} epochs have ended, and total_steps {spec.config.total_steps} takes"
@@ -245,37 +251,6 @@ def _open(
     for sink in opened:
         stack.callback(sink.close)
     return opened
-
-
-class Watch:
-    """Failures and warnings of runs side by side."""
-
-    def __init__(
-        self,
-        specs: Sequence[RunSpec],
-        folders: Sequence[Path],
-        report: Callable[[str], None],
-        failed: dict[int, tuple[int, str]],
-    ):
-        self.failed = failed  # lane -> the epoch in which it failed, and why; it is added to
-        self._specs, self._report = specs, report
-        self._names = [f"{folder.name}: " if len(specs) > 1 else "" for folder in folders]
-        self._warned: set[tuple[int, str]] = set()
-
-    def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
-        """Records the lanes that failed in an epoch, and reports each kind of warning once."""
-        finite = np.atleast_1d(progress.finite)
-        for lane, (spec, row) in enumerate(zip(self._specs, rows)):
-            if lane in self.failed:
-                continue
-            if reason := diagnostics.failure(row, spec.config, bool(finite[lane])):
-                self.failed[lane] = progress.epoch, reason
-                self._report(f"{self._names[lane]}failed in epoch {progress.epoch}: {reason}")
-                continue
-            for kind, text in diagnostics.warnings(row, spec.config).items():
-                if (lane, kind) not in self._warned:
-                    self._warned.add((lane, kind))
-                    self._report(f"{self._names[lane]}epoch {progress.epoch}: {text}")
 
 
 def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:

@@ -9,9 +9,11 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from mjx_dher.system import memory
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -20,6 +22,8 @@ LOCK = ".lock"  # name of the file in a folder by which it is locked
 _MARKER = f"{LOCK}.soft"  # the same, on a file system without locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)  # filelock itself marks the folder for ENOSYS
 _NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # of a folder: CIFS, AFS, some of FUSE
+
+_LARGEST_BLOCK = 1 << 16  # bytes; NFS gives the size of its messages as that of a block
 
 
 class FolderError(ValueError):
@@ -196,6 +200,19 @@ def flush_all(folder: Path) -> None:
         for name in names:
             flush(Path(root, name))
         flush(Path(root))
+
+
+def lack_of_space(folder: Path, sizes: Sequence[int]) -> str | None:
+    """Reason why files of these sizes, in bytes, do not fit on the disk of a folder, made or not; None if they do."""
+    folder = folder.absolute()
+    disk = os.statvfs(next(path for path in (folder, *folder.parents) if path.is_dir()))
+    block = min(disk.f_frsize, _LARGEST_BLOCK)
+    needed, free = sum(-(-size // block) * block for size in sizes), disk.f_bavail * disk.f_frsize
+    if needed > free:
+        return f"{memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free"
+    if disk.f_files and len(sizes) > disk.f_favail:
+        return f"{len(sizes)} files, and the disk can have {disk.f_favail} more"
+    return None
 
 
 def remove(path: Path) -> None:

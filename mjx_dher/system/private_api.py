@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
-import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -119,21 +118,19 @@ def reset_call_id(callable_: Any) -> None:
 
 
 def array_checkpointer() -> Any:
-    """Returns an orbax checkpointer that writes a folder for each array; silences orbax's log.
+    """Returns an orbax checkpointer, which reads checkpoints of version 0.2.0 and before.
 
-    Private: nothing by its name, but `PyTreeCheckpointHandler(use_ocdbt=False)` and the logger `absl` belong to orbax's older
-      interface, which https://github.com/google/orbax/issues/1624 (open) is to replace.
-    Why: the process keeps some memory of every checkpoint in orbax's other format, OCDBT (docs/reliability.md).
-    Needed by: orbax-checkpoint 0.12.8. No upstream issue known for the memory.
+    Private: nothing by its name, but `PyTreeCheckpointHandler` belongs to orbax's older interface.
+    Why: the folders that were written with it stay readable.
+    Needed by: orbax-checkpoint 0.12.8. https://github.com/google/orbax/issues/1624 (open) is to replace the interface.
     """
     import jax
     import orbax.checkpoint
 
-    logging.getLogger("absl").setLevel(logging.CRITICAL)  # orbax warns at every checkpoint in the older format
     alone: dict[str, Any] = {}
-    if jax.process_count() > 1:  # the process that writes does so alone; orbax would have all of them wait for one another
+    if jax.process_count() > 1:  # else orbax would have all of them wait for one another
         own = jax.process_index()
         options = orbax.checkpoint.options.MultiprocessingOptions(primary_host=own, active_processes={own})
         alone = {"multiprocessing_options": options}
-    handler = orbax.checkpoint.PyTreeCheckpointHandler(use_ocdbt=False, **alone)
+    handler = orbax.checkpoint.PyTreeCheckpointHandler(**alone)
     return orbax.checkpoint.Checkpointer(handler, **alone)

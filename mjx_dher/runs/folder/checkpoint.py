@@ -1,14 +1,14 @@
 """Checkpoints of a run: written whole or not at all, and restored only if they are undamaged.
 
-A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, the leaves of the TrainState as orbax stores arrays, and
-manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype. Orbax alone does not
-notice a flipped bit.
+A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, a NumPy file for each leaf of the TrainState, and
+manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 
 from mjx_dher.runs.folder.fingerprint import sha256_of
 from mjx_dher.runs.folder.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
-from mjx_dher.system import files, memory, private_api
+from mjx_dher.system import files, private_api
 from mjx_dher.system.files import FolderError
 
 SCHEMA = 2
@@ -28,6 +28,8 @@ _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
 _CURSOR, _STEPS = ".replay.cursor", ".env_steps"
+_PIECE = 1 << 20  # bytes that are looked at together for zeros
+_SPARE = 1 << 16  # bytes that a checkpoint leaves for metrics and result
 _EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # arrays that checkpoints of 0.2.0 lack
 
 
@@ -59,7 +61,7 @@ def save(
 ) -> Path:
     """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
 
-    Checkpoints of later epochs are deleted, too.
+    Checkpoints of later epochs are deleted, too. If the disk is too full, all but the newest one are deleted first.
 
     Args:
       folder: of the run.
@@ -80,6 +82,12 @@ def save(
         files.make_folder(parent)
         for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
             files.remove(left)
+        whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
+        for old in reversed(whole[1:]):
+            if lack_of_space(parent, state):
+                files.remove(old)
+        if lack := lack_of_space(parent, state):
+            raise OSError(lack)
         told = {"runs": list(runs), "failed": {str(lane): list(how) for lane, how in (failed or {}).items()}}
         _write(partial, state, {"schema": SCHEMA, "epoch": epoch, "wall_seconds": wall_seconds, **told})
         files.flush_all(partial)
@@ -87,25 +95,27 @@ def save(
             files.remove(target)
         partial.rename(target)
         files.flush(parent)
-        whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
         for old in set(checkpoints(folder)) - {target, *whole[: keep - 1]}:
             files.remove(old)
-    except Exception as error:  # orbax raises many kinds of errors
-        shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
         kept = checkpoints(folder)
         last = f"the last one is {kept[0]}" if kept else "there is none before it"
         raise CheckpointError(f"cannot write the checkpoint {target} ({error}); {last}") from error
     finally:
-        memory.release()  # the buffers of the threads that compress leave holes
+        shutil.rmtree(partial, ignore_errors=True)
     return target
+
+
+def lack_of_space(folder: Path, state: Any) -> str | None:
+    """Reason why a checkpoint of `state`, arrays or their shapes, does not fit on the disk of `folder`; None if it does."""
+    sizes = [x.size * x.dtype.itemsize + np.lib.format.ARRAY_ALIGN * 2 for x in _to_shapes(state).values()]
+    lack = files.lack_of_space(folder, [*sizes, 300 * len(sizes), _SPARE])
+    return lack and f"a checkpoint takes {lack}"
 
 
 def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
     """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and the digests of all files."""
     leaves = _to_arrays(state)
-    needed, free = sum(array.nbytes for array in leaves.values()), shutil.disk_usage(partial.parent).free
-    if needed > free:
-        raise OSError(f"it can take {memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free")
     _write_arrays(partial / _STATE, list(leaves.values()))
     content = {
         **content,
@@ -162,7 +172,7 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
     if manifest["epoch"] != epoch_of(path):
         raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
     saved = {name: [name, shape, dtype] for name, shape, dtype in manifest["leaves"]}
-    arrays = dict(zip(saved, _read_arrays(path / _STATE, len(saved))))
+    arrays = dict(zip(saved, _read_arrays(path / _STATE, [dtype for _, _, dtype in saved.values()])))
     for name, array in arrays.items():
         if [name, list(array.shape), str(array.dtype)] != saved[name]:
             read = _say([name, list(array.shape), str(array.dtype)])
@@ -284,14 +294,31 @@ def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
 
 
 def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
-    with private_api.array_checkpointer() as checkpointer:
-        checkpointer.save(path.absolute(), {f"{index:04d}": array for index, array in enumerate(arrays)})
+    """Writes NumPy files. Zeros, such as those of a ring that is not full, take no space on most file systems."""
+    path.mkdir(parents=True)
+    for index, array in enumerate(np.asarray(array, order="C") for array in arrays):
+        file = path / f"{index:04d}.npy"
+        content = array.reshape(-1).view(np.uint8)
+        with files.naming(file), file.open("wb") as stream:
+            np.lib.format.write_array_header_1_0(stream, np.lib.format.header_data_from_array_1_0(array))
+            for start in range(0, len(content), _PIECE):
+                piece = content[start : start + _PIECE]
+                if piece.any():
+                    stream.write(piece.data)
+                else:
+                    stream.seek(len(piece), os.SEEK_CUR)
+            stream.truncate()
 
 
-def _read_arrays(path: Path, count: int) -> list[np.ndarray]:
+def _read_arrays(path: Path, dtypes: Sequence[str]) -> list[np.ndarray]:
+    names = [f"{index:04d}" for index in range(len(dtypes))]
     try:
-        with private_api.array_checkpointer() as checkpointer:
-            arrays = checkpointer.restore(path.absolute())
-        return [np.asarray(arrays[f"{index:04d}"]) for index in range(count)]
-    except Exception as error:
+        if not any(path.glob("*.npy")):  # of a version that wrote checkpoints with orbax
+            with private_api.array_checkpointer() as checkpointer:
+                arrays = checkpointer.restore(path.absolute())
+            return [np.asarray(arrays[name]) for name in names]
+        read = [np.load(path / f"{name}.npy", allow_pickle=False) for name in names]
+        # NumPy has no name for bfloat16.
+        return [array.view(jnp.dtype(dtype)) if array.dtype.kind == "V" else array for array, dtype in zip(read, dtypes)]
+    except Exception as error:  # orbax raises many kinds of errors
         raise CheckpointError(f"{path} cannot be read ({error})") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import shutil
 from collections.abc import Callable, Sequence
@@ -54,14 +55,15 @@ class LaneCheckpoints:
             shared = next(others, shared)
         return shared if self.lanes > 1 or shared.exists() else self.folders[0]
 
-    def restore(self, init: Callable[[], TrainState]) -> Start:
+    def restore(self, init: Callable[[], TrainState], will_save: bool) -> Start:
         """Restores the newest checkpoint; without one, the runs start with what `init` makes.
 
         Raises:
-          FolderError: no checkpoint can be used, and not `restart`.
+          FolderError: no checkpoint can be used, and not `restart`; or there is none, the runs `will_save` some, and the disk
+            is too full.
         """
         state = init()
-        if not processes.broadcast(lambda: len(run_folder.checkpoints(self.folder))):
+        if not processes.broadcast(functools.partial(self._find, state, will_save)):
             return Start(state)
         template = jax.tree.map(self._shape_of, state)
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
@@ -82,6 +84,15 @@ class LaneCheckpoints:
         self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
         # A lane's number for its sampler depends on which others are left.
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
+
+    def _find(self, state: TrainState, will_save: bool) -> bool:
+        """Whether there is a checkpoint. Reports a disk too full for another; raises FolderError if that were the first."""
+        has_some = bool(run_folder.checkpoints(self.folder))
+        if will_save and (lack := checkpoint.lack_of_space(self.folder, state)):
+            if not has_some:
+                raise FolderError(f"{self.folder}: {lack}")
+            self.report(lack)
+        return has_some
 
     def _read(self, template: TrainState) -> Restored:
         """Returns the newest whole checkpoint; raises FolderError in all processes if one of them cannot read it."""
