@@ -42,6 +42,7 @@ ELSEWHERE = {
     "docs/gymnasium.md": "test_gym_use.py",
     "docs/policies.md": "test_export.py",
     "docs/tutorial.md": "test_examples.py",
+    "docs/your_robot.md": "test_your_robot.py",
 }
 SNIPPETS = list(blocks("python"))
 

@@ -1,0 +1,209 @@
+"""Controls: an action moves joint servos, motors or mocap bodies, in the ranges that the model gives them."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import fnmatch
+from collections.abc import Sequence
+from typing import Any, Self
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.arm_kinematics import quat_multiply
+from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.kinematics import Place, names_of, to_quat
+from mjx_dher.lookup import check_name
+from mjx_dher.types import Array
+
+_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_NONE)
+
+
+def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
+    """Indices whose name in one of the columns fits one of the patterns, such as "j1 finger*", in the columns' order.
+
+    Raises:
+      ValueError: no name fits a pattern; the message lists the names.
+    """
+    chosen: set[int] = set()
+    for pattern in patterns.split():
+        fitting = {i for names in columns for i, name in enumerate(names) if name and fnmatch.fnmatchcase(name, pattern)}
+        if not fitting:
+            check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
+        chosen |= fitting
+    return sorted(chosen)
+
+
+class Control:
+    """Base class: maps `size` numbers of an action, in [-1, 1], to the inputs of an engine."""
+
+    size: int
+    labels: list[str]  # [size] what each number of the action moves
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        """Returns a copy for `model`. Raises ValueError for a name that the model lacks."""
+        raise NotImplementedError
+
+    def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
+        """Returns `controls` with the inputs for `action` [size]."""
+        raise NotImplementedError
+
+
+class Actuators(Control):
+    """Actuators of any kind: -1 and 1 are the ends of the actuator's ctrlrange.
+
+    Args:
+      names: names of actuators or of their joints, separated by spaces; "*" and "?" stand for any characters.
+    """
+
+    def __init__(self, names: str = "*"):
+        self.names = names
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        own, joints = [""] * model.nu, [""] * model.nu  # names of actuators of this kind, and of their joints
+        for i in filter(lambda i: self._suits(model, i), range(model.nu)):
+            own[i] = model.actuator(i).name
+            joints[i] = model.joint(joint).name if (joint := _joint(model, i)) >= 0 else ""
+        bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
+        bound.labels = [own[i] or joints[i] for i in bound.indices]
+        bound.size = len(bound.indices)
+        bound.low, bound.high = np.array([_range(model, i) for i in bound.indices], np.float32).T
+        bound._bind_joints(model, [_joint(model, i) for i in bound.indices])
+        return bound
+
+    def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
+        ctrl = 0.5 * (self.high + self.low) + 0.5 * (self.high - self.low) * action
+        return dataclasses.replace(controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(ctrl))
+
+    def _suits(self, model: mujoco.MjModel, index: int) -> bool:
+        return True
+
+    def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
+        pass
+
+    indices: list[int]
+    low: np.ndarray  # [size]
+    high: np.ndarray  # [size]
+
+
+class JointPosition(Actuators):
+    """Position servos: -1 and 1 are the ends of the servo's ctrlrange, or of its joint's range if it has none."""
+
+    def _suits(self, model: mujoco.MjModel, index: int) -> bool:
+        return is_servo(model, index)
+
+
+class JointDelta(JointPosition):
+    """Position servos, moved relative to the present joint positions: 1 stands for `scale` (rad, or m for a slide).
+
+    Args:
+      names: as for `Actuators`.
+      scale: distance of the servo's target from the joint's position for an action of 1.
+    """
+
+    def __init__(self, names: str = "*", scale: float = 0.1):
+        super().__init__(names)
+        self.scale = scale
+
+    def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
+        target = self.gear * (physics.qpos[self.qpos] + self.scale * action)
+        return dataclasses.replace(
+            controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(jnp.clip(target, self.low, self.high))
+        )
+
+    def _suits(self, model: mujoco.MjModel, index: int) -> bool:
+        return is_servo(model, index) and _joint(model, index) >= 0
+
+    def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
+        self.qpos = model.jnt_qposadr[joints]
+        self.gear = np.array(model.actuator_gear[self.indices, 0], np.float32)
+
+    qpos: np.ndarray
+    gear: np.ndarray
+
+
+class Torque(Actuators):
+    """Motors: -1 and 1 are the ends of the motor's ctrlrange."""
+
+    def _suits(self, model: mujoco.MjModel, index: int) -> bool:
+        return model.actuator_biastype[index] == _NO_BIAS
+
+
+class Mocap(Control):
+    """A mocap body that pulls a body by a weld: 1 moves its target `scale` m from the pulled body, along x, y or z.
+
+    Args:
+      body: name of the mocap body.
+      scale: m for an action of 1.
+      turn: rad that an action of 1 turns the target about the world's x, y or z; 0 keeps the orientation in the model, and
+        the action has three numbers instead of six.
+    """
+
+    def __init__(self, body: str, scale: float = 0.05, turn: float = 0.0):
+        self.body, self.scale, self.turn = body, scale, turn
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        mocap = {name: i for i, name in enumerate(names_of(model, "body")) if model.body_mocapid[i] >= 0}
+        check_name("mocap body", self.body, mocap)
+        bound.index = int(model.body_mocapid[mocap[self.body]])
+        weld = int(mujoco.mjtEq.mjEQ_WELD)
+        ends = model.eq_obj1id, model.eq_obj2id
+        pulled = {
+            int(b[i]) for a, b in (ends, ends[::-1]) for i in np.flatnonzero((model.eq_type == weld) & (a == mocap[self.body]))
+        }
+        if len(pulled) != 1:
+            raise ValueError(f"mocap body {self.body!r} must be welded to one body; the model welds {len(pulled)} to it")
+        bound.place = Place(model, f"body:{model.body(pulled.pop()).name}")
+        bound.size = 6 if self.turn else 3
+        bound.labels = [f"{self.body} {axis}" for axis in ("x", "y", "z", "turn x", "turn y", "turn z")[: bound.size]]
+        return bound
+
+    def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
+        pos, mat = self.place.pose(physics.qpos)
+        mocap = controls.mocap.at[self.index, :3].set(pos + self.scale * action[:3])
+        if self.turn:
+            half = jnp.concatenate([jnp.ones(1, jnp.float32), 0.5 * self.turn * action[3:]])
+            turned = quat_multiply(half, to_quat(mat))
+            mocap = mocap.at[self.index, 3:].set(turned / jnp.sqrt(jnp.sum(jnp.square(turned))))
+        return dataclasses.replace(controls, mocap=mocap)
+
+    index: int
+    place: Place
+
+
+def is_servo(model: mujoco.MjModel, index: int) -> bool:
+    """Whether an actuator is a position servo: its force falls with the position of what it drives."""
+    return bool(model.actuator_biastype[index] == _AFFINE and model.actuator_biasprm[index, 1] < 0)
+
+
+def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Inputs [nu] that hold a configuration: servos of joints hold theirs, and all others get 0."""
+    ctrl = np.zeros(model.nu)
+    for index in range(model.nu):
+        if is_servo(model, index) and (joint := _joint(model, index)) >= 0:
+            ctrl[index] = model.actuator_gear[index, 0] * qpos[model.jnt_qposadr[joint]]
+    limited = model.actuator_ctrllimited.astype(bool)
+    ctrl[limited] = np.clip(ctrl[limited], *model.actuator_ctrlrange[limited].T)
+    return ctrl
+
+
+def _joint(model: mujoco.MjModel, index: int) -> int:
+    """The hinge or slide that an actuator drives, or -1."""
+    joint = int(model.actuator_trnid[index, 0]) if model.actuator_trntype[index] == _JOINT else -1
+    return joint if joint >= 0 and int(model.jnt_type[joint]) in (2, 3) else -1
+
+
+def _range(model: mujoco.MjModel, index: int) -> Any:
+    """Lowest and highest input of an actuator."""
+    joint = _joint(model, index)
+    if model.actuator_ctrllimited[index]:
+        return model.actuator_ctrlrange[index]
+    if is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
+        return np.sort(model.actuator_gear[index, 0] * model.jnt_range[joint])
+    name = model.actuator(index).name or model.joint(joint).name
+    raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")

@@ -1,0 +1,244 @@
+"""Kinds of goals. Each defines the goal's size, distance, threshold, sampling range and drawing, and what a model achieves."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.context import euclidean
+from mjx_dher.envs.arm_kinematics import quat_to_matrix
+from mjx_dher.envs.controls import pick
+from mjx_dher.envs.engines import Physics
+from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
+from mjx_dher.types import Array, PRNGKey
+
+Mark = tuple[int, np.ndarray, np.ndarray]  # body (-1: a ball), its position [3], m, and orientation [4] (w, x, y, z)
+Bounds = Sequence[float]
+_UNIT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Goal:
+    """Base class."""
+
+    size: int  # G
+    threshold: float  # largest distance at which the goal is reached
+    low: Any = None  # lowest and highest goals that `sample` draws and a hand may drag to, [G] or [3]
+    high: Any = None
+    place: Place | None = None  # what the goal is about, if it is about a site or body
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
+        raise NotImplementedError
+
+    def achieved(self, physics: Physics) -> Array:
+        """The goal [G] that a state achieves."""
+        raise NotImplementedError
+
+    def sample(self, key: PRNGKey) -> Array:
+        """Draws a goal [G]."""
+        raise NotImplementedError
+
+    distance: Any  # (achieved [..., G], desired [..., G]) -> [...]
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        """What to draw for a goal: balls, and bodies as ghosts."""
+        raise NotImplementedError
+
+
+class Position(Goal):
+    """A position of a site or body, [3] m.
+
+    Args:
+      of: "site:NAME" or "body:NAME".
+      low, high: lowest and highest coordinates [3] of goals, m.
+      threshold: m.
+    """
+
+    size = 3
+    distance = staticmethod(euclidean)
+
+    def __init__(self, of: str, low: Bounds, high: Bounds, threshold: float = 0.05):
+        self.of, self.low, self.high, self.threshold = of, low, high, threshold
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        bound.place = Place(model, self.of)
+        bound.low, bound.high = box(f"goal {bound.place.name}", 3, self.low, self.high)
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        return self.place.position(physics.qpos)  # type: ignore[union-attr]
+
+    def sample(self, key: PRNGKey) -> Array:
+        return jax.random.uniform(key, (3,), jnp.float32, self.low, self.high)
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        return [(-1, np.asarray(goal[:3]), _UNIT)]
+
+
+class Rotation(Goal):
+    """An orientation of a site or body: the first two columns of its rotation matrix, [6]. The distance is an angle, rad.
+
+    Args:
+      of: "site:NAME" or "body:NAME".
+      axis: goals are turns about this axis [3] of the world; None for any orientation.
+      threshold: rad.
+    """
+
+    size = 6
+
+    def __init__(self, of: str, axis: Bounds | None = None, threshold: float = 0.1):
+        self.of, self.axis, self.threshold = of, axis, threshold
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        bound.place = Place(model, self.of)
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        return self.place.rotation(physics.qpos)  # type: ignore[union-attr]
+
+    def sample(self, key: PRNGKey) -> Array:
+        if self.axis is None:
+            quat = jax.random.normal(key, (4,), jnp.float32)
+        else:
+            half = jax.random.uniform(key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
+            axis = np.divide(self.axis, np.linalg.norm(self.axis), dtype=np.float32, casting="same_kind")
+            quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+        return quat_to_matrix(quat)[:, :2].T.ravel()
+
+    @staticmethod
+    def distance(achieved: Array, desired: Array) -> Array:
+        # The matrices' difference has the norm sqrt(8) sin(angle / 2), which is exact for small angles, unlike a cosine.
+        squares = [jnp.sum(jnp.square(a - b), axis=-1) for a, b in zip(_columns(achieved), _columns(desired), strict=True)]
+        return 2.0 * jnp.arcsin(jnp.minimum(jnp.sqrt(sum(squares) / 8.0), 1.0))
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        assert self.place is not None
+        here = np.asarray(self.place.position(jnp.asarray(qpos, jnp.float32)))
+        return [_ghost(self.place, here, goal)]
+
+
+class Pose(Goal):
+    """A position and an orientation of a site or body, [3 + 6]. It is reached if both thresholds are kept.
+
+    The distance is in m. An angle counts as `threshold / angle` m a radian, if that is more than the distance of the positions.
+
+    Args:
+      of, low, high, threshold: as for `Position`.
+      axis, angle: as `axis` and `threshold` of `Rotation`.
+    """
+
+    size = 9
+
+    def __init__(
+        self, of: str, low: Bounds, high: Bounds, threshold: float = 0.05, axis: Bounds | None = None, angle: float = 0.1
+    ):
+        self.position, self.rotation = Position(of, low, high, threshold), Rotation(of, axis, angle)
+        self.threshold = threshold
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        bound.position, bound.rotation = self.position.bind(model), self.rotation.bind(model)
+        bound.place, bound.low, bound.high = bound.position.place, bound.position.low, bound.position.high
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        return jnp.concatenate([self.position.achieved(physics), self.rotation.achieved(physics)])
+
+    def sample(self, key: PRNGKey) -> Array:
+        position_key, rotation_key = jax.random.split(key)
+        return jnp.concatenate([self.position.sample(position_key), self.rotation.sample(rotation_key)])
+
+    def distance(self, achieved: Array, desired: Array) -> Array:
+        angle = Rotation.distance(achieved[..., 3:], desired[..., 3:])
+        return jnp.maximum(euclidean(achieved[..., :3], desired[..., :3]), self.threshold / self.rotation.threshold * angle)
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        assert self.place is not None
+        return [(-1, np.asarray(goal[:3]), _UNIT), _ghost(self.place, goal[:3], goal[3:])]
+
+
+class Joints(Goal):
+    """Positions of hinges and slides, [number of joints]. The distance is the largest difference of a joint, rad or m.
+
+    Args:
+      names: names of joints, separated by spaces; "*" and "?" stand for any characters.
+      low, high: lowest and highest positions of goals, by default the joints' ranges.
+      threshold: rad or m.
+    """
+
+    def __init__(self, names: str = "*", low: Bounds | None = None, high: Bounds | None = None, threshold: float = 0.1):
+        self.names, self.low, self.high, self.threshold = names, low, high, threshold
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = copy.copy(self)
+        names = [name if model.jnt_type[i] in (HINGE, SLIDE) else "" for i, name in enumerate(names_of(model, "joint"))]
+        bound.joints = pick("joint of the goal", self.names, names)
+        bound.qpos, bound.size = model.jnt_qposadr[bound.joints], len(bound.joints)
+        limits = model.jnt_range[bound.joints].T.copy()
+        unlimited = ~model.jnt_limited[bound.joints].astype(bool)
+        if self.low is None and unlimited.any():
+            raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range: give low and high")
+        limits[:, unlimited] = [[-np.inf], [np.inf]]
+        low, high = limits if self.low is None or self.high is None else (self.low, self.high)
+        bound.low, bound.high = box("goal", bound.size, low, high)
+        for i in np.flatnonzero((bound.low < limits[0] - 1e-6) | (bound.high > limits[1] + 1e-6))[:1]:
+            raise ValueError(
+                f"goal: joint {names[bound.joints[i]]!r} reaches {limits[0, i]:g} to {limits[1, i]:g}; the goals go from"
+                f" {bound.low[i]:g} to {bound.high[i]:g}"
+            )
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        return physics.qpos[self.qpos]
+
+    def sample(self, key: PRNGKey) -> Array:
+        return jax.random.uniform(key, (self.size,), jnp.float32, self.low, self.high)
+
+    @staticmethod
+    def distance(achieved: Array, desired: Array) -> Array:
+        return jnp.max(jnp.abs(achieved - desired), axis=-1)
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos
+        data.qpos[self.qpos] = goal
+        mujoco.mj_kinematics(model, data)
+        own = {int(model.jnt_bodyid[joint]) for joint in self.joints}
+        moved = set[int]()
+        for body in range(1, model.nbody):  # parents come first
+            if body in own or int(model.body_parentid[body]) in moved:
+                moved.add(body)
+        return [(body, data.xpos[body].copy(), data.xquat[body].copy()) for body in sorted(moved)]
+
+    joints: list[int]
+    qpos: np.ndarray
+
+
+def box(what: str, size: int, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Converts bounds to float32 [size] each. Raises ValueError if they are no finite numbers with low <= high."""
+    ends = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    if any(end.shape != (size,) for end in ends) or not np.all(np.isfinite(ends)) or np.any(ends[0] > ends[1]):
+        raise ValueError(f"{what}: low and high must be {size} finite numbers each, low <= high; got {low} and {high}")
+    return ends
+
+
+def _ghost(place: Place, pos: np.ndarray, columns: np.ndarray) -> Mark:
+    """The body of a site or body that is at `pos` [3], with the first two columns [6] of its rotation matrix."""
+    first, second = np.reshape(np.asarray(columns, float), (2, 3))
+    mat = np.stack([first, second, np.cross(first, second)], axis=1) @ place.offset[1].T
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, mat.ravel())
+    return place.body, np.asarray(pos, float) - mat @ place.offset[0], quat
+
+
+def _columns(goal: Array) -> tuple[Array, Array, Array]:
+    first, second = goal[..., :3], goal[..., 3:]
+    return first, second, jnp.cross(first, second)

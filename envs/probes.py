@@ -1,0 +1,88 @@
+"""Cheap trials of a model before training: is it stable, and can the robot reach its goals?"""
+
+from __future__ import annotations
+
+import warnings
+
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.goals import Goal
+from mjx_dher.envs.kinematics import HINGE, SLIDE, Place
+
+_SECONDS = 1.0  # of simulation, at most
+_ATTEMPTS, _ITERATIONS = 5, 40
+_BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+
+
+def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seconds: float) -> None:
+    """Simulates the start, first held and then under random inputs.
+
+    Raises:
+      ValueError: the simulation diverges; the message names the joint.
+    """
+    rng = np.random.default_rng(0)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, 0.0).T
+    inputs = {"held at the start": ctrl, "under random inputs": rng.uniform(low, high)}
+    for what, held in inputs.items():
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = qpos, held
+        for _ in range(int(min(seconds, _SECONDS) / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+            for name in _BAD:
+                if data.warning[getattr(mujoco.mjtWarning, name)].number:
+                    dof = int(data.warning[getattr(mujoco.mjtWarning, name)].lastinfo)
+                    joint = model.joint(int(model.dof_jntid[min(dof, model.nv - 1)])).name
+                    raise ValueError(
+                        f"unstable model: joint {joint!r} diverges, {what}; a smaller timestep, more damping or armature, or"
+                        " a start without overlapping geoms can help"
+                    )
+
+
+def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> None:
+    """Looks for poses that reach some goals; warns if it misses many.
+
+    Goals of bodies that a free or ball joint moves are not tried.
+
+    Raises:
+      ValueError: it finds a pose for none of the goals.
+    """
+    place = goal.place
+    if place is None or goal.low is None or not all(joint.kind in (HINGE, SLIDE) for joint in place.joints):
+        return
+    goals = np.random.default_rng(0).uniform(goal.low, goal.high, (8, 3))
+    missed = np.array([_distance(model, start, place, each) for each in goals])
+    if (missed > goal.threshold).all():
+        raise ValueError(
+            f"goal: no pose brings {place.name!r} to the goals from {goal.low} to {goal.high}; the nearest miss them by"
+            f" {missed.min():.3g} m, and the threshold is {goal.threshold:g} m"
+        )
+    if (missed > goal.threshold).mean() > 0.2:
+        warnings.warn(f"no pose brings {place.name!r} to {(missed > goal.threshold).mean():.0%} of the goals", stacklevel=2)
+
+
+def _distance(model: mujoco.MjModel, start: np.ndarray, place: Place, goal: np.ndarray) -> float:
+    """Distance, m, at which inverse kinematics from a few configurations ends."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    dofs = [joint.qvel for joint in place.joints]  # hinges and slides have one each
+    joints = model.dof_jntid[dofs]
+    limited = model.jnt_limited[joints].astype(bool)
+    low, high = np.where(limited, model.jnt_range[joints].T, [[-np.pi], [np.pi]])
+    at, jacobian, best = model.jnt_qposadr[joints], np.zeros((3, model.nv)), np.inf
+    for attempt in range(_ATTEMPTS):
+        data.qpos[:] = start
+        if attempt:
+            data.qpos[at] = rng.uniform(low, high)
+        for _ in range(_ITERATIONS):
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            point = data.xpos[place.body] + data.xmat[place.body].reshape(3, 3) @ place.offset[0]
+            error = goal - point
+            best = min(best, float(np.linalg.norm(error)))
+            mujoco.mj_jac(model, data, jacobian, None, point, place.body)
+            part = jacobian[:, dofs]
+            step = part.T @ np.linalg.solve(part @ part.T + 1e-4 * np.eye(3), error)
+            data.qpos[at] = np.clip(data.qpos[at] + np.clip(step, -0.3, 0.3), low, high)
+        if best < 1e-3:
+            break
+    return best

@@ -1,0 +1,318 @@
+"""A task from a robot's MJCF: `MujocoTask`, with its controls, goals, observations and starts."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.envs import probes
+from mjx_dher.envs.base import GoalEnv, State
+from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque, rest_ctrl
+from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation, box
+from mjx_dher.envs.kinematics import FREE, HINGE, SLIDE, Place, names_of
+from mjx_dher.envs.observations import term
+from mjx_dher.lookup import check_name
+from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
+from mjx_dher.validation import check_count, check_number
+
+__all__ = [
+    "Actuators",
+    "Control",
+    "Goal",
+    "JointDelta",
+    "JointPosition",
+    "Joints",
+    "Mocap",
+    "MujocoTask",
+    "Place",
+    "Pose",
+    "Position",
+    "Rotation",
+    "Start",
+    "Torque",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Starts of episodes.
+
+    Args:
+      keyframe: name of a keyframe of the model; None for the model's default configuration.
+      ranges: low and high, by the name of a free body ([3] m each, a position) or of a hinge or slide (rad or m). A start is
+        uniform between them.
+      settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
+    """
+
+    keyframe: str | None = None
+    ranges: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
+    settle: int = 0
+
+
+class MujocoTask(GoalEnv):
+    """A goal-conditioned task from a model and a few declarations. Every method may be overridden.
+
+    Args:
+      engine: "auto", "native", "jax" or "warp".
+      reward_type: "sparse" (0 if the goal is reached, else -1) or "dense" (minus the distance, without a lower bound).
+      distance_threshold: largest distance at which the goal is reached; None for the goal's own.
+      episode_length: steps of an episode; None for the class's.
+      **engine_options: options of the engine; see `make_engine`.
+
+    Raises:
+      ValueError: the model lacks a name that is declared, or it is unstable, or no pose of the robot reaches a goal.
+    """
+
+    model: Any  # MJCF (a path, relative to the file of the class, or the text), MjSpec or MjModel; of an object, the MjModel
+    control: Control | Sequence[Control] = JointPosition()
+    goal: Goal
+    observations: Sequence[str] = ("qpos:*", "qvel:*")
+    start = Start()
+    hz: float = 25.0  # actions per second
+    episode_length: int = 50
+    max_speed: float = 1000.0  # rad/s or m/s; beyond it the physics has blown up
+
+    def __init__(
+        self,
+        engine: str = "auto",
+        reward_type: str = "sparse",
+        distance_threshold: float | None = None,
+        episode_length: int | None = None,
+        **engine_options: Any,
+    ):
+        if reward_type not in ("sparse", "dense"):
+            raise ValueError(f"reward_type must be 'sparse' or 'dense'; got {reward_type!r}")
+        self.reward_type = reward_type
+        self.episode_length = _plain(type(self).episode_length if episode_length is None else episode_length)
+        check_count("episode_length", self.episode_length)
+        self.name = getattr(type(self), "name", type(self).__name__)
+        self.model = load_model(type(self))
+        substeps = substeps_of(self.hz, self.model.opt.timestep)
+        self.dt = substeps * float(self.model.opt.timestep)  # s
+        self.engine = make_engine(engine, self.model, substeps, **engine_options)
+        self.bind()
+        self.distance_threshold = _plain(self.goal.threshold if distance_threshold is None else distance_threshold)
+        check_number("distance_threshold", self.distance_threshold, "(0, inf)", float)
+
+    def bind(self) -> None:
+        """Looks up the declared names in the model, and tries the model out."""
+        declared = type(self).control
+        self.parts = [part.bind(self.model) for part in (declared if isinstance(declared, Sequence) else (declared,))]
+        self.action_size = sum(part.size for part in self.parts)
+        self.goal = type(self).goal.bind(self.model)
+        self.goal_size = self.goal.size
+        self.goal_distance: DistanceFn = self.goal.distance
+        self._bind_start()
+        self.layout: dict[str, slice] = {}  # of the observation, by the name of its parts
+        self._terms = {text: term(self.model, text) for text in self.observations}
+        end = 0
+        for text, part in self._terms.items():
+            size = jax.eval_shape(part, self._rest).shape[0]
+            self.layout[text] = slice(end, end + size)
+            end += size
+        self.observation_size = end
+        probes.check_stable(self.model, np.asarray(self._rest.qpos), self._rest_ctrl, self.dt * self.episode_length)
+        probes.check_reachable(self.model, np.asarray(self._rest.qpos), self.goal)
+
+    @property
+    def spec(self) -> EnvSpec:
+        """The task's contract."""
+        observation = jax.ShapeDtypeStruct((self.observation_size,), jnp.float32)
+        lowest = -1.0 if self.reward_type == "sparse" else -np.inf
+        return EnvSpec(observation, self.goal_size, self.action_size, self.episode_length, reward_range=(lowest, 0.0))
+
+    @property
+    def goal_bounds(self) -> np.ndarray | None:
+        """Lowest and highest coordinates [2, 3] of goals, m, if they are positions."""
+        return None if self.goal.low is None or self.goal.place is None else np.stack([self.goal.low, self.goal.high])
+
+    def goal_marks(self, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        """What to draw for a goal in a configuration [nq]: balls and ghosts of bodies."""
+        return self.goal.marks(self.model, qpos, goal)
+
+    def reset(self, key: PRNGKey) -> State:
+        """Draws a start and a goal."""
+        start_key, goal_key = jax.random.split(key)
+        return self.init_state(self.start_physics(start_key), self.sample_goal(goal_key))
+
+    def init_state(self, physics: Physics, desired_goal: Array) -> State:
+        """Returns the first state of an episode that starts from `physics`, with a goal [G]."""
+        obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
+        return State(
+            physics=physics,
+            obs=obs,
+            reward=jnp.zeros((), jnp.float32),
+            success=self._success(obs),
+            step=jnp.zeros((), jnp.int32),
+            failed=jnp.zeros((), bool),
+        )
+
+    def with_goal(self, state: State, goal: Array) -> State:
+        """Returns the state with another desired goal [G]."""
+        obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
+        return dataclasses.replace(state, obs=obs, success=self._success(obs))
+
+    def step(self, state: State, action: Array) -> State:
+        """Applies an action [A] for one step.
+
+        If the physics blows up, the state goes back to the start, and `failed` stays True until `reset`.
+        """
+        action = jnp.clip(self.check_action(action), -1.0, 1.0)
+        physics = self.engine.advance(state.physics, self.controls(state.physics, action))
+        sound = self.is_sound(physics)
+        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._rest)
+        failed = state.failed | ~sound
+        obs = self.observe_goal(physics, state.obs["desired_goal"])
+        return State(
+            physics=physics,
+            obs=obs,
+            reward=self.compute_reward(obs["achieved_goal"], obs["desired_goal"]),
+            success=jnp.where(failed, 0.0, self._success(obs)),
+            step=state.step + 1,
+            failed=failed,
+        )
+
+    def check(self) -> None:
+        self.engine.check()
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """Rewards [...] of goals [..., G]. Sparse: 0 if reached, else -1. Dense: minus the distance."""
+        if self.reward_type == "dense":
+            return -self.goal_distance(achieved_goal, desired_goal)
+        return -(~self.reached(achieved_goal, desired_goal)).astype(jnp.float32)  # -1, too, if the distance is NaN
+
+    def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """Whether goals [..., G] are reached, bool [...]."""
+        return self.goal_distance(achieved_goal, desired_goal) <= self.distance_threshold
+
+    def start_physics(self, key: PRNGKey) -> Physics:
+        """Draws the physics of a start."""
+        qpos = jnp.asarray(self._rest.qpos)
+        for number, (index, low, high) in enumerate(self._ranges):
+            drawn = jax.random.uniform(jax.random.fold_in(key, number), low.shape, jnp.float32, low, high)
+            qpos = qpos.at[index : index + low.shape[0]].set(drawn)
+        physics = dataclasses.replace(self._rest, qpos=qpos)
+        if not self.start.settle:
+            return physics
+        return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, self._hold), physics)
+
+    def sample_goal(self, key: PRNGKey) -> Array:
+        """Draws a goal [G]."""
+        return self.goal.sample(key)
+
+    def controls(self, physics: Physics, action: Array) -> Controls:
+        """The engine's inputs for an action [A] in [-1, 1]. Inputs that no control has are those of the start."""
+        controls, begin = self._hold, 0
+        for part in self.parts:
+            controls = part.apply(physics, action[begin : begin + part.size], controls)
+            begin += part.size
+        return controls
+
+    def observe(self, physics: Physics) -> Array:
+        """The observation [D]; `layout` has the slices of its parts."""
+        return jnp.concatenate([part(physics) for part in self._terms.values()])
+
+    def achieved(self, physics: Physics) -> Array:
+        """The goal [G] that a state achieves."""
+        return self.goal.achieved(physics)
+
+    def observe_goal(self, physics: Physics, desired_goal: Array) -> GoalObs:
+        """Observation, achieved and desired goal, float32 also if JAX computes in 64 bits."""
+        observation, achieved = self.observe(physics).astype(jnp.float32), self.achieved(physics).astype(jnp.float32)
+        return GoalObs(observation=observation, achieved_goal=achieved, desired_goal=desired_goal.astype(jnp.float32))
+
+    def is_sound(self, physics: Physics) -> Array:
+        """Whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(physics)]
+        return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < self.max_speed)
+
+    def _success(self, obs: GoalObs) -> Array:
+        return self.reached(obs["achieved_goal"], obs["desired_goal"]).astype(jnp.float32)
+
+    def _bind_start(self) -> None:
+        """Sets the start's physics, the inputs that hold it, and the ranges [first index in qpos, low, high]."""
+        model, start = self.model, self.start
+        data = mujoco.MjData(model)
+        if start.keyframe is not None:
+            check_name("keyframe", start.keyframe, names_of(model, "key"))
+            mujoco.mj_resetDataKeyframe(model, data, model.key(start.keyframe).id)
+        self._ranges: list[tuple[int, np.ndarray, np.ndarray]] = []
+        places = start_places(model)
+        for name, ends in start.ranges.items():
+            check_name("name in the ranges of start", name, places)
+            index, size = places[name]
+            low, high = box(f"start: {name}", size, *map(np.atleast_1d, ends))
+            self._ranges.append((index, low, high))
+            data.qpos[index : index + size] = 0.5 * (low + high)
+        self._rest_ctrl = data.ctrl if data.ctrl.any() else rest_ctrl(model, data.qpos)
+        # NumPy arrays become constants of the programs that use them, on any device.
+        arrays: Any = (np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act))
+        self._rest = Physics(*arrays)
+        mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1).astype(np.float32)
+        self._hold = Controls(ctrl=jnp.asarray(self._rest_ctrl, jnp.float32), mocap=jnp.asarray(mocap))
+
+
+def start_places(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
+    """First index in qpos and number of coordinates, by the names of free bodies (3) and of hinges and slides (1)."""
+    places = {}
+    for i in range(model.njnt):
+        kind, index = int(model.jnt_type[i]), int(model.jnt_qposadr[i])
+        if kind == FREE:
+            places[model.body(int(model.jnt_bodyid[i])).name] = (index, 3)
+        elif kind in (HINGE, SLIDE):
+            places[model.joint(i).name] = (index, 1)
+    return places
+
+
+def load_model(task: type) -> mujoco.MjModel:
+    """Compiles the MJCF of a task class.
+
+    Raises:
+      ValueError: there is no such file, or MuJoCo rejects it.
+    """
+    model = getattr(task, "model", None)
+    try:
+        if isinstance(model, mujoco.MjModel):
+            return copy.copy(model)
+        if isinstance(model, mujoco.MjSpec):
+            return model.compile()
+        if isinstance(model, str) and model.lstrip().startswith("<"):
+            return mujoco.MjModel.from_xml_string(model)
+        if isinstance(model, (str, Path)):
+            return mujoco.MjModel.from_xml_path(str(_folder(task) / model))
+    except ValueError as error:
+        raise ValueError(f"model of {task.__name__}: {error}") from error
+    raise ValueError(f"model of {task.__name__} must be an MJCF (path or text), MjSpec or MjModel; got {model!r}")
+
+
+def _folder(task: type) -> Path:
+    """Folder of the file that declares the model of a task class; the current one if there is no file, as in a notebook."""
+    owner = next(base for base in task.__mro__ if "model" in vars(base))
+    try:
+        return Path(inspect.getfile(owner)).parent
+    except (TypeError, OSError):
+        return Path()
+
+
+def substeps_of(hz: float, timestep: float) -> int:
+    """Timesteps of the model for each action. Raises ValueError if `hz` does not make a whole number of them."""
+    check_number("hz", hz, "(0, inf)", float)
+    substeps = round(1 / (hz * timestep))
+    if substeps < 1 or abs(substeps * timestep * hz - 1) > 1e-6:
+        nearest = sorted({round(1 / (n * timestep), 4) for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})
+        raise ValueError(f"hz must make a whole number of the model's timesteps of {timestep:g} s; got {hz}, near {nearest}")
+    return substeps
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

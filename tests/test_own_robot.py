@@ -1,0 +1,304 @@
+"""Tasks from an MJCF (`envs.task`): kinematics, controls, goals, observations and starts, by values computed by hand."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from conftest import refuses
+
+from mjx_dher import testing
+from mjx_dher.envs import task
+from mjx_dher.envs.engines import Physics
+from mjx_dher.envs.kinematics import Place, to_quat
+
+# A free body and a chain of two ball joints, slides with a reference, and two hinges of one body beside their anchors.
+TREE = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos=".1 .2 .3" euler="20 30 40">
+      <joint name="slide" type="slide" axis="1 1 0" ref=".2"/><geom size=".1"/>
+      <body name="ball" pos=".3 0 0"><joint type="ball" pos="0 .1 0"/><geom size=".1"/>
+        <body name="hinges" pos="0 0 .4" euler="0 10 0">
+          <joint axis="0 1 0" pos=".1 0 0" ref="10"/><joint axis="1 0 1" pos="0 .1 .1"/><geom size=".1"/>
+          <body name="fixed" pos=".1 0 0" euler="30 0 0"><geom size=".1"/><site name="tip" pos=".1 .2 0" euler="0 0 50"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="cube" pos="1 0 0"><freejoint/><geom size=".1"/><site name="corner" pos=".1 .1 .1"/></body>
+    <body name="target" mocap="true"><body name="held"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["site:tip", "body:fixed", "body:hinges", "body:ball", "site:corner", "cube", "world"])
+def test_kinematics_are_mujoco_s_for_every_kind_of_joint(name):
+    model = mujoco.MjModel.from_xml_string(TREE)
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    place = Place(model, name)
+    pose, motion = jax.jit(place.pose), jax.jit(place.motion)
+    for _ in range(3):
+        data.qpos[:], data.qvel[:] = rng.normal(size=model.nq), rng.normal(size=model.nv)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_forward(model, data)
+        kind, _, rest = place.name.partition(":")
+        mine, kind = (
+            (data.site(rest), mujoco.mjtObj.mjOBJ_SITE) if kind == "site" else (data.body(rest), mujoco.mjtObj.mjOBJ_XBODY)
+        )
+        pos, mat = pose(jnp.float32(data.qpos))
+        np.testing.assert_allclose(pos, mine.xpos, atol=2e-6)
+        np.testing.assert_allclose(mat.ravel(), mine.xmat, atol=2e-6)
+        back = np.zeros(9)
+        mujoco.mju_quat2Mat(back, np.asarray(to_quat(mat), float))
+        np.testing.assert_allclose(back, mine.xmat, atol=2e-6)
+        twist = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, kind, mine.id, twist, 0)
+        linear, angular = motion(jnp.float32(data.qpos), jnp.float32(data.qvel))
+        np.testing.assert_allclose(linear, twist[3:], atol=1e-5)
+        np.testing.assert_allclose(angular, twist[:3], atol=1e-5)
+
+
+def test_a_place_that_the_state_does_not_determine_is_rejected():
+    model = mujoco.MjModel.from_xml_string(TREE)
+    with refuses("held", "target"):
+        Place(model, "body:held")
+    with refuses("site", "tap", "tip"):
+        Place(model, "site:tap")
+    with refuses("joint:x", "joint", "site", "body"):
+        Place(model, "joint:x")
+
+
+# Two hinges with servos, a motor on a slide, and a free box: nothing touches anything, and there is no gravity.
+MACHINE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option gravity="0 0 0" timestep="0.01"/>
+  <default><joint damping="1" armature="1"/></default>
+  <worldbody>
+    <body name="one"><joint name="a" axis="0 0 1" range="-1 2"/><geom size=".02" pos=".5 0 0"/>
+      <body name="two" pos=".5 0 0"><joint name="b" axis="0 0 1" range="-2 2"/><geom size=".02" pos=".5 0 0"/>
+        <site name="tip" pos=".5 0 0"/></body></body>
+    <body name="cart" pos="0 5 0"><joint name="c" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+    <body name="box" pos="0 0 1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+    <body name="hand" mocap="true" pos="3 0 0"/>
+    <body name="held" pos="3 0 0"><freejoint/><geom size=".1"/></body>
+  </worldbody>
+  <equality><weld body1="hand" body2="held" relpose="0 0 0 1 0 0 0"/></equality>
+  <actuator>
+    <position name="servo" joint="a" kp="10" kv="1" gear="2"/>
+    <position joint="b" kp="10" kv="1" ctrlrange="-1 1.5"/>
+    <motor joint="c" ctrlrange="-4 4"/>
+  </actuator>
+  <keyframe><key name="bent" qpos="0.3 -0.2 0 0 0 1 1 0 0 0 3 0 0 1 0 0 0" ctrl="0.1 0.2 0.3"/></keyframe>
+</mujoco>"""
+
+
+class Machine(task.MujocoTask):
+    model = MACHINE
+    goal = task.Position("site:tip", (0.3, 0.3, 0.0), (0.6, 0.6, 0.0), threshold=0.1)
+    hz = 20.0
+
+
+def make(**declared):
+    return type("Declared", (Machine,), declared)(engine="native")
+
+
+START = Physics(
+    qpos=jnp.array([0.3, -0.2, 0.5, 0, 0, 1, 1, 0, 0, 0, 3, 0, 0, 1, 0, 0, 0]), qvel=jnp.arange(15.0), warmstart=0, act=0
+)
+
+
+CONTROLS = [
+    # From the middle of the range of a servo with gear 2, whose joint has -1 to 2, and of one with -1 to 1.5.
+    (task.JointPosition(), [0.0, 1.0], [1.0, 1.5, 0], None),
+    (task.JointPosition("b"), [-1.0], [0, -1.0, 0], None),
+    (task.JointDelta("servo b", scale=0.5), [1.0, -1.0], [2 * 0.8, -0.7, 0], None),
+    (task.JointDelta("b", scale=9.0), [1.0], [0, 1.5, 0], None),
+    (task.Torque("c"), [-0.5], [0, 0, -2.0], None),
+    (task.Actuators("c *"), [1.0, 1.0, 1.0], [4.0, 1.5, 4.0], None),
+    (task.Mocap("hand", scale=0.1), [1.0, 0.0, -1.0], [0, 0, 0], [3.1, 0, -0.1, 1, 0, 0, 0]),
+    (task.Mocap("hand", turn=2.0), [0, 0, 0, 0, 0, 1.0], [0, 0, 0], [3, 0, 0, 2**-0.5, 0, 0, 2**-0.5]),
+    ((task.Torque(), task.Mocap("hand", scale=1.0)), [0.5, 0, 1.0, 0], [0, 0, 2.0], [3, 1, 0, 1, 0, 0, 0]),
+]
+
+
+def test_controls():
+    tasks = [make(control=control) for control, *_ in CONTROLS]
+    assert [env.action_size for env in tasks] == [len(action) for _, action, *_ in CONTROLS]
+    actions = [jnp.array(action) for _, action, *_ in CONTROLS]
+    results = jax.jit(lambda *actions: [env.controls(START, action) for env, action in zip(tasks, actions)])(*actions)
+    for (_, _, ctrl, mocap), controls in zip(CONTROLS, results, strict=True):
+        np.testing.assert_allclose(controls.ctrl, ctrl, atol=1e-6)
+        np.testing.assert_allclose(controls.mocap[0], [3, 0, 0, 1, 0, 0, 0] if mocap is None else mocap, atol=1e-6)
+
+
+def test_observations():
+    parts = {
+        "site:tip": [0.5 * np.cos(0.3) + 0.5 * np.cos(0.1), 0.5 * np.sin(0.3) + 0.5 * np.sin(0.1), 0],
+        "body:two": [0.5 * np.cos(0.3), 0.5 * np.sin(0.3), 0],
+        "body:box - body:two": [-0.5 * np.cos(0.3), -0.5 * np.sin(0.3), 1],
+        "rot:tip": [np.cos(0.1), np.sin(0.1), 0, -np.sin(0.1), np.cos(0.1), 0],
+        "rot:box": [1, 0, 0, 0, 1, 0],
+        "angvel:tip": [0, 0, 0 + 1],
+        "vel:two": [0, 0, 0],  # the first joint is at rest
+        "vel:site:tip": [-0.5 * np.sin(0.1), 0.5 * np.cos(0.1), 0],
+        "vel:box": [3, 4, 5],
+        "angvel:box": [6, 7, 8],
+        "qpos:a c": [0.3, 0.5],
+        "qvel:?": [0, 1, 2],
+    }
+    env = make(observations=tuple(parts), control=task.Torque())
+    observed = jax.jit(env.observe)(START)
+    assert list(env.layout) == list(parts)
+    assert observed.shape == (env.observation_size,) == (sum(map(len, parts.values())),)
+    for text, value in parts.items():
+        np.testing.assert_allclose(observed[env.layout[text]], value, atol=1e-6, err_msg=text)
+
+
+def turned(angle, axis=2):
+    """The goal of a turn about one of the world's axes."""
+    mat = np.zeros(9)
+    mujoco.mju_axisAngle2Quat(quat := np.zeros(4), np.eye(3)[axis], angle)
+    mujoco.mju_quat2Mat(mat, quat)
+    return mat.reshape(3, 3)[:, :2].T.ravel()
+
+
+GOALS = [
+    (task.Position("body:box", (0, 0, 1), (1, 0, 2)), [0, 0, 1], [0.3, 0, 1.4], 0.5),
+    (task.Rotation("box"), turned(0), turned(1e-3, axis=1), 1e-3),
+    (task.Rotation("box", axis=(0, 0, 1)), turned(0), turned(np.pi), np.pi),
+    (task.Pose("box", (0, 0, 0), (1, 1, 1)), [0, 0, 1, *turned(0)], [0, 0, 1.04, *turned(0.2, axis=0)], 0.1),
+    (task.Pose("box", (0, 0, 0), (1, 1, 1)), [0, 0, 1, *turned(0)], [0, 0, 2, *turned(0.2, axis=0)], 1.0),
+    (task.Joints("a b"), [0.3, -0.2], [0.4, 0.2], 0.4),
+    (task.Joints("c", low=[-1], high=[1]), [0.5], [0.25], 0.25),
+]
+
+
+def test_goals():
+    tasks = [make(goal=goal, control=task.Torque()) for goal, *_ in GOALS]
+
+    @jax.jit
+    def ask():
+        def one(env, achieved, other):
+            achieved, many = jnp.float32(achieved), jnp.float32([other, achieved])
+            drawn = jax.vmap(env.sample_goal)(jax.random.split(jax.random.key(0), 500))
+            results = (function(achieved, many) for function in (env.goal_distance, env.reached, env.compute_reward))
+            return env.achieved(START), *results, drawn
+
+        return [one(env, achieved, other) for env, (_, achieved, other, _) in zip(tasks, GOALS, strict=True)]
+
+    for env, (_, achieved, _, distance), (seen, distances, reached, rewards, drawn) in zip(tasks, GOALS, ask(), strict=True):
+        np.testing.assert_allclose(seen, achieved, atol=1e-6)
+        assert env.goal_size == len(achieved)
+        np.testing.assert_allclose(distances, [distance, 0], rtol=1e-4, atol=1e-6)
+        near = distance <= env.distance_threshold
+        assert (list(reached), list(rewards)) == ([near, True], [0 if near else -1, 0])
+        assert np.isfinite(drawn).all()
+        if env.goal.low is not None:
+            part = drawn[:, : len(env.goal.low)]
+            np.testing.assert_allclose([part.min(0), part.max(0)], [env.goal.low, env.goal.high], atol=0.02)
+        if env.goal_size in (6, 9):
+            angles = task.Rotation.distance(drawn[:, -6:], jnp.float32(turned(0)))
+            assert angles.min() < 0.5 < 3 < angles.max()
+
+
+def test_goals_are_drawn_as_balls_and_ghosts():
+    """A site's goal is drawn by its body, at the pose that brings the site to the goal."""
+    qpos = np.asarray(START.qpos)
+    marks = [
+        env.goal_marks(qpos, np.float32(goal))
+        for env, goal in (
+            (make(), [0.3, 0.4, 0]),
+            (make(goal=task.Rotation("tip")), turned(np.pi / 2)),
+            (make(goal=task.Joints("b")), [np.pi / 2 - 0.3]),
+        )
+    ]
+    data = mujoco.MjData(make().model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(make().model, data)
+    tip, two = data.site("tip").xpos, data.body("two")
+    ((body, pos, _),), (turn,), (bent,) = marks
+    assert body == -1
+    np.testing.assert_allclose(pos, [0.3, 0.4, 0], atol=1e-6)
+    for (body, pos, quat), place in ((turn, tip - [0, 0.5, 0]), (bent, two.xpos)):
+        assert body == two.id
+        np.testing.assert_allclose(pos, place, atol=1e-6)
+        np.testing.assert_allclose(quat, [2**-0.5, 0, 0, 2**-0.5], atol=1e-6)
+
+
+class Settled(Machine):
+    """Everything of a start: a keyframe, ranges and settling."""
+
+    start = task.Start("bent", ranges={"box": ((1, 1, 1), (2, 1, 3)), "a": (0.2, 0.4)}, settle=3)
+    control = task.JointDelta("b")
+
+
+def test_starts():
+    env = Settled(engine="native")
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
+    qpos = np.asarray(states.physics.qpos)
+    np.testing.assert_allclose([qpos[:, 3:6].min(0), qpos[:, 3:6].max(0)], [[1, 1, 1], [2, 1, 3]], atol=0.2)
+    assert len(np.unique(qpos[:, 3])) == len(np.unique(qpos[:, 5])) == 64
+    np.testing.assert_array_equal(qpos[:, 6:10], np.tile([1, 0, 0, 0], (64, 1)))
+    assert np.ptp(qpos[:, 0]) > 0.05  # the first joint has moved from where it was drawn, held by the keyframe's inputs
+    data = mujoco.MjData(env.model)
+    mujoco.mj_resetDataKeyframe(env.model, data, 0)
+    for _ in range(15):  # 3 steps of 50 ms
+        mujoco.mj_step(env.model, data)
+    np.testing.assert_allclose(qpos[:, 1:3], np.tile(data.qpos[1:3], (64, 1)), atol=0.02)
+
+
+@pytest.mark.slow
+def test_it_is_an_environment():
+    testing.check_env(Settled(engine="native"))
+
+
+def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
+    env = make(start=task.Start("bent"), control=task.Torque())
+    first = jax.jit(env.reset)(jax.random.key(0))
+    step = jax.jit(env.step)
+    for broken in (first.physics.qvel.at[0].set(jnp.nan), first.physics.qvel.at[2].set(1e30)):
+        state = step(dataclasses.replace(first, physics=first.physics.replace(qvel=broken)), jnp.zeros(1))
+        assert (bool(state.failed), float(state.success)) == (True, 0.0)
+        np.testing.assert_array_equal(state.physics.qpos, first.physics.qpos)
+        state = step(state, jnp.zeros(1))
+        assert np.isfinite(np.append(state.obs["observation"], 0 if state.failed else np.nan)).all()
+
+
+@pytest.mark.parametrize(
+    ("declared", "parts"),
+    [
+        ({"goal": task.Position("site:tap", (0, 0, 0), (1, 1, 1))}, ("site", "tap", "tip")),
+        ({"goal": task.Position("site:tip", (0, 0, 0), (1, 1))}, ("site:tip", 3)),
+        ({"goal": task.Position("site:tip", (3, 0, 0), (4, 1, 1))}, ("goal", "site:tip", "3.", "4.")),
+        ({"goal": task.Position("site:tip", (np.nan, 0, 0), (4, 1, 1))}, ("site:tip", "nan")),
+        ({"goal": task.Joints("c")}, ("joint", "c")),
+        ({"goal": task.Joints("a", low=[0], high=[2.5])}, ("a", 2, 2.5)),
+        ({"goal": task.Joints("d")}, ("joint", "d", "a", "b", "c")),
+        ({"control": task.JointPosition("c")}, ("JointPosition", "c", "servo", "b")),
+        ({"control": task.Torque("servo")}, ("Torque", "servo", "c")),
+        ({"control": task.Mocap("held")}, ("mocap", "held", "hand")),
+        ({"observations": ("qpos:a", "site:tap")}, ("site", "tap", "tip")),
+        ({"observations": ("places:tip",)}, ("places", "site", "body", "qvel")),
+        ({"observations": ("site:tip - qpos:a",)}, ("site:tip - qpos:a", 3, 1)),
+        ({"observations": ("body:hand",)}, ("body:hand",)),
+        ({"start": task.Start("bend")}, ("keyframe", "bend", "bent")),
+        ({"start": task.Start(ranges={"bx": (0, 1)})}, ("bx", "box", "a")),
+        ({"start": task.Start(ranges={"box": (0, 1)})}, ("box", 3)),
+        ({"hz": 30}, ("hz", 30, "0.01")),
+        ({"model": "no_such.xml"}, ("Declared", "no_such.xml")),
+        ({"model": MACHINE.replace('armature="1"', "")}, ("unstable", "a")),
+    ],
+)
+def test_a_declaration_that_does_not_fit_the_model_is_rejected_before_training(declared, parts):
+    with refuses(*parts):
+        make(**declared)
+
+
+def test_an_action_of_another_size_is_rejected():
+    env = make(control=task.Torque())
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    with refuses("action", "(3,)", "(1,)"):
+        jax.eval_shape(env.step, state, jnp.zeros(3))

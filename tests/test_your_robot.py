@@ -1,0 +1,63 @@
+"""docs/your_robot.md and its arm, docs/examples/my_arm.py: from an MJCF to ONNX, on every engine."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import my_arm
+import numpy as np
+import pytest
+from conftest import EXAMPLES, ROOT, names
+
+from mjx_dher import cli
+
+PAGE = (ROOT / "docs" / "your_robot.md").read_text()
+
+
+def test_the_page_shows_the_example():
+    code = (EXAMPLES / "my_arm.py").read_text()
+    shown = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "class " in block]
+    assert [block.count("class ") for block in shown] == [1, 1]
+    for block in shown:
+        assert block.partition("class ")[2] in code
+    assert len(code.splitlines()) <= 40
+
+
+@pytest.mark.slow
+def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
+    """From `check` to ONNX; and a robot's loop gives the action that the policy gives in simulation."""
+    monkeypatch.chdir(tmp_path)
+    (script,) = re.findall(r"```bash\n(.*?)```", PAGE, re.S)
+    for line in script.replace("\\\n", "").splitlines():
+        command = line.removeprefix("python train.py ").split()
+        if command[0] not in ("view", "render"):
+            assert cli.main(command) == 0, line
+    assert float(re.findall(r"^success ([\d.]+)", capsys.readouterr().out, re.M)[0]) >= 0.9
+    assert (tmp_path / "arm.onnx").stat().st_size > 100_000
+    (robot,) = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "def targets" in block]
+    names = {"Reach": my_arm.Reach}
+    exec(compile(robot, "your_robot.md", "exec"), names)
+    state = names["env"].reset(jax.random.key(0))
+    ctrl = names["targets"](state.physics.qpos, state.physics.qvel, state.obs["desired_goal"])
+    action = names["policy"](jax.tree.map(np.asarray, state.obs))
+    np.testing.assert_allclose(ctrl, names["env"].controls(state.physics, jnp.asarray(action)).ctrl, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Reach", "Push"])
+def test_engines_agree_on_the_arm(name):
+    """Ten steps from one start under one action. An engine that cannot run the arm names what it lacks."""
+    results = {}
+    for engine, options in {"native": {}, "jax": {}, "warp": {"allow_cpu": True}}.items():
+        try:
+            env = getattr(my_arm, name)(engine=engine, **options)
+        except ValueError as error:
+            assert engine == "warp"
+            names(str(error), "warp", "integrator")
+            continue
+        state, step = env.reset(jax.random.key(0)), jax.jit(env.step)
+        for action in 0.5 * jax.random.normal(jax.random.key(1), (10, env.action_size)):
+            state = step(state, action)
+        results[engine] = state.obs["observation"]
+    for observation in results.values():
+        np.testing.assert_allclose(observation, results["native"], atol=1e-3)
