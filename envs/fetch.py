@@ -115,6 +115,16 @@ class FetchEnv(GoalEnv):
         observation = jax.ShapeDtypeStruct((self.observation_size,), jnp.float32)
         return EnvSpec(observation, self.goal_size, self.action_size, self.episode_length, reward_range=(-1.0, 0.0))
 
+    @property
+    def goal_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] of the goals that a reset draws."""
+        return self.task.goal_bounds
+
+    @property
+    def object_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] at which a reset puts the object."""
+        return self.task.object_bounds
+
     def reset(self, key: PRNGKey) -> State:
         """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)

@@ -136,6 +136,16 @@ class MujocoTask(GoalEnv):
         """Lowest and highest coordinates [2, 3] of goals, m, if they are positions."""
         return None if self.goal.low is None or self.goal.place is None else np.stack([self.goal.low, self.goal.high])
 
+    @property
+    def has_object(self) -> bool:
+        """Whether the start has a range for a free body, so that `with_object` can move it."""
+        return self._object is not None
+
+    @property
+    def object_bounds(self) -> np.ndarray | None:
+        """Lowest and highest coordinates [2, 3] at which a reset puts the first free body, m."""
+        return None if self._object is None else np.stack(self._object[2:])
+
     def goal_marks(self, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
         """What to draw for a goal in a configuration [nq]: balls and ghosts of bodies."""
         return self.goal.marks(self.model, qpos, goal)
@@ -182,6 +192,16 @@ class MujocoTask(GoalEnv):
             failed=failed,
         )
 
+    def with_object(self, state: State, position: Array) -> State:
+        """Returns the state with the first free body in the ranges of the start at `position`, [3] m, at rest."""
+        assert self._object is not None
+        at, dof, _, _ = self._object
+        qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
+        qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)
+        physics = dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel))
+        obs = self.observe_goal(physics, state.obs["desired_goal"])
+        return dataclasses.replace(state, physics=physics, obs=obs, success=self._success(obs))
+
     def check(self) -> None:
         self.engine.check()
 
@@ -198,7 +218,7 @@ class MujocoTask(GoalEnv):
     def start_physics(self, key: PRNGKey) -> Physics:
         """Draws the physics of a start."""
         qpos = jnp.asarray(self._rest.qpos)
-        for number, (index, low, high) in enumerate(self._ranges):
+        for number, (index, _, low, high) in enumerate(self._ranges):
             drawn = jax.random.uniform(jax.random.fold_in(key, number), low.shape, jnp.float32, low, high)
             qpos = qpos.at[index : index + low.shape[0]].set(drawn)
         physics = dataclasses.replace(self._rest, qpos=qpos)
@@ -240,20 +260,21 @@ class MujocoTask(GoalEnv):
         return self.reached(obs["achieved_goal"], obs["desired_goal"]).astype(jnp.float32)
 
     def _bind_start(self) -> None:
-        """Sets the start's physics, the inputs that hold it, and the ranges [first index in qpos, low, high]."""
+        """Sets the start's physics, the inputs that hold it, and the ranges [first index in qpos and in qvel, low, high]."""
         model, start = self.model, self.start
         data = mujoco.MjData(model)
         if start.keyframe is not None:
             check_name("keyframe", start.keyframe, names_of(model, "key"))
             mujoco.mj_resetDataKeyframe(model, data, model.key(start.keyframe).id)
-        self._ranges: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._ranges: list[tuple[int, int, np.ndarray, np.ndarray]] = []
         places = start_places(model)
         for name, ends in start.ranges.items():
             check_name("name in the ranges of start", name, places)
-            index, size = places[name]
+            index, dof, size = places[name]
             low, high = box(f"start: {name}", size, *map(np.atleast_1d, ends))
-            self._ranges.append((index, low, high))
+            self._ranges.append((index, dof, low, high))
             data.qpos[index : index + size] = 0.5 * (low + high)
+        self._object = next((each for each in self._ranges if each[2].shape == (3,)), None)
         self._rest_ctrl = data.ctrl if data.ctrl.any() else rest_ctrl(model, data.qpos)
         # NumPy arrays become constants of the programs that use them, on any device.
         arrays: Any = (np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act))
@@ -262,15 +283,15 @@ class MujocoTask(GoalEnv):
         self._hold = Controls(ctrl=jnp.asarray(self._rest_ctrl, jnp.float32), mocap=jnp.asarray(mocap))
 
 
-def start_places(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
-    """First index in qpos and number of coordinates, by the names of free bodies (3) and of hinges and slides (1)."""
+def start_places(model: mujoco.MjModel) -> dict[str, tuple[int, int, int]]:
+    """First index in qpos and in qvel, and number of coordinates, of free bodies (3) and of hinges and slides (1) by name."""
     places = {}
     for i in range(model.njnt):
-        kind, index = int(model.jnt_type[i]), int(model.jnt_qposadr[i])
+        kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
         if kind == FREE:
-            places[model.body(int(model.jnt_bodyid[i])).name] = (index, 3)
+            places[model.body(int(model.jnt_bodyid[i])).name] = (*at, 3)
         elif kind in (HINGE, SLIDE):
-            places[model.joint(i).name] = (index, 1)
+            places[model.joint(i).name] = (*at, 1)
     return places
 
 

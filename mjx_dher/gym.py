@@ -172,7 +172,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 
             env: Any = self._compiled.env  # Any: a GoalEnv need not have a model
             render.check_drawable(env)
-            self._painter = render.Painter(env.model, PICTURE, PICTURE)
+            self._painter = render.Painter(env, PICTURE, PICTURE)
         return self._painter.draw(np.asarray(self._state.physics.qpos), np.asarray(self._state.obs["desired_goal"]))
 
     def close(self) -> None:

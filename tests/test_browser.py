@@ -134,7 +134,7 @@ def test_a_dragged_goal_is_reached(viewer, browser):
     until(lambda: not viewer.player.playing, "the clock to stop")
     (client,) = viewer._server.get_clients().values()
     goal = viewer.player.obs["desired_goal"].astype(float)
-    middle = np.mean(viewer.player.game.env.task.goal_bounds, axis=0)
+    middle = np.mean(viewer.player.game.env.goal_bounds, axis=0)
     towards = 0.08 * np.array([np.sign(middle[0] - goal[0]), 0.0, 0.0])  # where it may go
     arrow = goal + np.array([0.11, 0.0, 0.0])
     drag(browser, to_pixels(client.camera, arrow), to_pixels(client.camera, arrow + towards))

@@ -13,6 +13,7 @@ from mjx_dher import testing
 from mjx_dher.envs import task
 from mjx_dher.envs.engines import Physics
 from mjx_dher.envs.kinematics import Place, to_quat
+from mjx_dher.viewer.player import Player, make_game
 
 # A free body and a chain of two ball joints, slides with a reference, and two hinges of one body beside their anchors.
 TREE = """
@@ -302,3 +303,19 @@ def test_an_action_of_another_size_is_rejected():
     state = jax.eval_shape(env.reset, jax.random.key(0))
     with refuses("action", "(3,)", "(1,)"):
         jax.eval_shape(env.step, state, jnp.zeros(3))
+
+
+def test_the_viewer_moves_goals_and_objects():
+    """A pose keeps its orientation while its position is dragged; a goal of joints cannot be dragged."""
+    game = make_game(make(start=Settled.start, goal=task.Pose("box", (0, 0, 0), (1, 1, 1)), control=task.Torque()))
+    player = Player(game, lambda obs: np.zeros(1, np.float32), seed=1)
+    rotation = player.obs["desired_goal"][3:]
+    player.move_goal(np.array([0.5, 9.0, 0.25]))
+    np.testing.assert_allclose(player.obs["desired_goal"], [0.5, 1, 0.25, *rotation], atol=1e-6)
+    player.move_object(np.array([9.0, 1.0, 2.0]))
+    np.testing.assert_allclose(player.obs["achieved_goal"], [2, 1, 2, *turned(0)], atol=1e-6)
+    assert player.distance == pytest.approx(
+        float(game.env.goal_distance(player.obs["achieved_goal"], player.obs["desired_goal"]))
+    )
+    assert [body for body, _, _ in player.marks] == [-1, game.env.model.body("box").id]
+    assert make_game(make(goal=task.Joints("a b c", [0] * 3, [1] * 3))).move_goal is None

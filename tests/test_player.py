@@ -22,9 +22,7 @@ def state(x, goal, failed=False):
 
 
 GAME = Game(
-    env=SimpleNamespace(
-        episode_length=LENGTH, distance_threshold=REACH, task=SimpleNamespace(goal_bounds=[[0, 0, 0], [1, 1, 0]])
-    ),
+    env=SimpleNamespace(episode_length=LENGTH, distance_threshold=REACH, goal_bounds=[[0, 0, 0], [1, 1, 0]]),
     reset=lambda seed: state(0.0, [0.4, 0, 0]),
     step=lambda before, action: state(before.obs["observation"][0] + action[0], before.obs["desired_goal"], abs(action[0]) > 9),
     move_goal=lambda before, position: state(before.obs["observation"][0], position),
@@ -214,14 +212,14 @@ def test_commands_run_in_order_and_later_ones_wait():
 
 def test_bounds_are_those_of_resets():
     """FetchPush: goal and cube within 15 cm of the gripper, on the table; FetchPickAndPlace: goals up to 45 cm above it."""
-    push, lift = (SimpleNamespace(task=_task(name)) for name in ("push", "pick_and_place"))
+    push, lift = (_task(name) for name in ("push", "pick_and_place"))
     np.testing.assert_allclose(bounds(push, "goal"), [(1.2131, 1.5131), (0.5991, 0.8991), (0.4249, 0.4249)], atol=1e-4)
     np.testing.assert_allclose(bounds(push, "object"), [(1.2131, 1.5131), (0.5991, 0.8991), (0.4249, 0.4249)], atol=1e-4)
     np.testing.assert_allclose(bounds(lift, "goal")[2], (0.4249, 0.8749), atol=1e-4)
-    slide = SimpleNamespace(task=_task("slide"))
+    slide = _task("slide")
     np.testing.assert_allclose(bounds(slide, "goal")[0], (1.1133, 1.7133), atol=1e-4)
     np.testing.assert_allclose(bounds(slide, "object")[0], (0.9133, 1.1133), atol=1e-4)
-    reach = SimpleNamespace(task=_task("reach"))
+    reach = _task("reach")
     np.testing.assert_allclose(bounds(reach, "goal")[2], (0.3847, 0.6847), atol=1e-4)
     assert bounds(SimpleNamespace(), "goal") is None
 
@@ -262,7 +260,7 @@ def test_the_policy_of_the_package_follows_a_goal_that_is_moved(push):
     from mjx_dher import load_policy
 
     player = Player(push, load_policy("push"), seed=1)
-    center = np.mean(push.env.task.goal_bounds, axis=0)
+    center = np.mean(push.env.goal_bounds, axis=0)
     for x, y in ((0.1, 0.08), (-0.08, 0.1), (0.05, -0.1)):
         player.move_goal(center + np.array([x, y, 0]))
         for _ in range(player.length):

@@ -33,7 +33,7 @@ except ValueError as error:
 import jax
 
 def picture(env, qpos, goal):
-    return next(render.draw_frames(env.model, [qpos], goal, 320, 240))
+    return next(render.draw_frames(env, [qpos], goal, 320, 240))
 
 frames = {}
 for name in envs.list_envs():
@@ -238,12 +238,12 @@ def test_a_way_to_draw_that_hangs_is_given_up():
 
 # MuJoCo is imported first, as by another environment, and so has chosen a way to draw that needs a screen.
 LATE = """
-import mujoco, sys
+import mujoco, sys, types
 from mjx_dher.tools import render
 scene = '<geom size=".1"/><camera name="front" pos="0 -1 0" xyaxes="1 0 0 0 0 1"/>'
 model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{scene}</worldbody></mujoco>")
 try:
-    pictures = list(render.draw_frames(model, [[]] * 2, [0.2, 0, 0], 64, 64))
+    pictures = list(render.draw_frames(types.SimpleNamespace(model=model), [[]] * 2, [0.2, 0, 0], 64, 64))
 except ValueError as error:
     print(error)
     sys.exit(77 if "cannot draw here" in str(error) else 1)

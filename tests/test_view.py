@@ -150,7 +150,7 @@ def test_a_hand_moves_the_goal(port):
         viewer._drag("goal", np.array([9.0, 0.8, 0.5]), "update")
         viewer._drag("goal", np.zeros(3), "end")
         viewer.show(True)
-        highest = viewer.player.game.env.task.goal_bounds[1, 0]
+        highest = viewer.player.game.env.goal_bounds[1, 0]
         np.testing.assert_allclose(
             viewer._handle.position, [highest, 0.8, 0.5], atol=1e-6
         )  # it springs back to where goals lie

@@ -95,7 +95,7 @@ def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> N
         soft_wrap=True,
     )
     qpos, goals, success = render.record_episodes(env, act, args.seed, args.episodes)
-    pictures, fps = (env.model, qpos, goals, args.width, args.height), 1 / step_seconds(env)
+    pictures, fps = (env, qpos, goals, args.width, args.height), 1 / step_seconds(env)
     frames = [render.stills(*pictures)] if args.out.suffix.lower() == ".png" else render.film(*pictures, fps)
     render.write_frames(args.out, frames, fps)
     console.print(f"success in {int(success.sum())} of {args.episodes}; wrote {args.out}", soft_wrap=True)

@@ -104,13 +104,21 @@ def check_drawable(env: Any) -> None:
     import jax
 
     start = jax.eval_shape(env.reset, jax.random.key(0))
-    has_positions = hasattr(getattr(start, "physics", None), "qpos") and start.obs["desired_goal"].shape == (3,)
-    if not (hasattr(env, "model") and has_positions):
+    if not (hasattr(env, "model") and hasattr(getattr(start, "physics", None), "qpos")):
         name = getattr(env, "name", type(env).__name__)
         raise ValueError(
-            f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`), states with `physics.qpos` and goals of"
-            " size 3"
+            f"{name} cannot be rendered: it needs a MuJoCo model (attribute `model`) and states with `physics.qpos`"
         )
+
+
+def goal_marks(env: Any, qpos: np.ndarray, goal: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Marks of a goal [G]: the environment's `goal_marks`, else a ball at a goal of size 3, else none.
+
+    A mark is a body, or -1 for a ball, its position [3], m, and its orientation [4] (w, x, y, z).
+    """
+    if hasattr(env, "goal_marks"):
+        return env.goal_marks(qpos, goal)
+    return [(-1, np.asarray(goal), np.array([1.0, 0.0, 0.0, 0.0]))] if np.shape(goal) == (3,) else []
 
 
 def record_episodes(
@@ -119,13 +127,13 @@ def record_episodes(
     """Plays whole episodes in a batch and returns the data to draw them.
 
     Args:
-      env: an environment with a MuJoCo `model`, states with `physics.qpos`, and positions as goals.
+      env: an environment with a MuJoCo `model` and states with `physics.qpos`.
       act: (observations [N, ...], key) -> actions [N, A].
       seed: seed of starts, goals and the keys of `act`.
       num_episodes: N.
 
     Returns:
-      qpos [N, T+1, nq] in the layout of the model, desired goals [N, 3] in m, success at the end [N].
+      qpos [N, T+1, nq] in the layout of the model, desired goals [N, G], success at the end [N].
 
     Raises:
       ValueError: the environment cannot be drawn.
@@ -148,32 +156,32 @@ def record_episodes(
     return qpos, goals, success
 
 
-def film(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
+def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
     """Yields the frames [height, width, 3] uint8 of all episodes, the last of each for `HOLD_SECONDS`. Arguments: `stills`."""
     for episode, goal in zip(qpos, goals):
-        for frame in draw_frames(model, episode, goal, width, height):
+        for frame in draw_frames(env, episode, goal, width, height):
             yield frame
         for _ in range(round(HOLD_SECONDS * fps)):
             yield frame
 
 
-def stills(model: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
+def stills(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
     """Draws pictures of the first episode, from start to end, side by side: [height, STILLS * width, 3] uint8.
 
     Args:
-      model: the environment's `mujoco.MjModel`.
+      env: the environment.
       qpos: [N, T+1, nq].
-      goals: [N, 3] m.
+      goals: [N, G].
       width, height: size of one picture, pixels.
     """
     # Closer together at first, when a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)
-    return np.concatenate(list(draw_frames(model, qpos[0, chosen], goals[0], width, height)), axis=1)
+    return np.concatenate(list(draw_frames(env, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
-def draw_frames(model: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
+def draw_frames(env: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
     """Yields a picture [height, width, 3] uint8 of each configuration [nq]; arguments as for `Painter`."""
-    with contextlib.closing(Painter(model, width, height)) as painter:
+    with contextlib.closing(Painter(env, width, height)) as painter:
         for configuration in qpos:
             yield painter.draw(configuration, goal)
 
@@ -182,17 +190,20 @@ class Painter:
     """Draws configurations of a model. Close it before the program ends.
 
     Args:
-      model: the environment's `mujoco.MjModel`, with a camera "front".
+      env: an environment with a `mujoco.MjModel`, `model`, whose camera "front" looks at it; else a free camera does.
       width, height: size of a picture, pixels.
 
     Raises:
       ValueError: MuJoCo cannot draw in this process.
     """
 
-    def __init__(self, model: Any, width: int, height: int):
+    def __init__(self, env: Any, width: int, height: int):
         import mujoco
 
-        model = copy.copy(model)  # the buffer size is set below; that of the environment's model must not change
+        self._env, model = (
+            env,
+            copy.copy(env.model),
+        )  # the buffer size is set below; that of the environment's model must not change
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._model, self._data = model, mujoco.MjData(model)
         backend = choose_gl()
@@ -203,20 +214,38 @@ class Painter:
             raise ValueError(f"MuJoCo cannot draw in this process with MUJOCO_GL={backend}: {error}") from error
 
     def draw(self, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """A picture [height, width, 3] uint8 of a configuration [nq], with the goal [3] m as a red ball."""
+        """A picture [height, width, 3] uint8 of a configuration [nq], with the goal [G] as a red ball or ghost."""
         import mujoco
 
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
-        self._renderer.update_scene(self._data, camera="front")
-        scene = self._renderer.scene
-        ball, size = scene.geoms[scene.ngeom], np.array([GOAL_RADIUS, 0, 0])
-        place, colour = np.asarray(goal, float), np.array(GOAL_RGBA, np.float32)
-        mujoco.mjv_initGeom(ball, mujoco.mjtGeom.mjGEOM_SPHERE, size, place, np.eye(3).ravel(), colour)
-        ball.transparent, ball.emission = True, 0.5
-        scene.ngeom += 1
+        front = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, "front")  # -1, a free camera, if there is none
+        self._renderer.update_scene(self._data, camera=front)
+        for body, pos, quat in goal_marks(self._env, np.asarray(qpos), np.asarray(goal)):
+            if body < 0:
+                self._add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, np.array([GOAL_RADIUS, 0, 0]), pos, quat)
+                continue
+            first = self._model.body_geomadr[body]
+            for geom in range(first, first + self._model.body_geomnum[body]):
+                place, turn = np.zeros(3), np.zeros(4)
+                frame = self._model.geom_pos[geom], self._model.geom_quat[geom]
+                mujoco.mju_mulPose(place, turn, np.asarray(pos, float), np.asarray(quat, float), *frame)
+                mesh = 2 * int(self._model.geom_dataid[geom])  # the mesh itself; the odd number after it is its convex hull
+                self._add_geom(self._model.geom_type[geom], self._model.geom_size[geom], place, turn, mesh)
         return self._renderer.render()
+
+    def _add_geom(self, kind: Any, size: np.ndarray, pos: np.ndarray, quat: np.ndarray, mesh: int = -1) -> None:
+        import mujoco
+
+        scene, mat = self._renderer.scene, np.zeros(9)
+        if scene.ngeom == scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mju_quat2Mat(mat, quat)
+        mujoco.mjv_initGeom(geom, kind, size, np.asarray(pos, float), mat, np.array(GOAL_RGBA, np.float32))
+        geom.dataid, geom.transparent, geom.emission = max(mesh, -1), True, 0.5
+        scene.ngeom += 1
 
     def close(self) -> None:
         """Frees the renderer."""

@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from mjx_dher import context
 from mjx_dher.contract import step_seconds
-from mjx_dher.tools.render import check_drawable
+from mjx_dher.tools.render import check_drawable, goal_marks
 
 HOLD = 0.6  # s for which the end of an episode is shown before the next one begins
 SHOWN = 10.0  # s that the curves show
@@ -49,11 +51,17 @@ def make_game(env: Any) -> Game:
     """
     check_drawable(env)
     has_object = getattr(env, "has_object", True)  # the tasks here share their methods, and not all have an object
+    is_point = jax.eval_shape(env.reset, jax.random.key(0)).obs["desired_goal"].shape == (3,)
+    has_position = bounds(env, "goal") is not None if hasattr(env, "goal_marks") else is_point
+
+    def move_goal(state: Any, position: Any) -> Any:  # a pose keeps its orientation
+        return env.with_goal(state, jnp.concatenate([position, state.obs["desired_goal"][3:]]))
+
     game = Game(
         env=env,
         reset=jax.jit(lambda seed: env.reset(jax.random.key(seed))),
         step=jax.jit(env.step),
-        move_goal=jax.jit(env.with_goal) if hasattr(env, "with_goal") else None,
+        move_goal=jax.jit(move_goal) if hasattr(env, "with_goal") and has_position else None,
         move_object=jax.jit(env.with_object) if hasattr(env, "with_object") and has_object else None,
     )
     state = game.reset(np.uint32(0))
@@ -69,7 +77,7 @@ def bounds(env: Any, dragged: str) -> Bounds | None:
 
     None where the environment does not tell.
     """
-    box = getattr(getattr(env, "task", None), f"{dragged}_bounds", None)
+    box = getattr(env, f"{dragged}_bounds", None)
     return None if box is None else tuple((float(low), float(high)) for low, high in np.transpose(box))  # type: ignore[return-value]
 
 
@@ -189,12 +197,18 @@ class Player:
     @property
     def distance(self) -> float:
         """Distance of what should be at the goal from it, m."""
-        return float(np.linalg.norm(self.obs["achieved_goal"] - self.obs["desired_goal"]))
+        distance = getattr(self.game.env, "goal_distance", context.euclidean)
+        return float(distance(self.obs["achieved_goal"], self.obs["desired_goal"]))
 
     @property
     def qpos(self) -> np.ndarray:
         """Configuration [nq], in the layout of the environment's model."""
         return np.asarray(self._state.physics.qpos, np.float64)
+
+    @property
+    def marks(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Marks of the goal (`render.goal_marks`)."""
+        return goal_marks(self.game.env, self.qpos, self.obs["desired_goal"])
 
     @property
     def _failed(self) -> bool:

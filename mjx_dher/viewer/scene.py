@@ -64,18 +64,24 @@ class Poses:
         return self._data.xpos, self._data.xquat
 
 
-def add(scene: Any, model: Any) -> dict[int, Any]:
-    """Adds a model's geoms to a scene of viser's; returns the nodes of the bodies that have any, by their number."""
+def add(scene: Any, model: Any, ghosts: Any = None, rgba: Any = None) -> dict[int, Any]:
+    """Adds a model's geoms to a scene of viser's; returns the nodes of the bodies that have any, by their number.
+
+    With `ghosts`, these bodies alone are added, a second time and in the colour `rgba` [4].
+    """
     nodes: dict[int, Any] = {}
-    for shape in shapes(model):
+    folder = "/bodies" if ghosts is None else "/ghosts"
+    chosen = shapes(model)
+    if ghosts is not None:
+        chosen = [shape._replace(rgba=np.array(rgba)) for shape in chosen if shape.body in ghosts]
+    for shape in chosen:
         if shape.body not in nodes:
-            nodes[shape.body] = scene.add_frame(f"/bodies/{shape.body}", show_axes=False)
-        _add_shape(scene, model, shape)
+            nodes[shape.body] = scene.add_frame(f"{folder}/{shape.body}", show_axes=False)
+        _add_shape(scene, model, shape, f"{folder}/{shape.body}/{shape.name}")
     return nodes
 
 
-def _add_shape(scene: Any, model: Any, shape: Shape) -> None:
-    name = f"/bodies/{shape.body}/{shape.name}"
+def _add_shape(scene: Any, model: Any, shape: Shape, name: str) -> None:
     rgb = tuple(round(255 * float(x)) for x in shape.rgba[:3])
     x, y, z = map(float, shape.size)
     if shape.kind == int(_TYPES.mjGEOM_PLANE):

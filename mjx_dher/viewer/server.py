@@ -113,13 +113,17 @@ class Viewer:
         for body, node in self._nodes.items():
             if body:  # the world stays where it is
                 node.position, node.wxyz = positions[body], orientations[body]
-        places = {"goal": self.player.obs["desired_goal"], "object": self.player.obs["achieved_goal"]}
+        places = {"goal": self.player.obs["desired_goal"][:3], "object": self.player.obs["achieved_goal"][:3]}
         if self._handle is not None and not self._held:
             self._handle.position = places[self._taken]
         colour = _REACHED if self.player.success else _rgb(GOAL_RGBA)
         if self._ball.color != colour:
             self._ball.color = colour
-        self._ball.position = places["goal"]
+        marks = {body: (pos, quat) for body, pos, quat in self.player.marks}
+        self._ball.visible = -1 in marks
+        for body, node in {-1: self._ball, **self._ghosts}.items():
+            if body in marks:
+                node.position, node.wxyz = marks[body]
         self._panel.update(curves)
 
     def take(self, dragged: str) -> None:
@@ -130,11 +134,12 @@ class Viewer:
     def _draw_scene(self) -> None:
         """Draws the environment anew."""
         scene, env = self._server.scene, self.player.game.env
-        for name in ("/bodies", "/handle", "/ball"):
+        for name in ("/bodies", "/ghosts", "/handle", "/ball"):
             with contextlib.suppress(KeyError, ValueError):
                 scene.remove_by_name(name)
         self._held = False
         self._poses, self._nodes = Poses(env.model), add(scene, env.model)
+        self._ghosts = add(scene, env.model, {body for body, _, _ in self.player.marks}, GOAL_RGBA)
         moves = {"goal": self.player.game.move_goal, "object": self.player.game.move_object}
         self._handle = None if moves.get(self._taken) is None else self._add_handle(self._taken)
         look: dict[str, Any] = {"opacity": GOAL_RGBA[3], "cast_shadow": False, "receive_shadow": False}
