@@ -130,6 +130,10 @@ def too_narrow(relative, temperature):
     return jnp.where(relative > 1e3 * temperature, 0.0, -jnp.inf)
 
 
+def deaf(relative, temperature):
+    return jnp.zeros_like(relative)
+
+
 def one_argument(relative):
     return -relative
 
@@ -143,6 +147,7 @@ KERNELS = {
     "log_of_negative": "is nan at relative distance",
     "pole": "is inf at relative distance 0",
     "too_narrow": "takes no goal",
+    "deaf": "tells no distances apart",
     "one_argument": r"weight_kernel must be a function \(relative, temperature\)",
     "mask_alone": r"log weights .* floats .* bool\[31\]",
 }
@@ -326,7 +331,7 @@ def _half(state):
 
 ENVS = {
     "NanObservation": "observation must be finite",
-    "SuccessSeven": "success must be 0 or 1; it is",
+    "SuccessSeven": "success must be 0 or 1; it takes",
     "NanSuccess": "success must be finite",
     "RewardOfTwoAxes": r"reward must be a scalar, \[\]",
     "ShorterGoal": r"achieved_goal and desired_goal .* \(2,\) and \(1,\)",

@@ -1,5 +1,6 @@
 """What users hand in is checked where it is handed in: a table of mistakes in each kind of part."""
 
+import itertools
 import re
 
 import configs
@@ -15,10 +16,12 @@ import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
+from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
 from mjx_dher.runs import driver
 from mjx_dher.testing import (
     check_env,
+    check_generator,
     check_kernel,
     check_learner,
     check_metric,
@@ -68,7 +71,7 @@ def test_what_is_right_passes(capsys):
     assert cli.main(["check", *parts, "--learner", "mjx_dher.learners.ddpg:make", "--priority", "test_mistakes:alike"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "point_mass:PointMass" in lines[0]
-    assert [line.partition(" ")[0] for line in lines] == ["env", "metric", "weighted:", "priority", "learner"]
+    assert [line.partition(" ")[0] for line in lines] == ["testing", "env", "metric", "weighted:", "priority", "learner"]
     assert cli.main(["check"]) == 2
     assert "one or more components as module:attribute" in capsys.readouterr().err
 
@@ -85,6 +88,54 @@ def near(achieved, desired):
 
 def alike(episode, context):
     return jnp.ones(())
+
+
+def deaf(distance, candidates, scale):
+    return jnp.ones_like(distance)
+
+
+def always(index):
+    """A `choose` that does not look at the transitions."""
+    return Priority(choose=lambda key, sample, batch, number, context: index(jnp.arange(number), key))
+
+
+calls = itertools.count()
+MORE = {  # what a check is handed, and a word of what it says
+    "the same normalized distance": (lambda: check_normalization(deaf), "tells no distances apart"),
+    "one transition": (lambda: check_priority(always(lambda i, key: 0 * i), ENV), "all 8 are one"),
+    "one transition at random": (
+        lambda: check_priority(always(lambda i, key: 0 * i + jax.random.randint(key, (), 0, 32)), ENV),
+        "all 8 are one",
+    ),
+    "the first of each": (lambda: check_priority(always(lambda i, key: 4 * i), ENV), "keeps the first of each 4"),
+    "no candidate": (lambda: check_priority(always(lambda i, key: 5 * i - 1), ENV), r"indices of 32 candidates; one is \[-1\]"),
+    "another sampler each time": (
+        lambda: check_sampler(lambda achieved, desired, step, hparams: next(calls) * achieved[:, 0], ENV),
+        "sampler, called twice .* same result",
+    ),
+    "another generator each time": (
+        lambda: check_generator(lambda key, obs, ring, context: obs["desired_goal"] + next(calls), ENV),
+        "generator, called twice .* same result",
+    ),
+    "another weight each time": (
+        lambda: check_priority(lambda episode, context: jnp.zeros(()) + next(calls), ENV),
+        "priority, called twice .* same result",
+    ),
+}
+
+
+@pytest.mark.parametrize(("act", "message"), MORE.values(), ids=MORE)
+def test_parts_that_do_not_look_or_not_alike_are_named(act, message):
+    with pytest.raises(testing.ComponentError, match=message):
+        act()
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("dpp", "td_error")]
+
+
+@pytest.mark.parametrize("name", ["curriculum", "not_misleading", *SLOW])
+def test_built_in_choices_pass(name):
+    assert "8 of 32 transitions chosen" in check_priority(name, ENV)
 
 
 FLAGS = configs.flags(SMALL)[2:]  # all but the environment

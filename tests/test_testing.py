@@ -127,10 +127,6 @@ def forgetful():
     return broken(reset=lambda self, key: Quick.reset(self, jax.random.fold_in(key, next(calls))))
 
 
-def traced_otherwise(self, state, action):
-    return PointMass.step(self, state, action / 2 if isinstance(action, jax.core.Tracer) else action)
-
-
 def mixing(self, state, action):
     """A callback that is handed the whole batch, and mixes it."""
 
@@ -141,10 +137,11 @@ def mixing(self, state, action):
     return PointMass.step(self, state, centred)
 
 
-def refusing(self, state, action):
-    if not isinstance(action, jax.core.Tracer) and np.abs(action).max() > 1:
-        raise ValueError("action out of range")
-    return PointMass.step(self, state, action)
+def unclipped(self, state, action):
+    """NaN where an action is out of bounds."""
+    following = PointMass.step(self, state, action)
+    obs = following.obs
+    return following.replace(obs={**obs, "observation": obs["observation"] + jnp.where(jnp.abs(action) > 1, jnp.nan, 0.0)})
 
 
 def diverging(self, state, action):
@@ -183,6 +180,35 @@ def shifted(self, achieved_goal, desired_goal):
     return PointMass.compute_reward(self, achieved_goal, desired_goal) + 1.0
 
 
+def rare(self, achieved_goal, desired_goal):
+    """1 at the goal, as in other libraries: random actions never see it."""
+    return (jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) < 1e-6).astype(jnp.float32)
+
+
+def dense(self, achieved_goal, desired_goal):
+    return -10.0 * jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+def log_distance(self, achieved_goal, desired_goal):
+    """Finite wherever random actions come."""
+    return -jnp.log(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)) / 1e3 - 0.5
+
+
+def counted():
+    calls = itertools.count()
+    return lambda self, achieved, desired: PointMass.compute_reward(self, achieved, desired) * (1 - 0.01 * next(calls))
+
+
+def angle(self, achieved_goal, desired_goal):
+    """Rounding takes the cosine of equal goals beyond 1."""
+    cosine = jnp.sum(achieved_goal * desired_goal, axis=-1) / jnp.sum(jnp.square(desired_goal), axis=-1)
+    return jnp.arccos(1.0000001 * cosine)
+
+
+def away(self, state, goal):
+    return self._state(goal, goal)
+
+
 def whole_numbers(self, achieved_goal, desired_goal):
     return -(jnp.linalg.norm(achieved_goal - desired_goal, axis=-1) > 0.1).astype(jnp.int32)
 
@@ -209,8 +235,8 @@ BROKEN = {
     "two kinds of goal": (with_obs("desired_goal", lambda x: x[:1]), r"achieved_goal and desired_goal .* \(2,\) and \(1,\)"),
     "a row of rewards": (with_state(reward=lambda s: s.reward[None]), r"reward .* scalar, \[\].* \(1,\)"),
     "success is bool": (with_state(success=lambda s: s.success > 0), "success .* float32.* bool"),
-    "success of 2": (with_state(success=lambda s: s.success + 2), "success .* 0 or 1.* 2"),
-    "NaN at once": (with_obs("observation", lambda x: x * jnp.nan), r"reset: observation .* finite.* \[nan nan\]"),
+    "success of 2": (with_state(success=lambda s: s.success + 2), "success .* 0 or 1.*2"),
+    "NaN at once": (with_obs("observation", lambda x: x * jnp.nan), "observation .* finite.* after 0 steps"),
     "changes the state": (broken(step=mutating), "step .* state unchanged"),
     "branches": (broken(step=branching), "episode, traced by jax.jit, raises TracerBoolConversionError"),
     "grows": (broken(step=growing), r"reset and step .* only one has \.count"),
@@ -218,20 +244,34 @@ BROKEN = {
         counting(jnp.zeros((), jnp.int32), lambda count: count + 1.0),
         r"step .* \.count .* int32\[\] .* float32\[\]",
     ),
-    "hidden start": (forgetful(), "reset, called twice .* key, .* same result"),
-    "hidden step": (drifting(), "step, called twice .* state and action, .* same result"),
+    "hidden start": (forgetful(), "reset and step, called twice .* same result; reset: "),
+    "hidden step": (drifting(), "reset and step, called twice .* same result; step: "),
     "NaN later": (broken(step=diverging), "observation .* finite.* `failed`.* after [1-9]"),
     "always fails": (Explodes(None, edge=-1.0), "every episode .* `failed`"),
     "one start": (broken(reset=lambda self, key: Quick.reset(self, jax.random.key(0))), "8 keys gave the same"),
     "moving goal": (broken(step=new_goal), "desired_goal .* constant .* step 1"),
-    "other when traced": (broken(step=traced_otherwise), "step, alone and under jax.jit and jax.vmap, .* same result"),
-    "mixes the batch": (broken(step=mixing), "step, alone and under jax.jit and jax.vmap, .* same result; .* differs by"),
-    "refuses": (broken(step=refusing), r"step with an action of \+-3 raises ValueError: action out of range"),
+    "mixes the batch": (broken(step=mixing), "step, alone and under jax.vmap, .* same result; step: .* differs by"),
+    "wants what is in bounds": (broken(step=unclipped), r"step with an action of \+-3: observation must be finite"),
     "reward of all goals": (broken(compute_reward=over_all), r"compute_reward of goals \[3, 2\] .* \[3\].* float32\[\]"),
-    "reward of whole numbers": (broken(compute_reward=whole_numbers), "reward .* float32.* int32"),
+    "reward of whole numbers": (broken(compute_reward=whole_numbers), "compute_reward .* floats.* int32"),
     "reward of the batch": (broken(compute_reward=over_the_batch), "compute_reward .* depends on the others"),
     "late reward": (broken(step=late_reward), r"step .* compute_reward\(achieved_goal, desired_goal\)"),
     "reward of 1": (broken(compute_reward=shifted), r"rewards .* \[-1, 0\].* 0 to 1"),
+    "reward of 1 that is never seen": (
+        broken(compute_reward=rare),
+        r"rewards .* reward_range \[-1, 0\]; .* 0 to 1: .* reward_range=\(0, 1\)",
+    ),
+    "reward of metres times 10": (broken(compute_reward=dense), "rewards .* to 0: .* reward_range=.* or scale the reward"),
+    "reward of what is never reached": (
+        broken(compute_reward=lambda self, a, d: -jnp.ones(a.shape[:-1])),
+        "sparse reward .* 0 ",
+    ),
+    "reward that is infinite at the goal": (broken(compute_reward=log_distance), r"rewards .* to inf"),
+    "reward that differs from trace to trace": (broken(compute_reward=counted()), "called twice .* same .* reward"),
+    "goal that is never reached": (broken(reached=lambda self, a, d: a[..., 0] > 9), "reached must be True"),
+    "distance of NaN": (broken(goal_distance=angle), "goal_distance must be finite"),
+    "goals that are not kept": (broken(with_goal=lambda self, state, goal: state), "with_goal, .* desired_goal differs"),
+    "goals that move": (broken(with_goal=away), "with_goal, .* alone, .* differs"),
     "inverted": (broken(compute_reward=inverted), "compute_reward .* greatest .* achieved exactly"),
     "always a success": (with_state(success=lambda s: jnp.ones(())), "success .* 0 .* sparse reward .* -1"),
     "never a success": (with_state(success=lambda s: jnp.zeros(())), "success .* 1 .* never"),

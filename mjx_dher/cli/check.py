@@ -38,8 +38,8 @@ def check_command(argv: list[str], console: Console) -> int:
     if not spec.custom_components(run):
         raise ValueError("check takes one or more components as module:attribute; all of these are built in")
     prepare()
-    from mjx_dher.testing import check_components
+    from mjx_dher.testing import verdicts
 
-    for line in check_components(make_env(run), run):
+    for line in verdicts.check(make_env(run), [run], again=True):
         console.print(line)
     return 0

@@ -80,15 +80,11 @@ def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None
     Raises:
       ValueError: names the component and the first violation.
     """
-    tried: set[str] = set()
-    for spec in specs:
-        if custom_components(spec):
-            from mjx_dher.testing import check_components
+    if any(custom_components(spec) for spec in specs):
+        from mjx_dher.testing import verdicts
 
-            for line in check_components(env, dataclasses.replace(spec, seed=0)):
-                if line not in tried:
-                    tried.add(line)
-                    console.print(line)
+        for line in verdicts.check(env, specs):
+            console.print(line)
 
 
 def find_run(run: Path, console: Console) -> Path:

@@ -24,22 +24,23 @@ from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
 from mjx_dher.testing.methods import as_arrays, check_choice, check_generator, trial_context
-from mjx_dher.testing.trial import TOLERANCE, attempt, expect, expect_range, random_episodes
+from mjx_dher.testing.trial import TOLERANCE, attempt, compiled, expect, expect_range, expect_same, random_episodes, run
 from mjx_dher.types import Env, Episode
 
 
-def check_components(env: Env, spec: RunSpec) -> Iterator[str]:
+def check_components(env: Env, spec: RunSpec, with_env: bool = True) -> Iterator[str]:
     """Checks the custom components of a run; yields a line for each that passes.
 
     Args:
       env: the environment.
       spec: the run.
+      with_env: whether to check a custom environment, too.
 
     Raises:
       ComponentError: names the component, and the first violation.
     """
     custom = custom_components(spec)
-    if "env" in custom:
+    if "env" in custom and with_env:
         check_env(env)
         yield f"env {spec.env}: as it should be, in random episodes"
     if not custom.keys() - {"env"}:
@@ -73,7 +74,8 @@ def check_sampler(
 ) -> str:
     """Asks a sampler for the log weights of every step of random episodes.
 
-    They must be floats [T+1], below +inf and not NaN, not all -inf at every step, and the same under `jax.vmap` as alone.
+    They must be floats [T+1], below +inf and not NaN, not all -inf at every step, and the same under `jax.vmap` as alone and in
+    a second call.
 
     Args:
       sampler: what `samplers.make` takes.
@@ -100,8 +102,8 @@ def check_sampler(
 
     of_episode = jax.vmap(of_step, in_axes=(None, None, None, 0))
     asked = episodes.achieved_goal, episodes.desired_goal, score
-    log_weights = attempt("sampler", jax.jit(jax.vmap(of_episode, in_axes=(0, 0, 0, None))), *asked, steps)
-    alone = attempt("sampler, alone,", of_step, *(x[0] for x in asked), steps[-1])
+    log_weights = run("sampler", jax.vmap(of_episode, in_axes=(0, 0, 0, None)), *asked, steps)
+    alone = attempt("sampler, alone,", jax.jit(of_step), *(x[0] for x in asked), steps[-1])
     return _check_log_weights(np.asarray(log_weights), np.asarray(alone))
 
 
@@ -145,8 +147,8 @@ def check_metric(
         sampler, context = samplers.make("closest", metric=made), trial_context(env, learner=learner)
         distances = np.asarray(attempt("metric", samplers.score_episodes, sampler, episodes, context))
     else:
-        compute = jax.jit(jax.vmap(functools.partial(samplers.measure, made)))
-        distances = np.asarray(attempt("metric", compute, episodes.achieved_goal, episodes.desired_goal))
+        compute = jax.vmap(functools.partial(samplers.measure, made))
+        distances = np.asarray(run("metric", compute, episodes.achieved_goal, episodes.desired_goal))
     text = expect_range("metric: distances", distances)
     expect(distances.min() < distances.max(), f"metric: it tells no goals apart: all distances are {distances.min():.3g}")
     return f"metric as it should be: distances {text}"
@@ -155,7 +157,7 @@ def check_metric(
 def check_kernel(kernel: str | KernelFn) -> str:
     """Asks a kernel for the log weights of relative distances from 0 to 3, at temperatures of 0.3, 1 and 3.
 
-    They must be as many as the distances, below +inf and not NaN, and not all -inf.
+    They must be as many as the distances, below +inf and not NaN, not all -inf, and not all alike.
 
     Returns:
       A line: the weights at some distances.
@@ -165,15 +167,17 @@ def check_kernel(kernel: str | KernelFn) -> str:
     """
     made = attempt("weight_kernel", components.load, "weight_kernel", kernel, "relative", "temperature")
     relative = jnp.linspace(0.0, 3.0, 31)
-    compute = jax.jit(lambda r, t: check.array("weight_kernel: log weights", made(r, t), r.shape))
+    ask = lambda r, t: check.array("weight_kernel: log weights", made(r, t), r.shape)  # noqa: E731
+    compute = compiled("weight_kernel", ask, relative, jnp.float32(1))
     for temperature in (0.3, 3.0, 1.0):
-        log_weights = np.asarray(attempt("weight_kernel", compute, relative, jnp.float32(temperature)))
+        log_weights = np.asarray(compute(relative, jnp.float32(temperature)))
         wrong = np.flatnonzero(~(log_weights < np.inf))  # NaN, too
         if len(wrong):
             place = f"relative distance {float(relative[wrong[0]]):g} and temperature {temperature:g}"
             expect(False, f"weight_kernel: log weights must be finite or -inf; it is {log_weights[wrong[0]]} at {place}")
         message = f"weight_kernel: every log weight is -inf at temperature {temperature:g}: it takes no goal"
         expect((log_weights > -np.inf).any(), message)
+    expect(np.ptp(np.exp(log_weights)) > 0, "weight_kernel: it tells no distances apart: every weight is the same")
     near, mean, far = np.exp(log_weights[[0, 10, 20]])  # at temperature 1
     return f"weight_kernel as it should be: weights {near:.3g}, {mean:.3g} and {far:.3g} at relative distances 0, 1 and 2"
 
@@ -182,7 +186,7 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
     """Asks a normalization for the relative distances of 20 candidates among 30 distances, at scales of 0.01, 0.05 and 1.
 
     They must be as many floats as there are distances, not NaN, and finite for candidates: those whose distances are 0.01 to
-    0.2, or all 0.1, or all 0, and a single candidate.
+    0.2, which it must tell apart, or all 0.1, or all 0, and a single candidate.
 
     Returns:
       A line: their range for distances of 0.01 to 0.2.
@@ -192,7 +196,7 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
     """
     field = "weight_normalization"
     made = attempt(field, components.load, field, normalization, "distance", "candidates", "scale")
-    compute = jax.jit(lambda d, c, s: check.array(f"{field}: relative distances", made(d, c, s), d.shape))
+    ask = lambda d, c, s: check.array(f"{field}: relative distances", made(d, c, s), d.shape)  # noqa: E731
     later, last = jnp.arange(30) >= 10, jnp.arange(30) == 29
     rising = jnp.where(later, jnp.linspace(-0.09, 0.2, 30), 0.0)
     cases = {
@@ -201,12 +205,14 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
         "of one candidate": (rising, last),
         "from 0.01 to 0.2": (rising, later),
     }
+    compute = compiled(field, ask, rising, later, jnp.float32(1))
     for name, (distance, candidates) in cases.items():
         for scale in (0.01, 0.05, 1.0):
-            relative = np.asarray(attempt(field, compute, distance, candidates, jnp.float32(scale)))
+            relative = np.asarray(compute(distance, candidates, jnp.float32(scale)))
             fine = not np.isnan(relative).any() and np.isfinite(relative[np.asarray(candidates)]).all()
             expect(fine, f"{field}: a relative distance is not finite, for distances {name}")
     shown = relative[10:]
+    expect(shown.min() < shown.max(), f"{field}: it tells no distances apart: all relative distances are {shown.min():.3g}")
     return f"{field} as it should be: {shown.min():.3g} to {shown.max():.3g} for distances from 0.01 to 0.2 m"
 
 
@@ -238,10 +244,9 @@ def check_priority(
     def weigh(episode: Any) -> Any:
         return check.array("priority: weight []", of_episode(episode, context), (), jnp.number)
 
-    weights = np.asarray(attempt("priority", jax.jit(jax.vmap(weigh)), episodes))
+    weights = np.asarray(run("priority", jax.vmap(weigh), episodes))
     text = expect_range("priority: weights", weights)
-    alone = attempt("priority, alone,", weigh, jax.tree.map(lambda x: x[0], episodes))
-    same = np.allclose(alone, weights[0], rtol=TOLERANCE, atol=TOLERANCE)
-    expect(same, "priority: weights under jax.vmap must be those alone; they depend on other episodes")
+    alone = attempt("priority, alone,", jax.jit(weigh), jax.tree.map(lambda x: x[0], episodes))
+    expect_same("priority, alone and under jax.vmap,", alone, weights[0])
     none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
     return f"priority as it should be: {'; '.join([f'weights {text}{none}', *more])}"

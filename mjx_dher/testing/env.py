@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -10,24 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import check, context, contract, rollout
-from mjx_dher.testing.trial import TOLERANCE, attempt, expect
+from mjx_dher.testing.trial import TOLERANCE, attempt, compiled, expect, expect_range, expect_same, run
 from mjx_dher.types import Env, EnvSpec
 
 GOALS = ("achieved_goal", "desired_goal")
+DERIVED = ("reward", "success")  # what a state has besides, which a goal may change
 STARTS = 8  # episodes in a batch
 
 
 def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
-    """Plays `env` with random actions and raises at the first violation of `types.Env`.
+    """Plays `env` with random actions, compiled, and raises at the first violation of `types.Env`.
 
     - The spec agrees with the arrays (`contract.env_spec`). States keep structure, shapes and dtypes, as `lax.scan` requires.
     - Observations are float32 or uint8. Goals [G], reward [] and success [] are float32. All are finite; success is 0 or 1.
-    - `reset` and `step` are pure: the same arguments give the same results, alone and under `jax.jit` and `jax.vmap`, and stay
-      unchanged.
+    - `reset` and `step` are pure: when they are traced or called twice, the same arguments give the same results, alone and
+      under `jax.vmap`, and stay unchanged.
     - Starts or goals differ from key to key, and the goal is constant in an episode.
     - Actions outside [-1, 1] are accepted.
-    - `compute_reward`, and `reached` and `goal_distance` if present, take any leading axes. `step` gives the same reward. It
-      lies in the spec's `reward_range`, and it is greatest for a goal that is achieved exactly.
+    - `compute_reward`, and `reached` and `goal_distance` if present, take any leading axes and are pure. `step` gives the same
+      reward. Rewards of desired and of achieved goals lie in the spec's `reward_range`. A goal that is achieved exactly has the
+      greatest reward and is reached; distances are not negative.
     - If all rewards are at an end of the range, success is never 1 at the low end, and not 0 at every reward of the high end.
       They need not agree at each step: an environment may require more for a success, such as rest.
     - An episode has one step or more. With `EnvSpec.ends`, states after its end are ignored, as are those with `failed`.
@@ -42,23 +45,24 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
       ComponentError: names the first violation and what is expected.
     """
     spec: EnvSpec = attempt("reset", contract.env_spec, env)
-    reset_key, action_key = jax.random.split(jax.random.key(seed))
-    keys = jax.random.split(reset_key, STARTS)
-    shape = (spec.episode_length, STARTS, spec.action_size)
-    actions = jax.random.uniform(action_key, shape, jnp.float32, minval=-1.0, maxval=1.0)
+    keys, actions = _draw(jax.random.key(seed), (spec.episode_length, STARTS, spec.action_size))
     play = lambda: rollout.rollout(env, lambda action, obs: action, keys, STARTS, actions)  # noqa: E731
     attempt("an episode, traced by jax.jit,", jax.eval_shape, play)  # shapes
-    first = _check_single(env, keys[0], actions[0, 0], tolerance)
     _check_goal_functions(env, spec.goal_size)
-    states = _play(env, keys, actions)
-    played = jax.device_get(_outputs(states))  # [T+1, N, ...]
+    states = jax.device_get(_play(env, keys, actions))  # [T+1, N, ...]
+    played = _outputs(states)
     valid = _check_episodes(env, spec, played)
-    _check_against_play(env, keys, actions, states, tolerance)
-    _check_with_goal(env, keys, tolerance)
-    beyond = "step with an action of +-3"
-    _check_state(attempt(beyond, env.step, first, 3.0 * jnp.sign(actions[0, 0])), beyond)
-    _check_reward(env, spec, played, valid, tolerance)
+    _check_alone(env, keys, jax.device_get(actions), states, tolerance)
+    _check_rewards(env, spec, played, valid, tolerance)
     contract.check_steps(env)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _draw(key: jax.Array, shape: tuple[int, int, int]) -> tuple[jax.Array, jax.Array]:
+    """Keys of starts [N], and actions of `shape`, which is [T, N, A]."""
+    reset_key, action_key = jax.random.split(key)
+    actions = jax.random.uniform(action_key, shape, jnp.float32, minval=-1.0, maxval=1.0)
+    return jax.random.split(reset_key, shape[1]), actions
 
 
 def _outputs(state: Any) -> dict[str, Any]:
@@ -70,51 +74,15 @@ def _outputs(state: Any) -> dict[str, Any]:
     return {name + jax.tree_util.keystr(path): leaf for name, leaves in paths.items() for path, leaf in leaves}
 
 
-def _check_state(state: Any, source: str) -> None:
-    """Checks dtypes and values of a state that `source` returned."""
-    for name, value in _outputs(state).items():
-        if name not in contract.FLAGS:
-            allowed = ("float32", "uint8") if name.startswith("observation") else ("float32",)
-            dtype = str(jnp.result_type(value))
-            expect(dtype in allowed, f"{source}: {name} must be {' or '.join(allowed)}; it is {dtype}")
-        expect(np.all(np.isfinite(value)), f"{source}: {name} must be finite; it is {np.asarray(value)}")
-    expect(float(state.success) in (0.0, 1.0), f"{source}: success must be 0 or 1; it is {float(state.success):g}")
-
-
-def _check_single(env: Env, key: jax.Array, action: jax.Array, tolerance: float) -> Any:
-    """Checks one reset and one step, called twice; returns the first state."""
-    first = attempt("reset", env.reset, key)
-    _check_state(first, "reset")
-    leaves = jax.tree.leaves(first)
-    second = attempt("step", env.step, first, action)
-    kept = jax.tree.leaves(first)
-    unchanged = len(kept) == len(leaves) and all(a is b for a, b in zip(leaves, kept))
-    expect(unchanged, "step must return a new state and leave the given state unchanged; it changed it")
-    _check_state(second, "step")
-    _check_same("reset, called twice with the same key", attempt("reset", env.reset, key), first, tolerance)
-    again = attempt("step", env.step, first, action)
-    _check_same("step, called twice with the same state and action", again, second, tolerance)
-    return first
-
-
 def _check_goal_functions(env: Any, goal_size: int) -> None:
     def trace(name: str, kind: Any, leading: tuple[int, ...]) -> None:
-        goals = jnp.zeros((*leading, goal_size))
+        goals = jax.ShapeDtypeStruct((*leading, goal_size), jnp.float32)
         what = f"{name} of goals {list(goals.shape)}"
         attempt(what, jax.eval_shape, lambda a, d: check.array(what, getattr(env, name)(a, d), leading, kind), goals, goals)
 
     for name, kind in {"compute_reward": jnp.floating, "reached": jnp.bool_, "goal_distance": jnp.floating}.items():
         for leading in ((), (3,), (2, 3)) if hasattr(env, name) else ():
             trace(name, kind, leading)
-
-
-def _check_same(what: str, state: Any, expected: Any, tolerance: float) -> None:
-    actual = _outputs(state)
-    for name, value in _outputs(expected).items():
-        a, b = np.asarray(actual[name], np.float32), np.asarray(value, np.float32)
-        difference = np.abs(a - b)
-        same = np.all(difference <= tolerance * np.maximum(1.0, np.abs(b)))
-        expect(same, f"{what}, must give the same result; {name} differs by {difference.max():.3g}")
 
 
 def _play(env: Env, keys: jax.Array, actions: jax.Array) -> Any:
@@ -135,6 +103,10 @@ def _play(env: Env, keys: jax.Array, actions: jax.Array) -> Any:
 
 def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDArray:
     """Checks whole episodes; returns which of their states [T+1, N] count."""
+    for name, values in played.items():
+        allowed = ("float32", "uint8") if name.startswith("observation") else ("float32",)
+        fits = name in contract.FLAGS or values.dtype in allowed
+        expect(fits, f"reset: {name} must be {' or '.join(allowed)}; it is {values.dtype}")
     none = np.zeros(played["reward"].shape, bool)
     failed = np.logical_or.accumulate(played.get("failed", none))
     ended = played.get("done", none) | played.get("terminal", none)
@@ -151,9 +123,8 @@ def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDAr
         step = int(np.argmin(fine.all(axis=1)))
         message = f"{name} must be finite, or `failed` be True; it is not finite after {step} steps of random actions"
         expect(fine.all(), message)
-    varied = any(
-        np.any(values[0] != values[0, 0]) for name, values in played.items() if name.startswith(("observation", *GOALS))
-    )
+    names = [name for name in played if name.startswith(("observation", *GOALS))]
+    varied = any(np.any(played[name][0] != played[name][0, 0]) for name in names)
     expect(varied, f"reset must draw starts or goals with its key; {STARTS} keys gave the same")
     moved = np.any(played["desired_goal"] != played["desired_goal"][0], axis=-1) & valid
     step = int(np.argmax(moved.any(axis=1)))
@@ -163,53 +134,90 @@ def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDAr
     return valid
 
 
-def _check_against_play(env: Env, keys: jax.Array, actions: jax.Array, states: Any, tolerance: float) -> None:
-    """Compares single, uncompiled resets and steps with those of the batch, from the same states."""
-    num_steps = actions.shape[0]
+def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tolerance: float) -> None:
+    """Compares single resets and steps with those of the batch, from the same states; sets goals, and acts out of bounds."""
+
+    def alone(key: jax.Array, state: Any, action: jax.Array) -> Any:
+        before = jax.tree.leaves(state)
+        following = env.step(state, action)
+        after = jax.tree.leaves(state)
+        unchanged = len(before) == len(after) and all(a is b for a, b in zip(before, after))
+        expect(unchanged, "step must return a new state and leave the given state unchanged; it changed it")
+        return {"reset": _outputs(env.reset(key)), "step": _outputs(following)}
+
     at = lambda t, n: jax.tree.map(lambda x: x[t, n], states)  # noqa: E731
+    program = compiled("reset and step", alone, keys[0], at(0, 0), actions[0, 0], tolerance=tolerance)
+    num_steps = actions.shape[0]
     for n, t in enumerate(sorted({0, num_steps // 2, num_steps - 1})):
-        start, following = attempt("reset", env.reset, keys[n]), attempt("step", env.step, at(t, n), actions[t, n])
-        _check_same("reset, alone and under jax.jit and jax.vmap", start, at(0, n), tolerance)
-        _check_same("step, alone and under jax.jit and jax.vmap", following, at(t + 1, n), tolerance)
-
-
-def _check_with_goal(env: Any, keys: jax.Array, tolerance: float) -> None:
+        batch = {"reset": _outputs(at(0, n)), "step": _outputs(at(t + 1, n))}
+        what = "reset and step, alone and under jax.vmap,"
+        expect_same(what, program(keys[n], at(t, n), actions[t, n]), batch, tolerance)
+    beyond = program(keys[0], at(0, 0), 3.0 * np.sign(actions[0, 0]))["step"]
+    for name, value in beyond.items():
+        expect(np.all(np.isfinite(value)), f"step with an action of +-3: {name} must be finite; it is {value}")
     if not hasattr(env, "with_goal"):
         return
-    first, goal = env.reset(keys[0]), env.reset(keys[1]).obs["desired_goal"]
-    changed = attempt("with_goal", env.with_goal, first, goal)
-    _check_state(changed, "with_goal")
-    following = attempt("step after with_goal", env.step, changed, jnp.zeros(env.action_size))
-    for name, state in (("with_goal", changed), ("step after with_goal", following)):
-        expect(np.array_equal(state.obs["desired_goal"], goal), f"{name}: desired_goal must be the goal that was handed in")
-    before, after = _outputs(first), _outputs(changed)
-    for name in before.keys() - {"desired_goal", "reward", "success"}:
-        same = np.allclose(after[name], before[name], rtol=tolerance, atol=tolerance)
-        expect(same, f"with_goal must change the desired goal alone; it changed {name}")
+    first = jax.tree.map(lambda x: x[0], states)
+    goals = np.roll(first.obs["desired_goal"], 1, axis=0)
+    changed = run("with_goal", jax.vmap(env.with_goal), first, goals)
+    attempt("with_goal", contract.check_same_shapes, first, changed, "with_goal")
+    given = {name: value for name, value in _outputs(first).items() if name not in DERIVED}
+    kept = {name: value for name, value in _outputs(changed).items() if name not in DERIVED}
+    expect_same("with_goal, which changes the desired goal alone,", kept, {**given, "desired_goal": goals}, 0.0)
+    following = program(keys[0], jax.tree.map(lambda x: x[0], changed), np.zeros_like(actions[0, 0]))["step"]
+    expect_same("step after with_goal", following["desired_goal"], goals[0], 0.0)
 
 
-def _check_reward(env: Env, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:
+def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:
+    """Checks the functions of goals on those of episodes, of which the states in the mask `valid` [T+1, N] count."""
     achieved, desired = (played[name] for name in GOALS)
-    reward = jax.jit(env.compute_reward)
-    batched = np.asarray(reward(achieved, desired))
-    single = np.asarray(jax.jit(jax.vmap(jax.vmap(env.compute_reward)))(achieved, desired))
+
+    def ask(achieved: jax.Array, desired: jax.Array) -> dict[str, Any]:
+        pairs = {"desired": (achieved, desired), "own": (achieved, achieved), "other": (achieved, achieved[::-1])}
+        each = jax.vmap(jax.vmap(env.compute_reward))(achieved, desired)
+        names = [name for name in ("compute_reward", "reached", "goal_distance") if hasattr(env, name)]
+        return {"each": each, **{name: {key: getattr(env, name)(*pair) for key, pair in pairs.items()} for name in names}}
+
+    told = jax.device_get(run("compute_reward", ask, achieved, desired))
+    counted = {"desired": valid, "own": valid, "other": valid & valid[::-1]}
+    rewards = told["compute_reward"]
     differs = lambda a, b: np.abs(a - b) > tolerance * np.maximum(1.0, np.abs(b))  # noqa: E731
-    alone = not differs(batched, single).any()
+    alone = not differs(rewards["desired"], told["each"])[valid].any()
     expect(alone, "compute_reward of a batch must be that of each of its goals; it depends on the others")
-    later = valid[1:]
-    wrong = np.argwhere(differs(batched, played["reward"])[1:] & later)
+    later = np.concatenate([np.zeros_like(valid[:1]), valid[1:]])
+    wrong = np.argwhere(differs(rewards["desired"], played["reward"]) & later)
     if len(wrong):
-        t, n = wrong[0] + (1, 0)
-        right = f"compute_reward(achieved_goal, desired_goal) of the next state, {batched[t, n]:g}"
-        expect(False, f"the reward of step must be {right}; it is {played['reward'][t, n]:g}")
-    rewards, success = batched[1:][later], played["success"][1:][later]
-    low, high = spec.reward_range
-    given = f"{rewards.min():g} to {rewards.max():g}"
-    inside = rewards.min() >= low and rewards.max() <= high
-    expect(inside, f"rewards must lie in reward_range [{low:g}, {high:g}]; they range from {given}")
-    better = (np.asarray(reward(achieved, achieved)) < batched)[1:] & later
+        at = tuple(wrong[0])
+        right = f"compute_reward(achieved_goal, desired_goal) of the next state, {rewards['desired'][at]:g}"
+        expect(False, f"the reward of step must be {right}; it is {played['reward'][at]:g}")
+    of_pairs = np.concatenate([rewards[pair][mask] for pair, mask in counted.items()])
+    _check_range(spec.reward_range, of_pairs)
+    better = (rewards["own"] < rewards["desired"])[valid]
     expect(not better.any(), "compute_reward must be greatest for a goal that is achieved exactly; another had a greater one")
-    if np.isin(rewards, (low, high)).all():
-        expect(not success[rewards == low].any(), f"success must be 0 at a sparse reward of {low:g}; it is 1")
-        never = (rewards == high).any() and not success.any()
-        expect(not never, f"success must be 1 if the goal is reached; it never is, though the reward is {high:g} at some steps")
+    if np.isin(of_pairs, spec.reward_range).all():
+        highest = (rewards["own"][valid] == spec.reward_range[1]).all()
+        expect(highest, f"a sparse reward must be {spec.reward_range[1]:g} for a goal that is achieved exactly; it is not")
+        _check_success(spec.reward_range, rewards["desired"][later], played["success"][later])
+    if "reached" in told:
+        expect(told["reached"]["own"][valid].all(), "reached must be True for a goal that is achieved exactly")
+    for pair, distance in told.get("goal_distance", {}).items():
+        expect_range("goal_distance", distance[counted[pair]])
+
+
+def _check_range(reward_range: tuple[float, float], rewards: NDArray) -> None:
+    low, high = reward_range
+    least, greatest = rewards.min() + 0.0, rewards.max() + 0.0  # NaN if one is; not -0
+    is_sparse = len(np.unique(rewards)) == 2
+    declared = f"({least:g}, {greatest:g})" if is_sparse else "(low, high), bounds that hold everywhere, or scale the reward"
+    where = f"reward_range [{low:g}, {high:g}]"
+    cure = f"give the environment a `spec` (types.EnvSpec) with reward_range={declared}"
+    fits = least >= low and greatest <= high
+    expect(fits, f"rewards must lie in {where}; they range from {least:g} to {greatest:g}: {cure}")
+
+
+def _check_success(reward_range: tuple[float, float], rewards: NDArray, success: NDArray) -> None:
+    """Checks success against sparse rewards."""
+    low, high = reward_range
+    expect(not success[rewards == low].any(), f"success must be 0 at a sparse reward of {low:g}; it is 1")
+    never = (rewards == high).any() and not success.any()
+    expect(not never, f"success must be 1 if the goal is reached; it never is, though the reward is {high:g} at some steps")

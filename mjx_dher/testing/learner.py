@@ -16,7 +16,7 @@ from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
 from mjx_dher.samplers import future
 from mjx_dher.testing.methods import as_arrays
-from mjx_dher.testing.trial import EPISODES, TOLERANCE, attempt, expect, expect_finite, random_episodes
+from mjx_dher.testing.trial import EPISODES, TOLERANCE, attempt, expect, expect_finite, random_episodes, run
 from mjx_dher.types import Env, Episode, PyTree
 
 BATCH = 8
@@ -67,7 +67,7 @@ def check_learner(
     played = jax.tree.map(hide, episodes.observation), batch.desired_goal, numbers, valid
     state = _step("update_normalizers", jax.jit(made.update_normalizers), state, *played)
     obs = _check_acting(made, state, episodes, env, numbers)
-    updated, metrics = learners.check_update(state, attempt("learner.update", jax.jit(made.update), state, batch, numbers))
+    updated, metrics = learners.check_update(state, run("learner.update", made.update, state, batch, numbers))
     expect_finite("the state that learner.update gives", updated)
     same = all(bool(jnp.array_equal(a, b)) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(updated)))
     expect(not same, "learner.update must change the state; nothing in it is changed")
@@ -103,9 +103,9 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparam
     obs = {**jax.tree.map(lambda x: x[:, 0], start), "desired_goal": episodes.desired_goal}
     noise = attempt("learner.noise", made.noise, jax.random.key(2), env.episode_length, EPISODES, hparams)
     learners.check_noise(noise, env.episode_length, EPISODES)
-    explored = attempt("learner.explore", jax.jit(made.explore), state, obs, jax.tree.map(lambda x: x[0], noise), hparams)
+    explored = run("learner.explore", made.explore, state, obs, jax.tree.map(lambda x: x[0], noise), hparams)
     _check_actions("explore", explored, (EPISODES, env.action_size))
-    action = attempt("learner.act", jax.jit(made.act), state, obs, hparams)
+    action = run("learner.act", made.act, state, obs, hparams)
     _check_actions("act", action, (EPISODES, env.action_size))
     one = attempt("learner.act on one observation [D]", made.act, state, jax.tree.map(lambda x: x[0], obs), hparams)
     _check_actions("act on one observation [D]", one, (env.action_size,))

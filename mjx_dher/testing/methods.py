@@ -17,14 +17,15 @@ from mjx_dher.contract import check_with_goal, env_spec
 from mjx_dher.contrib import generators
 from mjx_dher.contrib.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
-from mjx_dher.priorities import CANDIDATES, Priority
+from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import future
-from mjx_dher.testing.trial import EPISODES, attempt, expect, expect_range, random_episodes
-from mjx_dher.types import Env, Episode, GoalObs
+from mjx_dher.testing.trial import EPISODES, attempt, compiled, expect, expect_range, random_episodes, run
+from mjx_dher.types import Env, Episode, GoalObs, PRNGKey
 
 NUMBER = 8  # transitions that a priority is asked to choose
+BATCHES = 8  # of candidates that it chooses from, one after another
 
 
 def as_arrays(hparams: HParams) -> HParams:
@@ -84,10 +85,8 @@ def check_generator(
         goals = made(jax.random.key(2), obs, ring, context)
         return check.array("generator: goals [N, G]", goals, obs["desired_goal"].shape)
 
-    goals, again = (np.asarray(attempt("generator", jax.jit(ask), first.obs, full)) for _ in range(2))
+    goals = np.asarray(run("generator", ask, first.obs, full))
     attempt("generator, with an empty ring,", jax.jit(ask), first.obs, empty)
-    same = np.array_equal(goals, again, equal_nan=True)
-    expect(same, "generator: the same key and the same ring must give the same goals; they differ")
     finite = np.isfinite(goals).all(axis=-1)
     expect(finite.any(), "generator: no goal is finite, so every episode would be played for the reset's own")
     own = np.asarray(first.obs["desired_goal"])
@@ -110,18 +109,31 @@ def check_choice(
     context, ring = trial_context(env, hparams, learner), ring_of(episodes, env_spec(env).ends)
     lines = []
     if (renew := priority.renew) is not None:
-        weights = np.asarray(attempt("priority: renew", jax.jit(lambda ring: renew(ring, context)), ring))
+        weights = np.asarray(run("priority: renew", lambda ring: renew(ring, context), ring))
         attempt("priority: renew", jax.jit(lambda ring: priorities.renew(priority, ring, context)), ring)
         lines.append(f"renewed weights {expect_range('priority: weights', weights[: episodes.action.shape[0]])}")
     if priority.choose is not None:
-        keys = jax.random.split(jax.random.key(3), 3)
-        sample = replay.sample(ring, keys[0], CANDIDATES * NUMBER)
-        batch = relabel(sample, future, context, keys[1]).batch
-        choose = priority.choose
-        attempt("priority: choose", lambda: priorities.choose(priority, keys[2], sample, batch, NUMBER, context))
-        pick = jax.jit(lambda key: choose(key, sample, batch, NUMBER, context))
-        indices = np.asarray(attempt("priority: choose", pick, keys[2]))
-        inside = indices.min() >= 0 and indices.max() < CANDIDATES * NUMBER
-        expect(inside, f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {indices.max()}")
+        _check_picks(priority.choose, ring, context)
         lines.append(f"{NUMBER} of {CANDIDATES * NUMBER} transitions chosen")
     return lines
+
+
+def _check_picks(choose: ChooseFn, ring: ReplayState, context: Context) -> None:
+    """Checks the indices that `choose` gives of the candidates of several batches."""
+
+    def pick(key: PRNGKey) -> jax.Array:
+        sample_key, goal_key, choose_key = jax.random.split(key, 3)
+        sample = replay.sample(ring, sample_key, CANDIDATES * NUMBER)
+        batch = relabel(sample, future, context, goal_key).batch
+        indices = choose(choose_key, sample, batch, NUMBER, context)
+        return check.array("priority: indices [B] of choose", indices, (NUMBER,), jnp.integer)
+
+    keys = jax.random.split(jax.random.key(3), BATCHES)
+    program = compiled("priority: choose", pick, keys[0])
+    picked = np.stack([program(key) for key in keys])
+    outside = picked[(picked < 0) | (picked >= CANDIDATES * NUMBER)]
+    expect(not outside.size, f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {outside[:1]}")
+    same = (picked == picked[:, :1]).all()
+    expect(not same, f"priority: choose must give different transitions; all {NUMBER} are one, in each of {BATCHES} batches")
+    first = (picked == CANDIDATES * np.arange(NUMBER)).all()
+    expect(not first, f"priority: choose keeps the first of each {CANDIDATES} candidates, whatever they are; it must choose")

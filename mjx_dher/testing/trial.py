@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import traceback
 from collections.abc import Callable
@@ -47,6 +48,38 @@ def expect_range(what: str, values: NDArray) -> str:
     expect_finite(what, values)
     expect(values.min() >= 0, f"{what} must not be negative; the least is {values.min():.3g}")
     return f"from {values.min():.3g} to {values.max():.3g}"
+
+
+def compiled(what: str, function: Callable[..., Any], *args: Any, tolerance: float = TOLERANCE) -> Callable[..., Any]:
+    """Compiles a pure function for arguments like `args`, arrays all of them.
+
+    Raises:
+      ComponentError: it raises an error, or a second trace of it, or a second call, gives another result for `args`.
+    """
+    traces = [attempt(what, jax.jit(functools.partial(function)).lower, *args) for _ in range(2)]  # two objects: two traces
+    program = attempt(what, traces[0].compile)
+    # Two traces are compared as programs, because most are the same, and compiling takes longest.
+    other = program if traces[0].as_text() == traces[1].as_text() else attempt(what, traces[1].compile)
+    results = (attempt(what, again, *args) for again in (program, other))
+    expect_same(f"{what}, called twice with the same arguments,", *results, tolerance)
+    return lambda *args: attempt(what, program, *args)
+
+
+def run(what: str, function: Callable[..., Any], *args: Any) -> Any:
+    """Result of a pure function of arrays, compiled; raises ComponentError as `compiled` does."""
+    return compiled(what, function, *args)(*args)
+
+
+def expect_same(what: str, result: Any, expected: Any, tolerance: float = TOLERANCE) -> None:
+    """Raises ComponentError unless two pytrees of arrays are equal, up to `tolerance` times the larger of 1 and the value."""
+    for (path, actual), value in zip(jax.tree_util.tree_leaves_with_path(result), jax.tree.leaves(expected)):
+        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            continue
+        a, b = (np.asarray(x, np.float64) for x in (actual, value))
+        if not np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True):
+            name = jax.tree_util.keystr(path, simple=True, separator=": ")
+            difference = f"{name or 'it'} differs by {np.nanmax(np.abs(a - b)):.3g}"
+            raise ComponentError(f"{what} must give the same result; {difference}")
 
 
 def random_episodes(env: Env, seed: int = 0) -> Episode:
