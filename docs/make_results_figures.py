@@ -6,7 +6,8 @@ those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, do
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import paper_forest
@@ -35,42 +36,65 @@ from paper_analysis import (
     window,
     with_tables,
 )
+from scipy.stats import t
 
 from mjx_dher import stats
 
 PAGE, SCRIPT = DOCS / "results.md", "docs/make_results_figures.py"
 
 
+OWN_CYCLES, LONG_CYCLES = "50 an epoch", "1 an epoch"
+
+
 def verdicts(the_set: Mapping[str, Sweeps]) -> str:
-    """Returns the table of the paper's claims."""
-    data, s = paper_set.current(the_set), "samplers"
-    push, pick = data["push"], data["pick_and_place"]
+    """Table of the paper's claims: with its own cycles where these have been run, else with longer ones."""
+    push, pick = the_set["push"], the_set["pick_and_place"]
     found = paper_set.compared(the_set)
-    claim = {result.comparison.task: result for result in found["the paper's claim"]}
-    rows = [
-        ["Push: `weighted` converges sooner than `future`", *_success(claim["push"].difference, p=claim["push"].p)],
-        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, s, START), 2)],
-        ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, s, 0.9), 5)],
-        ["Push: `epsilon_closest` is behind `future`", *_success(gain(push, s, "future", "epsilon_closest"))],
-        ["Push: `closest` is behind `epsilon_closest`", *_success(gain(push, s, "epsilon_closest", "closest"))],
-        [
-            "PickAndPlace: `weighted` converges sooner than `future`",
-            *_success(claim["pick_and_place"].difference, p=claim["pick_and_place"].p),
-        ],
-        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, s, START), 2)],
-        ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, s, 0.9), 10)],
-        ["Slide: no noticeable difference", *_alike(claim["slide"].difference)],
-        ["The first epochs are alike: Push, epochs 1 to 5", *_alike(window(push, s, slice(FIRST)))],
-        ["... PickAndPlace, epochs 1 to 5", *_alike(window(pick, s, slice(FIRST)))],
+    claim = {result.comparison.task: result for result in found["the paper's own cycles"]}
+    behind = {result.comparison.setting: result for result in found["methods 1 and 2, own cycles"]}
+    methods = gain(push, "own_methods", "epsilon_closest", "closest")
+    own = [
+        ["Push: `weighted` converges sooner than `future`", *_sooner(claim["push"])],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, "own_push", START), 2)],
+        ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, "own_push", 0.9), 5)],
+        ["Push: `epsilon_closest` is behind `future`", *_success(behind["epsilon_closest"].difference, -1)],
+        ["Push: `closest` is behind `epsilon_closest`", *_success(methods)],
+        ["PickAndPlace: `weighted` converges sooner than `future`", *_sooner(claim["pick_and_place"])],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, "own_pick_and_place", START), 2)],
+        ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, "own_pick_and_place", 0.9), 10)],
     ]
-    for task, sweeps in data.items():
-        start = "In the long term `weighted` is at least as good: " if task == "push" else "... "
-        late = window(sweeps, s, slice(-LAST[task], None))
-        rows.append([f"{start}{NAMES[task]}, last {LAST[task]} epochs", *_no_worse(late)])
+    for task in ("push", "pick_and_place"):
+        early, late = (window(the_set[task], f"own_{task}", part) for part in (slice(FIRST), slice(-LAST[task], None)))
+        own.append([f"{NAMES[task]}: epochs 1 to {FIRST} are alike", *_alike(early)])
+        own.append([f"{NAMES[task]}: in the last {LAST[task]} epochs `weighted` is at least as good", *_no_worse(late)])
+    slide = next(result for result in found["the paper's claim"] if result.comparison.task == "slide")
+    late = window(the_set["slide"], "slide", slice(-LAST["slide"], None))
+    long = [
+        ["Slide: no noticeable difference", *_alike(slide.difference)],
+        [f"Slide: in the last {LAST['slide']} epochs `weighted` is at least as good", *_no_worse(late)],
+    ]
     for result in found["k 16 against 8"]:
-        start = "k above 8 degrades, 16 against 8: " if result.comparison.task == "push" else "... "
-        rows.append([f"{start}{NAMES[result.comparison.task]}", *_success(result.difference, -1, result.p)])
-    return table("the paper says | our estimate | 95 % interval | p | verdict", rows)
+        long.append([f"{NAMES[result.comparison.task]}: k 16 is worse than k 8", *_success(result.difference, -1, result.p)])
+    rows = [[*row[:1], cycles, *row[1:]] for cycles, part in ((OWN_CYCLES, own), (LONG_CYCLES, long)) for row in part]
+    return table("the paper says | cycles | our estimate | 95 % interval | p | verdict", rows)
+
+
+def _sooner(result: paper_set.Compared) -> list[str]:
+    """Cells of a claim that a setting learns sooner: alike, if its interval lies within the margin."""
+    d = result.difference
+    cells = _success(d, p=result.p)
+    return [*cells[:-1], "**no**: alike"] if d.low > -MARGIN and d.high < MARGIN else cells
+
+
+def lottery(the_set: Mapping[str, Sweeps]) -> str:
+    """Table of what one curve each would show: pairs of seeds in which one is sooner by what the paper says."""
+    rows = []
+    for task, claimed in (("push", 5), ("pick_and_place", 10)):
+        weighted, future = (reach(the_set[task][f"own_{task}", name], 0.9) for name in ("weighted", "future"))
+        same = (future[:, None] - future)[~np.eye(len(future), dtype=bool)]
+        counts = [f"{np.sum(gains >= claimed)} of {gains.size}" for gains in (future[:, None] - weighted, same)]
+        rows.append([NAMES[task], str(claimed), *counts])
+    return table("task | epochs sooner | `weighted` against `future` | `future` against `future`, another seed", rows)
 
 
 def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
@@ -158,18 +182,39 @@ def kernels(data: Mapping[str, Sweeps]) -> str:
 
 
 def repeats(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of `weighted` against `future` in every sweep that has both."""
+    """Table of `weighted` against `future` in every sweep that has both, and their random-effects mean by task."""
     rows = []
     for task, sweeps in data.items():
-        for sweep in dict.fromkeys(sweep for sweep, setting in sweeps if setting == "weighted" and (sweep, "future") in sweeps):
-            curves, threshold = sweeps[sweep, "future"], THRESHOLDS[task]
-            success, epochs = gain(sweeps, sweep, "weighted", "future"), sooner(sweeps, sweep, threshold)
-            length = curves.success.shape[1]
-            rows.append([NAMES[task] if sweep == TODAY else "", sweep, str(length), *signed(success), *signed(epochs, 1)[:2]])
+        names = list(dict.fromkeys(sweep for sweep, setting in sweeps if setting == "weighted" and (sweep, "future") in sweeps))
+        gains = [gain(sweeps, sweep, "weighted", "future") for sweep in names]
+        for sweep, success in zip(names, gains):
+            epochs = sooner(sweeps, sweep, THRESHOLDS[task])
+            length = str(sweeps[sweep, "future"].success.shape[1])
+            rows.append([NAMES[task] if sweep == names[0] else "", sweep, length, *signed(success), *signed(epochs, 1)[:2]])
+        mean, low, high = pooled(gains)
+        rows.append(["", "**all of them**", "", f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", "", "", ""])
     return table(
         "task | sweep | epochs | mean success, `weighted` less `future` | 95 % interval | p | epochs sooner | 95 % interval",
         rows,
     )
+
+
+def pooled(differences: Sequence[Difference]) -> tuple[float, float, float]:
+    """Random-effects mean of the differences, and its 95 % interval.
+
+    Source: DerSimonian & Laird (1986) for the spread between sweeps, Hartung & Knapp (2001) for the interval.
+    """
+    means = np.array([d.mean for d in differences])
+    within = np.array([d.each.var(ddof=1) / len(d.each) for d in differences])
+    weights = 1 / within
+    fixed = np.average(means, weights=weights)
+    excess = float(weights @ (means - fixed) ** 2) - (len(means) - 1)
+    between = max(0.0, excess / (weights.sum() - (weights**2).sum() / weights.sum()))
+    weights = 1 / (within + between)
+    mean = float(np.average(means, weights=weights))
+    variance = float(weights @ (means - mean) ** 2) / ((len(means) - 1) * weights.sum())
+    half = float(t.ppf(0.975, len(means) - 1)) * math.sqrt(variance)
+    return mean, mean - half, mean + half
 
 
 CHANGES = (  # what, task, the sweep, and the one that it is compared with
@@ -220,7 +265,16 @@ def field(data: Mapping[str, Sweeps]) -> str:
     return table("who | Push: to 0.90 | at the end | PickAndPlace: to 0.90 | at the end | Slide: to 0.60 | at the end", rows)
 
 
-TODAY = "today's preset"  # the name of the set's sweeps among those of 2026-11-22
+OWN, TODAY = "the paper's cycles, 20 seeds", "today's preset"  # names of the set's sweeps among those of 2026-11-22
+
+
+def own_samplers(the_set: Mapping[str, Sweeps]) -> str:
+    """Table of the samplers with the paper's own cycles."""
+    named = {"own_methods": "samplers", **{f"own_{task}": "samplers" for task in NAMES}}
+    own = {t: {(named[w], n): c for (w, n), c in s.items() if w in named} for t, s in the_set.items()}
+    return samplers({task: sweeps for task, sweeps in own.items() if sweeps})
+
+
 OF_TODAY: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"samplers": samplers, "field": field}
 OF_BEFORE: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"kernels": kernels, "robustness": robustness}
 
@@ -229,21 +283,26 @@ def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[
     """Returns all tables by name, of the curves of the set and of those of 2026-11-22."""
     today = paper_set.current(the_set)
     found = {name: make(today) for name, make in OF_TODAY.items()} | {name: make(before) for name, make in OF_BEFORE.items()}
-    found |= {"verdicts": verdicts(the_set), "k": ks(the_set), "repeats": repeats(with_repeats(today, before))}
+    found |= {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "own_samplers": own_samplers(the_set)}
+    found |= {"k": ks(the_set), "repeats": repeats(with_repeats(the_set, before))}
     return found | paper_set.blocks(the_set, before)
 
 
-def with_repeats(today: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
-    """Returns the sweeps of both times by task, today's first, by the name TODAY."""
-    renamed = {task: {(TODAY, name): curves for (_, name), curves in sweeps.items()} for task, sweeps in today.items()}
-    return {task: renamed[task] | dict(sweeps) for task, sweeps in before.items()}
+def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
+    """The sweeps with `weighted` and `future` by task: with the paper's own cycles, the set's longer ones, and those before."""
+    today = paper_set.current(the_set)
+    found = {}
+    for task, sweeps in before.items():
+        own = {(OWN, name): curves for (sweep, name), curves in the_set[task].items() if sweep == f"own_{task}"}
+        found[task] = own | {(TODAY, name): curves for (_, name), curves in today[task].items()} | dict(sweeps)
+    return found
 
 
 def main() -> None:
     """Writes tables and pictures."""
     the_set, before = paper_set.load_set(paper_set.FOLDER), load()
     PAGE.write_text(with_tables(PAGE.read_text(), SCRIPT, blocks(the_set, before)))
-    paper_forest.draw(with_repeats(paper_set.current(the_set), before), DOCS / "images" / "paper_forest.png", TODAY)
+    paper_forest.draw(with_repeats(the_set, before), DOCS / "images" / "paper_forest.png", (OWN, TODAY))
     paper_forest.draw_set(paper_set.compared(the_set), DOCS / "images" / "set_forest.png")
 
 

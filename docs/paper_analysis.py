@@ -83,8 +83,16 @@ def difference(a: NDArray, b: NDArray) -> Difference:
 
 
 def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str, epochs: int | None = None) -> Difference:
-    """Returns by how much a setting's mean success over the epochs exceeds a baseline's of the same sweep."""
-    return difference(area(sweeps[sweep, setting], epochs), area(sweeps[sweep, baseline], epochs))
+    """Gain in mean success over the epochs of a setting against a baseline of the same sweep, paired by the setting's seeds."""
+    own = sweeps[sweep, setting]
+    return difference(area(own, epochs), area(with_seeds(sweeps[sweep, baseline], own.seeds), epochs))
+
+
+def with_seeds(curves: Curves, seeds: tuple[int, ...]) -> Curves:
+    """The curves of some of the seeds. Raises ValueError if one is missing."""
+    if missing := set(seeds) - set(curves.seeds):
+        raise ValueError(f"the curves lack seeds {sorted(missing)}; they have {curves.seeds}")
+    return Curves(seeds, curves.success[[curves.seeds.index(seed) for seed in seeds]])
 
 
 def sooner(sweeps: Sweeps, sweep: str, threshold: float) -> Difference:

@@ -43,8 +43,8 @@ def epoch_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line
     return lines
 
 
-def draw(data: Mapping[str, Sweeps], path: Path, main: str) -> None:
-    """Draws the picture; `main` is the sweep that comes first, and darker."""
+def draw(data: Mapping[str, Sweeps], path: Path, main: tuple[str, ...]) -> None:
+    """Draws the picture. The sweeps in `main` come first; the first one that a task has is darker."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -52,8 +52,8 @@ def draw(data: Mapping[str, Sweeps], path: Path, main: str) -> None:
 
     figure, axes = plt.subplots(1, 2, figsize=(12, 6.2))
     titles = ("mean success: weighted less future", "epochs that weighted is sooner than future")
-    for ax, lines, title in zip(axes, (success_lines(data, (main, *REPEATED)), epoch_lines(data, (main, *REPEATED))), titles):
-        _panel(ax, lines, main)
+    for ax, lines, title in zip(axes, (success_lines(data, (*main, *REPEATED)), epoch_lines(data, (*main, *REPEATED))), titles):
+        _panel(ax, lines)
         ax.set(xlabel=title)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
     axes[0].axvspan(-0.02, 0.02, color="#eef2f6", zorder=0)
@@ -101,16 +101,16 @@ def _short(result: Compared) -> str:
     return f"{setting}, against {against}" if against else setting
 
 
-def _panel(ax, lines: list[Line], main: str) -> None:
+def _panel(ax, lines: list[Line]) -> None:
     """Draws intervals from top to bottom; those of one question stand close together."""
     y, before, ticks = 0.0, "", []
-    for label, sweep, d, claimed in lines:
+    for label, _, d, claimed in lines:
         y -= 0.32 if label == before else 1.0
         if label != before:
             ticks.append((y, label))
-        is_main = sweep == main
+        is_main = label != before
         color = "#1b62a5" if is_main else "#8fb8de"
-        told = "95 % interval, 2026-11-24" if is_main else "2026-11-22"
+        told = "the paper's cycles (Slide: one an epoch), 95 %" if is_main else "other sweeps"
         label_of_dot = told if told not in ax.get_legend_handles_labels()[1] else None
         ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if is_main else 1.6, solid_capstyle="butt")
         ax.plot(d.mean, y, "o", color=color, markersize=6 if is_main else 4, label=label_of_dot)

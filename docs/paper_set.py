@@ -28,6 +28,7 @@ from paper_analysis import (
     signed,
     sooner,
     table,
+    with_seeds,
 )
 
 from mjx_dher import stats
@@ -154,10 +155,8 @@ def _baseline(c: Comparison) -> tuple[str, str]:
 
 def _compare(sweeps: Sweeps, c: Comparison) -> tuple[Difference, int]:
     """Difference of mean success over the epochs that both have, paired by the setting's seeds, and the number of epochs."""
-    a, b = sweeps[c.sweep, c.setting], sweeps[_baseline(c)]
-    if missing := set(a.seeds) - set(b.seeds):
-        raise ValueError(f"{c.sweep}, {c.setting} has seeds {sorted(missing)} that its baseline lacks; it has {b.seeds}")
-    b = Curves(a.seeds, b.success[[b.seeds.index(seed) for seed in a.seeds]])
+    a = sweeps[c.sweep, c.setting]
+    b = with_seeds(sweeps[_baseline(c)], a.seeds)
     epochs = min(a.success.shape[1], b.success.shape[1])
     return difference(area(a, epochs), area(b, epochs)), epochs
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 
+import make_results_figures
 import numpy as np
 import paper_analysis
 import paper_set
@@ -166,6 +167,13 @@ def test_the_interval_is_students_t_and_pairs_by_seed():
             {**sweeps, ("own_push", "future"): paper_analysis.Curves((1, 2), baseline.success[:2])},
             paper_set.FAMILIES["methods 1 and 2, own cycles"][0],
         )
+
+
+def test_the_pooled_estimate_by_hand():
+    """Means 0.1 and 0.3 with variances of 0.01: Q is 2, the variance between them 0.01; t with one degree is 12.706."""
+    spread = np.array([-0.1, 0.1])  # variance 0.02, of the mean of two 0.01
+    sweeps = [paper_analysis.Difference(mean + spread, mean, 0.0, 0.0, 1.0) for mean in (0.1, 0.3)]
+    assert make_results_figures.pooled(sweeps) == pytest.approx((0.2, 0.2 - 1.2706, 0.2 + 1.2706), abs=1e-3)
 
 
 def test_verdicts_of_intervals():
