@@ -73,7 +73,7 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
       model: the compiled MJCF.
       concerns: whether a field, by its name, is looked at.
     """
-    found = []
+    features = []
     defaults = _defaults()
     for name, value in fields(model):
         if not concerns(name):
@@ -81,10 +81,10 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
         words, default = _WORDS.get(name, name), defaults.get(name)
         if default is None or np.ndim(value) == np.ndim(default):
             if default is None or not np.array_equal(value, default):
-                found.append(words)
+                features.append(words)
         elif np.any(different := value != default):
-            found.append(with_names(words, model, name.split("_")[0], np.unique(np.nonzero(different)[0])))
-    return list(dict.fromkeys(found))
+            features.append(with_names(words, model, name.split("_")[0], np.unique(np.nonzero(different)[0])))
+    return list(dict.fromkeys(features))
 
 
 def with_names(what: str, model: mujoco.MjModel, kind: str, indices: Any) -> str:
