@@ -44,6 +44,14 @@ def test_a_program_is_killed_at_the_end_of_its_block():
     assert time.monotonic() - start < 30
 
 
+def test_a_program_whose_output_nobody_reads_goes_on():
+    """As the viewer beside a run, whose errors are of use only when it has ended."""
+    code = "import sys; [print('x' * 1000, file=stream) for stream in (sys.stdout, sys.stderr) for _ in range(1000)]"
+    with subprocesses.started([sys.executable, "-S", "-c", code]) as process:
+        assert process.wait(30) == 0
+        assert len(subprocesses.answer(process).err) == 1_001_000
+
+
 def test_the_package_is_the_one_that_runs():
     """A child process finds it by this path, whatever is installed."""
     assert os.path.samefile(subprocesses.PACKAGE, os.path.dirname(sys.modules["mjx_dher"].__file__))

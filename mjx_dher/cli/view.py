@@ -109,8 +109,9 @@ def _view(args: ViewArgs, console: Console) -> int:
             _until_ctrl_c() as stopped,
         ):
             console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)")
-            if args.page.host not in address.LOOPBACK:
-                console.print(f"whoever can reach {args.page.host} can see it, and move things")
+            if not address.is_loopback(args.page.host):
+                place = "any address of this machine" if address.is_everywhere(args.page.host) else args.page.host
+                console.print(f"whoever can reach {place} can see the page, and move things in it")
             if args.page.open and not address.open_browser(viewer.address):
                 console.print("there is no browser here that could be opened: open that address in one")
             sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Private names of MJX, MuJoCo Warp, Warp and orbax: every one that this library uses, behind a function each.
+"""Private names of MJX, MuJoCo Warp, Warp, orbax and viser: every one that this library uses, behind a function each.
 
 Each function says which names are private, why they are needed, and which versions need them. tests/test_private_api.py
 fails, naming the function to delete, once a newer version does without. The libraries are imported on the first call.
@@ -17,7 +17,7 @@ import functools
 import importlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -134,3 +134,31 @@ def array_checkpointer() -> Any:
         alone = {"multiprocessing_options": options}
     handler = orbax.checkpoint.PyTreeCheckpointHandler(**alone)
     return orbax.checkpoint.Checkpointer(handler, **alone)
+
+
+@contextlib.contextmanager
+def viser_served_with(adapt: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Iterator[None]:
+    """Has the server that viser starts meanwhile use the options that `adapt` makes from viser's own.
+
+    Private: that viser calls `websockets.asyncio.server.serve` by that name, which is replaced meanwhile, for every thread.
+    Why: viser serves whoever calls, and has no option for a check of requests, a limit of clients or a log.
+    Needed by: viser 1.1.1. No upstream issue known.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+    server.serve = lambda *args, **own: serve(*args, **adapt(own))  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
+
+
+def viser_control_id(control: Any) -> str:
+    """Returns the number by which browsers name a control of viser's.
+
+    Private: `_impl.uuid`.
+    Why: viser sets any attribute of a control to any value that a browser sends, before it calls anyone.
+    Needed by: viser 1.1.1. No upstream issue known.
+    """
+    return str(control._impl.uuid)

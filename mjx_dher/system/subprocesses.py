@@ -6,9 +6,10 @@ import contextlib
 import json
 import os
 import subprocess
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 PACKAGE = Path(__file__).resolve().parents[1]  # the folder mjx_dher
 
@@ -27,11 +28,17 @@ class Answer(NamedTuple):
 
 @contextlib.contextmanager
 def started(command: Sequence[str], variables: Mapping[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
-    """Starts a program, with `variables` added to this one's environment, and kills it at the end of the block."""
+    """Starts a program, with `variables` added to this one's environment, and kills it at the end of the block.
+
+    Its output goes to files, because a program stops at a full pipe that nobody reads.
+    """
     environment = {**os.environ, **(variables or {})}
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
-    ) as process:
+    with (
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as out,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as err,
+        subprocess.Popen(command, env=environment, stdout=out, stderr=err, text=True) as process,
+    ):
+        process.stdout, process.stderr = out, err
         try:
             yield process
         finally:
@@ -40,13 +47,22 @@ def started(command: Sequence[str], variables: Mapping[str, str] | None = None) 
 
 def answer(process: subprocess.Popen[str], seconds: float | None = None) -> Answer:
     """Waits for a program to end, and kills it after that many `seconds`."""
+    failure = None
     try:
-        out, err = process.communicate(timeout=seconds)
+        process.wait(seconds)
     except subprocess.TimeoutExpired:
         process.kill()
-        return Answer(*process.communicate(), f"did not end within {seconds:g} s")
+        process.wait()
+        failure = f"did not end within {seconds:g} s"
+    out, err = (_written(file) for file in (process.stdout, process.stderr))
     last = (err.strip().splitlines() or [""])[-1]
-    return Answer(out, err, f"exit status {process.returncode}: {last}" if process.returncode else None)
+    return Answer(out, err, failure or (f"exit status {process.returncode}: {last}" if process.returncode else None))
+
+
+def _written(file: IO[str] | None) -> str:
+    assert file is not None
+    file.seek(0)
+    return file.read()
 
 
 def ask(command: Sequence[str], variables: Mapping[str, str] | None = None, seconds: float | None = None) -> Answer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import ipaddress
 import os
 import socket
 import sys
@@ -11,9 +12,6 @@ import webbrowser
 
 from mjx_dher.lookup import require_extra
 from mjx_dher.validation import check_number
-
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
-EVERYWHERE = ("0.0.0.0", "::")  # all addresses of this machine
 
 
 def check(host: str, port: int) -> int:
@@ -24,8 +22,10 @@ def check(host: str, port: int) -> int:
     """
     require_extra("the viewer", "viser", "view")
     check_number("port", port, "[0, 65535]")
+    if not host.strip():
+        raise ValueError(f"host must be an address of this machine, such as 127.0.0.1; got {host!r}")
     try:
-        family, kind, _, _, address = socket.getaddrinfo(host or None, port, type=socket.SOCK_STREAM)[0]
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
             if os.name == "posix":  # as the server itself does; elsewhere this would let two have one port
                 trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -43,9 +43,26 @@ def in_use(host: str, port: int, reason: str) -> ValueError:
     return ValueError(f"port {port} of {host} cannot be used ({reason}); name another with --port, or 0 for any that is free")
 
 
+def is_ip(host: str) -> bool:
+    """Whether a host is an IP address, not a name."""
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(host))
+    return False
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is reached from this machine alone."""
+    return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def is_everywhere(host: str) -> bool:
+    """Whether a host means all addresses of this machine."""
+    return is_ip(host) and ipaddress.ip_address(host).is_unspecified
+
+
 def address(host: str, port: int) -> str:
     """Returns the page's address for a browser on this machine."""
-    name = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
+    name = "127.0.0.1" if is_everywhere(host) else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}"
 
 

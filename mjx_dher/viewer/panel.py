@@ -2,36 +2,41 @@
 
 from __future__ import annotations
 
-import queue
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from mjx_dher.system import private_api
 from mjx_dher.viewer.player import Player
 
 SPEEDS = (0.1, 4.0)  # slowest and fastest, times real time
 DRAGGED = ("goal", "object", "nothing")  # one at a time: at a goal that is reached, their handles would lie in one place
+_ONCE = ("Step", "New episode")  # buttons
 _SOLID, _DASHED = {"width": 2}, {"width": 1, "dash": (6, 4)}  # as uPlot has lines
 _RED, _BLUE, _GREY = "#d62728", "#1f77b4", "#999999"
 
 
 class Commands:
-    """Commands of users, from the threads of the server to the one that plays."""
+    """Commands of users, from the thread of the server to the one that plays. A later one replaces one of the same kind."""
 
     def __init__(self) -> None:
-        self._waiting: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._lock, self._waiting = threading.Lock(), dict[str, Callable[[], None]]()
 
-    def put(self, command: Callable[[], None]) -> None:
+    def put(self, kind: str, command: Callable[[], None]) -> None:
         """Adds a command; returns at once."""
-        self._waiting.put(command)
+        with self._lock:
+            self._waiting.pop(kind, None)
+            self._waiting[kind] = command
 
     def run(self) -> bool:
         """Runs the commands that wait, in order; returns whether there were any."""
-        number = self._waiting.qsize()
-        for _ in range(number):
-            self._waiting.get()()
-        return number > 0
+        with self._lock:
+            waiting, self._waiting = self._waiting, {}
+        for command in waiting.values():
+            command()
+        return bool(waiting)
 
 
 class Panel:
@@ -39,6 +44,7 @@ class Panel:
 
     Args:
       gui: of a server of viser's.
+      controls: receives, for each control, whether it may have a value.
       labels: names of the policies; the first is at play.
       commands: to put the user's into.
       choose: called with a policy's name.
@@ -49,6 +55,7 @@ class Panel:
     def __init__(
         self,
         gui: Any,
+        controls: dict[str, Callable[[Any], bool]],
         labels: Sequence[str],
         commands: Commands,
         choose: Callable[[str], None],
@@ -59,7 +66,7 @@ class Panel:
         self._policy = gui.add_dropdown("Policy", tuple(labels), initial_value=labels[0])
         self._about = gui.add_markdown("")
         self._play = gui.add_button("Pause", hint="Stop the clock, or let it go on")
-        self._once = gui.add_button_group("Once", ("Step", "New episode"), hint="A step of 40 ms; another start and goal")
+        self._once = gui.add_button_group("Once", _ONCE, hint="A step of 40 ms; another start and goal")
         self._speed = gui.add_slider("Speed", *SPEEDS, step=0.1, initial_value=1.0, hint="Times real time")
         self._renew = gui.add_checkbox("Next by itself", True, hint="Whether another episode begins when one has ended")
         self._taken = gui.add_dropdown("Drag", DRAGGED, initial_value=DRAGGED[0], hint="Where the handle is that moves it")
@@ -67,23 +74,29 @@ class Panel:
         self._distance = _curve(gui, "Distance to the goal, cm", ("distance", _RED), ("reached below", _GREY))
         self._critic = gui.add_markdown("")
         self._value = _curve(gui, "Critic's value", ("value", _BLUE))
-        self._policy.on_update(_put(commands, lambda: choose(self._policy.value)))
-        self._play.on_click(_put(commands, self._pause))
-        self._once.on_click(_put(commands, {"Step": self._one_step, "New episode": self._new_episode}))
-        self._speed.on_update(_put(commands, self._settle))
-        self._renew.on_update(_put(commands, self._settle))
-        self._taken.on_update(_put(commands, lambda: take(self._taken.value)))
+        is_bool = lambda value: isinstance(value, bool)  # noqa: E731
+        for control, is_value, command in (
+            (self._policy, labels.__contains__, lambda: choose(self._policy.value)),
+            (self._play, is_bool, self._pause),
+            (self._once, _ONCE.__contains__, self._act_once),
+            (self._speed, lambda value: isinstance(value, float) and SPEEDS[0] <= value <= SPEEDS[1], self._settle),
+            (self._renew, is_bool, self._settle),
+            (self._taken, DRAGGED.__contains__, lambda: take(self._taken.value)),
+        ):
+            number = private_api.viser_control_id(control)
+            controls[number] = is_value
+            (control.on_click if control in (self._play, self._once) else control.on_update)(_put(commands, number, command))
 
     def _pause(self) -> None:
         self._player().playing = not self._player().playing
 
-    def _one_step(self) -> None:
-        self._player().playing = False
-        self._player().step()
-
-    def _new_episode(self) -> None:
-        self._player().new_episode()
-        self._player().renew = True
+    def _act_once(self) -> None:
+        if self._once.value == "Step":
+            self._player().playing = False
+            self._player().step()
+        else:
+            self._player().new_episode()
+            self._player().renew = True
 
     def _settle(self) -> None:
         self._player().speed, self._player().renew = float(self._speed.value), bool(self._renew.value)
@@ -154,12 +167,12 @@ def _curve(gui: Any, label: str, *series: tuple[str, str]) -> Any:
     )
 
 
-def _put(commands: Commands, command: Callable[[], None] | Mapping[str, Callable[[], None]]) -> Callable[[Any], None]:
-    """Returns a callback of viser's that puts a command, of several the one that is pressed; none for what the server sets."""
+def _put(commands: Commands, kind: str, command: Callable[[], None]) -> Callable[[Any], Any]:
+    """Returns a callback of viser's that puts a command, unless the server itself has set the control."""
 
-    def callback(event: Any) -> None:
+    async def callback(event: Any) -> None:  # a coroutine: what a thread ran could come out of order
         if event.client_id is not None:
-            commands.put(command[event.target.value] if isinstance(command, Mapping) else command)
+            commands.put(kind, command)
 
     return callback
 

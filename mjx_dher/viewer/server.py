@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher.system import private_api
 from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
 from mjx_dher.viewer import address
 from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
@@ -44,9 +45,11 @@ class Viewer:
         self._taken, self._held = DRAGGED[0], False  # what has the handle, and whether a user holds it
         self._handle: Any = None
         self._cast, self.player = self._prepare(sources[0])
-        self._server = _start(host, port)
+        self._server, controls = _start(host, port)
         self.address = address.address(host, self._server.get_port())
-        self._panel = Panel(self._server.gui, list(self._sources), self._commands, self.choose, lambda: self.player, self.take)
+        self._panel = Panel(
+            self._server.gui, controls, list(self._sources), self._commands, self.choose, lambda: self.player, self.take
+        )
         self._draw_scene()
         self._name()
 
@@ -160,13 +163,15 @@ class Viewer:
 
         async def on_update(event: Any) -> None:  # a coroutine: what a thread ran could come out of order
             position, phase = np.array(event.target.position), event.phase
-            self._commands.put(lambda: self._drag(dragged, position, phase))
+            self._commands.put("move" if phase == "update" else "hold", lambda: self._drag(dragged, position, phase))
 
         handle.on_update(on_update)
         return handle
 
     def _drag(self, dragged: str, position: np.ndarray, phase: str) -> None:
-        """Follows a hand: `phase` is start, update or end."""
+        """Follows a hand: `phase` is start, update or end. The handle may have been given to something else meanwhile."""
+        if self._handle is None or dragged != self._taken:
+            return
         self._held = phase != "end"
         if phase == "update":
             {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](position)
@@ -194,22 +199,29 @@ def _place(source: Source) -> tuple[Any, ...]:
     return source.env, source.env_kwargs
 
 
-def _start(host: str, port: int) -> Any:
-    """Starts viser's server.
+def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:
+    """Starts viser's server; returns it, and the place for the panel's controls.
 
     Raises:
       ValueError: another program has taken the port since it was checked.
     """
     import viser
 
+    from mjx_dher.viewer.guard import Guard
+
+    guard = Guard(host)
     with contextlib.redirect_stdout(io.StringIO()):  # the address is told by whoever started this
-        server = viser.ViserServer(host=host, port=port, label="mjx-dher", verbose=False)
+        with private_api.viser_served_with(guard.options):
+            server = viser.ViserServer(host=host, port=port, label="mjx-dher", verbose=False)
         if server.get_port() != port:  # it takes the next that is free
             server.stop()
             raise address.in_use(host, port, "another program has taken it")
+        if not guard.is_used:
+            server.stop()
+            raise ValueError(f"the viewer cannot check requests with viser {viser.__version__}; install viser 1.1.1")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.scene.configure_environment_map("studio", environment_intensity=0.22)  # light from all sides
-    return server
+    return server, guard.controls
 
 
 def _rgb(rgba: Sequence[float]) -> tuple[int, int, int]:

@@ -1,0 +1,213 @@
+"""Guard of the viewer's port: checks connections, requests and messages before viser gets them. Needs viser.
+
+Any web page can make a browser call this port, and any program on the machine can. So requests must come from the viewer's own
+page, and messages must be those that its panel and its handle send, with values that these allow.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import logging
+import math
+import socket
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+import msgspec
+import viser
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from mjx_dher.viewer import address
+
+CLIENTS = 16  # browsers at a time
+WAITING = 64  # connections that are no browsers yet
+MESSAGE_BYTES = 1 << 14  # the page's own have less than 300
+BYTES_PER_SECOND, BURST_BYTES = 100_000, 500_000  # of a client; the page sends up to 25,000 a second
+UNSENT_BYTES = 16 << 20  # of a client that sends and does not read
+SECONDS_TO_READ = 20.0  # for a client that does not read
+HEADERS = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+
+_Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # which NaN is not
+_Pixels = Annotated[int, msgspec.Meta(ge=0, le=100_000)]
+_Vector = tuple[_Number, _Number, _Number]
+_Quaternion = tuple[_Number, _Number, _Number, _Number]
+
+
+class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
+    """Message of a browser, with the fields of viser's message of this name."""
+
+
+class _Camera(_Message, tag="ViewerCameraMessage"):
+    wxyz: _Quaternion
+    position: _Vector
+    fov: _Number
+    near: _Number
+    far: _Number
+    image_height: _Pixels
+    image_width: _Pixels
+    look_at: _Vector
+    up_direction: _Vector
+
+
+class _DragStart(_Message, tag="TransformControlsDragStartMessage"):
+    name: Literal["/handle"]
+    owner: Literal[""] = ""
+
+
+class _DragEnd(_DragStart, tag="TransformControlsDragEndMessage"):
+    pass
+
+
+class _Drag(_DragStart, tag="TransformControlsUpdateMessage", kw_only=True):
+    wxyz: _Quaternion
+    position: _Vector
+
+
+class _Updates(msgspec.Struct, forbid_unknown_fields=True):
+    value: bool | float | str
+
+
+class _Control(_Message, tag="GuiUpdateMessage"):
+    uuid: str
+    updates: _Updates
+
+
+_decode = msgspec.msgpack.Decoder(_Camera | _Drag | _DragStart | _DragEnd | _Control).decode
+
+
+class Guard:
+    """Rules of a port, and its open connections.
+
+    Args:
+      host: the address that the user named.
+    """
+
+    def __init__(self, host: str):
+        self.controls: dict[str, Callable[[Any], bool]] = {}  # of the panel, by number: whether a value is allowed
+        self.is_used = False
+        self._names = {"localhost", host.lower()}
+        if not address.is_loopback(host):
+            self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
+        self.waiting: dict[Connection, None] = {}  # in the order of their calls
+        self.clients: dict[Connection, None] = {}
+
+    def options(self, own: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns options for `websockets.asyncio.server.serve`, in place of viser's own."""
+        self.is_used = True
+        log = logging.Logger("viewer")  # with no handler: a stranger's errors are not for the user's screen
+        log.addHandler(logging.NullHandler())
+        return {
+            **own,
+            "process_request": lambda connection, request: self._answer(connection, request, own["process_request"]),
+            "create_connection": lambda *args, **options: Connection(self, *args, **options),
+            "subprotocols": [f"viser-v{viser.__version__}"],
+            "select_subprotocol": None,
+            "max_size": MESSAGE_BYTES,
+            "close_timeout": 1.0,
+            "logger": log,
+        }
+
+    def _answer(self, connection: Connection, request: Request, page: Callable[..., Response | None]) -> Response | None:
+        """Answers a request; returns None for a browser that may connect."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or not self._is_own(hosts[0]):
+            return connection.respond(http.HTTPStatus.MISDIRECTED_REQUEST, "no such host here\n")
+        if request.headers.get_all("Upgrade"):
+            if len(origins) > 1 or any(origin.lower().partition("://")[2] != hosts[0].lower() for origin in origins):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "only the viewer's own page can connect\n")
+            if not self._admit(connection):
+                return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers look\n")
+            return None
+        if request.path.partition("?")[0] not in ("/", "/index.html"):
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")
+        response = page(connection, request)
+        if response is not None:
+            response.headers.update(HEADERS)
+        return response
+
+    def _is_own(self, host: str) -> bool:
+        """Whether a request's Host cannot be a name that a stranger's DNS server has pointed here."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        return name in self._names or address.is_ip(name)
+
+    def _admit(self, connection: Connection) -> bool:
+        """Admits a browser; of too many, one that has not sent its camera gives way."""
+        if len(self.clients) >= CLIENTS:
+            silent = next((client for client in self.clients if not client.has_camera), None)
+            if silent is None:
+                return False
+            silent.drop()
+        self.waiting.pop(connection, None)
+        self.clients[connection] = None
+        return True
+
+
+class Connection(ServerConnection):
+    """Connection that passes on valid messages alone, and that ends if its peer sends too much or reads too little."""
+
+    def __init__(self, guard: Guard, *args: Any, **options: Any):
+        super().__init__(*args, **options)
+        self.has_camera = False
+        self._guard, self._credit, self._received = guard, float(BURST_BYTES), self.loop.time()
+
+    def drop(self) -> None:
+        """Ends the connection at once."""
+        self._guard.waiting.pop(self, None)
+        self._guard.clients.pop(self, None)
+        self.transport.abort()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._guard.waiting[self] = None
+        if len(self._guard.waiting) > WAITING:
+            next(iter(self._guard.waiting)).drop()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.drop()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        now = self.loop.time()
+        self._credit = min(BURST_BYTES, self._credit + (now - self._received) * BYTES_PER_SECOND) - len(data)
+        self._received = now
+        if self._credit < 0 or self.transport.get_write_buffer_size() > UNSENT_BYTES:
+            self.drop()
+        else:
+            super().data_received(data)
+
+    async def drain(self) -> None:
+        async with asyncio.timeout(SECONDS_TO_READ):
+            await super().drain()
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        while True:
+            raw = await super().recv(decode)
+            with contextlib.suppress(msgspec.MsgspecError, TypeError):  # TypeError: a frame of text
+                message = _decode(raw)  # type: ignore[arg-type]
+                if self._is_allowed(message):
+                    return msgspec.msgpack.encode(message)  # not `raw`, of which viser could read something else
+
+    def _is_allowed(self, message: _Message) -> bool:
+        """Whether viser may have a message. The camera comes first: viser has no client without one."""
+        if isinstance(message, _Camera):
+            view = math.dist(message.position, message.look_at)
+            is_posed = min(view, math.hypot(*message.up_direction), math.hypot(*message.wxyz)) > 1e-3
+            allowed = is_posed and 0 < message.fov < math.pi and 0 < message.near < message.far
+            self.has_camera |= allowed
+            return allowed
+        if isinstance(message, _Control):
+            is_value = self._guard.controls.get(message.uuid, lambda value: False)
+            return self.has_camera and is_value(message.updates.value)
+        return self.has_camera
