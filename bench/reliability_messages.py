@@ -2,7 +2,7 @@
 
     python bench/reliability_messages.py [--messages 200] [--seed 0] [--programs view distributed ray]
 
-Needs the extras `view` and `ray`, and Linux. Each program is the real command. After its messages it must still do its work, a
+Needs the extras `view`, `ray` and `test`. Each program is the real command. After its messages it must still do its work, a
 legitimate client of the viewer must still be served, and memory must not have grown.
 """
 
@@ -14,7 +14,6 @@ import contextlib
 import math
 import os
 import random
-import re
 import signal
 import socket
 import struct
@@ -25,6 +24,7 @@ import time
 from pathlib import Path
 
 import msgspec
+import psutil
 import viser
 import viser._messages
 import zstandard
@@ -221,38 +221,20 @@ async def attack_viewer(port, number, seed):
 # Programs
 
 
+def family(process):
+    """A program's processes."""
+    first = psutil.Process(process.pid)
+    return [first, *first.children(recursive=True)]
+
+
 def memory_mb(process):
-    return (
-        sum(int(re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())[1]) for pid in family(process.pid))
-        // 1024
-    )
-
-
-def family(pid):
-    """A process and its descendants."""
-    found = [pid]
-    for one in found:
-        with contextlib.suppress(OSError):
-            tasks = Path(f"/proc/{one}/task").glob("*/children")
-            found += [int(child) for path in tasks for child in path.read_text().split()]
-    return found
+    return sum(one.memory_info().rss for one in family(process)) >> 20
 
 
 def ports_of(processes):
-    """Ports at which processes and their descendants listen: {port: address}."""
-    links = {os.readlink(link) for process in processes for pid in family(process.pid) for link in links_of(pid)}
-    listening = {}
-    for table in ("tcp", "tcp6"):
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-            _, local, _, state, *_, inode = line.split()[:10]
-            if state == "0A" and f"socket:[{inode}]" in links:
-                listening[int(local.rpartition(":")[2], 16)] = local.rpartition(":")[0]
-    return listening
-
-
-def links_of(pid):
-    with contextlib.suppress(OSError):
-        yield from (link for link in Path(f"/proc/{pid}/fd").iterdir() if link.exists() or link.is_symlink())
+    """Ports at which programs listen."""
+    places = [one for process in processes for child in family(process) for one in child.net_connections()]
+    return sorted({one.laddr.port for one in places if one.status == psutil.CONN_LISTEN})
 
 
 @contextlib.contextmanager
@@ -354,12 +336,6 @@ def ray(folder, number, seed):
 PROGRAMS = {"view": view, "distributed": distributed, "ray": ray}
 
 
-def attack(program, folder, number, seed):
-    """Runs one program under hostile messages: the number of ports, and a line for each thing that went wrong."""
-    folder.mkdir(parents=True)
-    return PROGRAMS[program](folder, number, seed)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--messages", type=int, default=200)
@@ -369,7 +345,8 @@ def main() -> int:
     wrong = False
     with tempfile.TemporaryDirectory() as folder:
         for name in args.programs:
-            ports, faults = attack(name, Path(folder, name), args.messages, args.seed)
+            Path(folder, name).mkdir()
+            ports, faults = PROGRAMS[name](Path(folder, name), args.messages, args.seed)
             print(
                 f"{name}: {args.messages} messages to each of {ports} ports:", "; ".join(faults) or "nothing ended or blocked"
             )

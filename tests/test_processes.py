@@ -17,13 +17,16 @@ from mjx_dher.parallel import processes
 from mjx_dher.runs.folder import loggers
 
 TALK = """
-import jax, numpy as np
+import os, jax, numpy as np, psutil
 from jax.sharding import NamedSharding, PartitionSpec
 from mjx_dher.parallel import processes
 
 processes.connect()
 first = processes.leads()
 assert first == (jax.process_index() == 0)
+address, _, port = os.environ["JAX_COORDINATOR_ADDRESS"].rpartition(":")
+listening = [one.laddr for one in psutil.Process().net_connections() if one.status == psutil.CONN_LISTEN]
+assert [one.ip.removeprefix("::ffff:") for one in listening if one.port == int(port)] == [address] * first
 assert processes.broadcast(lambda: {"a": [1, "x" * 3000]}) == {"a": [1, "x" * 3000]}
 assert [processes.any_process(flag) for flag in (first, not first, False)] == [True, True, False]
 

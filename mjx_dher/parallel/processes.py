@@ -5,8 +5,11 @@ Every process must call each function here at the same point of the program. In 
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 import json
 import os
+import socket
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -32,9 +35,21 @@ def connect() -> None:
     """
     try:
         size, number = (int(os.environ[name]) if name in os.environ else None for name in VARIABLES[1:])
-        jax.distributed.initialize(num_processes=size, process_id=number, **TIMEOUTS)  # type: ignore[arg-type]
+        own: dict[str, Any] = {**TIMEOUTS, "coordinator_bind_address": _bind_address()}
+        jax.distributed.initialize(num_processes=size, process_id=number, **own)
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"distributed: {error} Start it with srun or mpirun, or set {', '.join(VARIABLES)}") from error
+
+
+def _bind_address() -> str | None:
+    """Address that the coordinator listens at: the named one if it is an IP address of this machine; None leaves it to JAX."""
+    address = os.environ.get(VARIABLES[0], "")
+    host = address.rpartition(":")[0].strip("[]")
+    with contextlib.suppress(OSError, ValueError):
+        family = socket.AF_INET6 if ipaddress.ip_address(host).version == 6 else socket.AF_INET
+        socket.create_server((host, 0), family=family).close()
+        return os.environ.get("JAX_COORDINATOR_BIND_ADDRESS", address)
+    return None
 
 
 def is_alone() -> bool:
