@@ -33,17 +33,9 @@ from websockets.exceptions import WebSocketException
 
 ROOT = Path(__file__).parent.parent
 PROTOCOL = f"viser-v{viser.__version__}"
-CAMERA = {
-    **{"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [3, 3, 3], "fov": 1, "near": 0.01, "far": 1000},
-    **{"image_height": 600, "image_width": 800, "look_at": [0, 0, 0], "up_direction": [0, 0, 1]},
-}
-DRAG = {
-    "type": "TransformControlsUpdateMessage",
-    "name": "/handle",
-    "wxyz": [1, 0, 0, 0],
-    "position": [1.3, 0.7, 0.5],
-    "owner": "",
-}
+CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [3, 3, 3], "fov": 1, "near": 0.01, "far": 1000}
+CAMERA |= {"image_height": 600, "image_width": 800, "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
+DRAG = {"type": "TransformControlsUpdateMessage", "name": "/handle", "wxyz": [1, 0, 0, 0], "position": [1.3, 0.7, 0.5]}
 GROWTH_MB = 64
 encode = msgspec.msgpack.encode
 
