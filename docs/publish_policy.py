@@ -124,12 +124,12 @@ def check(folder: Path, run: RunSpec) -> None:
 def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) -> dict[str, Any]:
     """Plays the policy here, on native, and in the original where `python` has it; returns both summaries."""
     from mjx_dher.evaluate import play_policy, summarize
-    from mjx_dher.policy.load import check_fits, check_plain, load_policy
+    from mjx_dher.policy.load import check_fits, load_plain
     from mjx_dher.system.caches import keep_compiled_programs
     from mjx_dher.system.limits import usable_cores
     from mjx_dher.tools import transfer
 
-    policy = check_plain(load_policy(folder), run, "the package")
+    policy = load_plain(folder, "the package")
     keep_compiled_programs()
     env = envs.make(run.env, engine="native")
     check_fits(policy, env)

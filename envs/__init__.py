@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 from collections.abc import Callable
@@ -36,12 +37,7 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
         of range, an engine is given to a constructor that takes none, or the constructor returns no environment.
     """
     constructor = load("env", name)
-    if not callable(constructor):
-        raise ValueError(f"env {name!r} must be a class or function that makes an environment; it is {constructor!r}")
-    try:
-        inspect.signature(constructor)
-    except ValueError as error:
-        raise ValueError(f"env {name!r} must be a class or function of Python's; {error}") from error
+    _check_kind(name, constructor)
     if _takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
@@ -54,12 +50,21 @@ def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
     except Exception as error:
         kind = "" if isinstance(error, TypeError) else f"{type(error).__name__}: "
         raise ValueError(f"env {name!r} cannot be made: {kind}{error}") from error
-    missing = [member for member in _MEMBERS if not hasattr(env, member)]
-    if missing:
-        raise ValueError(
-            f"env {name!r} is no environment: it has no {', '.join(missing)} (mjx_dher.types.Env says what one has)"
-        )
+    _check_members(name, env, ("action_size", "episode_length", *_METHODS))
     return env
+
+
+def _check_kind(name: str, constructor: Any) -> None:
+    """Raises ValueError for anything but a class with an environment's methods, or a Python function; nothing is called."""
+    if inspect.isclass(constructor):
+        _check_members(name, constructor, _METHODS)
+    elif not (inspect.isfunction(constructor) or isinstance(constructor, functools.partial)):
+        raise ValueError(f"env {name!r} must be a class or Python function that makes an environment; it is {constructor!r}")
+
+
+def _check_members(name: str, env: Any, members: tuple[str, ...]) -> None:
+    if missing := [member for member in members if not hasattr(env, member)]:
+        raise ValueError(f"env {name!r} is no environment: it has no {', '.join(missing)} (see mjx_dher.types.Env)")
 
 
 def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict[str, Any]) -> None:
@@ -78,7 +83,7 @@ def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict
         check_name(f"argument of env {name}", key, named)
 
 
-_MEMBERS = ("action_size", "episode_length", "reset", "step", "compute_reward")  # of types.Env
+_METHODS = ("reset", "step", "compute_reward")  # of types.Env
 
 
 def takes_engine(name: str) -> bool:

@@ -6,6 +6,7 @@ Loads neither JAX nor MuJoCo.
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import importlib.util
 import inspect
@@ -14,8 +15,34 @@ import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
+
+from mjx_dher import trust
+
+# Modules that have no component: of the standard library, and of the libraries that this one is built on.
+NO_COMPONENTS = frozenset(
+    {
+        *sys.stdlib_module_names,
+        *(
+            "etils",
+            "filelock",
+            "flax",
+            "jax",
+            "jaxlib",
+            "ml_dtypes",
+            "mujoco",
+            "numpy",
+            "optax",
+            "orbax",
+            "ray",
+            "rich",
+            "scipy",
+        ),
+        *("setuptools", "tyro", "viser", "warp"),
+    }
+)
 
 
 def command_name() -> str:
@@ -48,9 +75,11 @@ def load_import_path(field: str, value: str) -> Any:
     """Imports the module of "module:attribute" and returns the attribute.
 
     Raises:
-      ValueError: there is no such module or attribute (the message suggests the nearest), or the import raises an error.
+      ValueError: there is no such module or attribute (the message suggests the nearest), a library has it, a file names it
+        that is not trusted, or the import raises an error.
     """
     _check_import_path(field, value)
+    trust.check(field, value, module_file(value))
     name, attribute = value.split(":")
     try:
         module = importlib.import_module(name)
@@ -64,14 +93,21 @@ def load_import_path(field: str, value: str) -> Any:
     if not hasattr(module, attribute):
         hint = _hint(attribute, [name for name in dir(module) if not name.startswith("_")])
         raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{hint}")
-    return getattr(module, attribute)
+    component = getattr(module, attribute)
+    made_by = component.func if isinstance(component, functools.partial) else component
+    if inspect.isclass(made_by) or inspect.isroutine(made_by):  # and not an instance of a library's class
+        _check_origin(field, value, str(inspect.unwrap(made_by).__module__))
+    return component
 
 
 def module_file(value: str) -> Path | None:
-    """File of the module in "module:attribute", which is not imported; None if there is none."""
+    """File of the module in "module:attribute"; None if there is none. Neither it nor a package around it is imported."""
+    names = value.partition(":")[0].split(".")
     try:
-        spec = importlib.util.find_spec(value.partition(":")[0])
-    except Exception:  # a parent package cannot be imported; the error comes when the module is
+        spec = importlib.util.find_spec(names[0])
+        for end in range(2, len(names) + 1):
+            spec = PathFinder.find_spec(".".join(names[:end]), spec.submodule_search_locations or ()) if spec else None
+    except (ValueError, ImportError):  # __main__ has no spec, for example
         return None
     return Path(spec.origin) if spec is not None and spec.origin and Path(spec.origin).is_file() else None
 
@@ -100,9 +136,15 @@ def _check_import_path(field: str, value: str) -> None:
     name, _, attribute = value.partition(":")
     if not all(part.isidentifier() for part in (*name.split("."), attribute)):
         raise ValueError(f"{field} must be module:attribute, the module's name as `import` takes it; got {value!r}")
+    _check_origin(field, value, name)
     top = name.partition(".")[0]
     if top not in sys.modules and importlib.util.find_spec(top) is None:
         raise _no_module(field, value, top)
+
+
+def _check_origin(field: str, value: str, module: str) -> None:
+    if module.partition(".")[0] in NO_COMPONENTS:
+        raise ValueError(f"{field} must be a component; {value!r} is of {module}, which has none")
 
 
 def _no_module(field: str, value: str, missing: str) -> ValueError:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from typing_extensions import Doc
 
-from mjx_dher import validation
+from mjx_dher import trust, validation
 from mjx_dher.components import COMPONENTS, help_text
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name, is_import_path
@@ -159,13 +159,12 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
 
 
 def find_demonstrations(source: str) -> Path:
-    """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none."""
-    if source.endswith(".npz") and Path(source).is_file():
-        return Path(source)
+    """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none, or it is not trusted (`trust`)."""
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
-    for folder in (Path(source), root / source):
-        if source and (folder / "data").is_dir():
-            return folder
+    for path in (Path(source), root / source):
+        if (source.endswith(".npz") and path.is_file()) or (source and (path / "data").is_dir()):
+            trust.check("demonstrations", source, path)
+            return path
     raise ValueError(f"demonstrations must be an .npz file, or the folder or name of a Minari data set; got {source!r}")
 
 

@@ -51,7 +51,7 @@ def breaks(size=3):
 
 
 @pytest.mark.parametrize(
-    ("constructor", "reason"), [(breaks, "RuntimeError: no 3"), (lambda: len(3), "has no len"), (int, "signature")]
+    ("constructor", "reason"), [(breaks, "RuntimeError: no 3"), (lambda: len(3), "has no len"), (int, "builtins")]
 )
 def test_a_constructor_that_breaks_is_named(constructor, reason, monkeypatch):
     monkeypatch.setitem(sys.modules, "own", types.SimpleNamespace(made=constructor))

@@ -135,8 +135,9 @@ def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, m
     assert spec.demonstrations == str(file)
     assert content["sources"]["demonstrations"].startswith("demos.npz ")
     (tmp_path / "moved").mkdir()
+    name = fingerprint.trial_name(spec)
     moved = file.rename(tmp_path / "moved" / "demos.npz")
-    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=str(moved))) == fingerprint.trial_name(spec)
+    assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=str(moved))) == name
     assert fingerprint.trial_name(dataclasses.replace(spec, demonstrations=None)) != fingerprint.trial_name(spec)
     capsys.readouterr()
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--json"]) == 0  # the policy needs no file

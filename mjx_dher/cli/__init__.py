@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from mjx_dher import __version__, lookup
+from mjx_dher import __version__, lookup, trust
 from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS, run
 
@@ -36,6 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             ended = _run(name, argv)
         except SystemExit as error:  # of --help, and of arguments that cannot be parsed
             ended, trains = error.code if isinstance(error.code, int) else 1, False
+        finally:
+            trust.everything = False
         stream.flush()
     return output.status(stream, ended, trains)
 

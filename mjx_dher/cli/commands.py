@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
+from mjx_dher import trust
 from mjx_dher.lookup import command_name
 
 Args = TypeVar("Args")
@@ -81,4 +82,6 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
             raise ValueError(f"{flag} is called {name} here{comma}{rest}")
     command = kind.__name__.removesuffix("Args").lower()
     prog = command_name() + ("" if command == "train" else f" {command}")
-    return tyro.cli(kind, prog=prog, args=argv, **options)
+    args = tyro.cli(kind, prog=prog, args=argv, **options)
+    trust.everything = getattr(args, "trust", False)
+    return args

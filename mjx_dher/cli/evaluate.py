@@ -41,6 +41,8 @@ class EvalArgs:
     """Physics: native, jax, warp or auto; the run's own unless given."""
     env_kwargs: tuple[str, ...] = ()
     """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
+    trust: bool = False
+    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
     json: bool = False
     """Print one JSON object a run, a line each, instead; remarks then go to standard error."""
 

@@ -35,7 +35,7 @@ class ExportArgs:
 
 def export_command(argv: list[str], console: Console) -> int:
     """Writes the policy of a run folder for other programs."""
-    from mjx_dher.policy.load import check_plain, load_policy
+    from mjx_dher.policy.load import load_plain
     from mjx_dher.tools import export
 
     args = parse(ExportArgs, argv)
@@ -45,7 +45,7 @@ def export_command(argv: list[str], console: Console) -> int:
     beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside
     export.check(args.format, out, args.overwrite)
-    policy = check_plain(load_policy(folder), run, "export")
+    policy = load_plain(folder, "export")
     difference = export.write(policy, run, args.format, out)
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(

@@ -17,7 +17,7 @@ from mjx_dher.fleet import chunks, cluster, driver, worker
 from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.fleet.options import LOCAL, FleetOptions
 from mjx_dher.fleet.worker import News, Tell
-from mjx_dher.runs.folder import fingerprint
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.locks import Claims
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.signals import Stop
@@ -107,6 +107,8 @@ def _train(
     parts = [*before, *chunks.split(others, task, slots, order.lanes, order.fleet.ray_chunk)]
     stop, screen = Stop(console, order.out), _Screen(console, todo)
     code = chunks.code_of(todo)
+    for run in todo:  # the nodes write the folders
+        run_folder.record_names(run)
     with stop:
         asked = lambda: stop.asked is not None  # noqa: E731
         own = (order.options, order.lanes, task, order.storage, code, train_chunk)

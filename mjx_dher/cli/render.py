@@ -39,6 +39,8 @@ class RenderArgs:
     """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
+    trust: bool = False
+    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
     width: int = 640
     """Width of a picture, pixels."""
     height: int = 480

@@ -34,6 +34,8 @@ class ReportArgs:
     """Replacement of an existing `out`."""
     video: bool = False
     """Draw a video of the run's policy first, or of the best run of each task of a sweep, into the folder (extra video)."""
+    trust: bool = False
+    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
     threshold: float = 0.9
     """Success rate for the time that it takes to get there (of a sweep)."""
     baseline: str = "future"
@@ -55,7 +57,8 @@ def report_command(argv: list[str], console: Console) -> int:
 
     if args.video:
         for run, out in _to_film(args.folder, sweep):
-            commands.run("render", [str(run), "--out", str(out), "--episodes", str(EPISODES), "--overwrite"], console)
+            own = ("--out", str(out), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
+            commands.run("render", [str(run), *own], console)
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
     out = args.out or args.folder / report.REPORT
     with files.atomic_write(out) as partial:

@@ -153,6 +153,7 @@ def _check(args: SweepArgs) -> None:
         raise FolderError(f"out: {args.out} is there already and is no folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / grid.CELLS).is_dir():
         raise FolderError(f"out: {args.out} holds something else than a sweep; name a new or empty folder")
+    files.inside(args.out, [*args.out.glob("*"), *args.out.glob("*/*")])
 
 
 def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:

@@ -59,6 +59,8 @@ class TrainArgs:
     """Run folder, or a config.json, whose settings and options are taken in place of a preset's; others given override them."""
     out: Path | None = None
     """Run folder to write; a fresh one under runs/ unless given. Never overwrites."""
+    trust: bool = False
+    """Use the code and data that --config names, though you have not trained with them on this machine."""
     dry_run: bool = False
     """Say what would be trained, and what it takes, and write nothing."""
     curve: bool = True
@@ -86,6 +88,8 @@ class ResumeArgs:
     """Run folder."""
     engine: str | None = None
     """Physics: native, jax, warp or auto; the run's own unless given."""
+    trust: bool = False
+    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     total_steps: int | None = None

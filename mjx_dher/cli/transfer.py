@@ -44,12 +44,12 @@ def transfer_command(argv: list[str], console: Console) -> int:
     run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)
     from mjx_dher.evaluate import play_policy, summarize
-    from mjx_dher.policy.load import check_fits, check_plain, load_policy
+    from mjx_dher.policy.load import check_fits, load_plain
     from mjx_dher.stats import difference_interval
     from mjx_dher.system.limits import usable_cores
     from mjx_dher.tools import transfer
 
-    policy = check_plain(load_policy(folder), run, "transfer")
+    policy = load_plain(folder, "transfer")
     if args.set_up:
         environment = transfer.default_environment()
         console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)

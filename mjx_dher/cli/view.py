@@ -58,6 +58,8 @@ class ViewArgs:
     """Seed of the first start and goal."""
     env_kwargs: tuple[str, ...] = ()
     """Arguments of the environment, NAME=VALUE each, in place of the runs' own of these names."""
+    trust: bool = False
+    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
     page: tyro.conf.OmitArgPrefixes[Page] = dataclasses.field(default_factory=Page)
 
 
@@ -170,7 +172,7 @@ class Beside:
 
             place = str(subprocesses.PACKAGE.parent)  # of this package, which need not be installed
             code = f"import sys; sys.path.append({place!r}); from mjx_dher.cli import main; sys.exit(main())"
-            command = (sys.executable, "-c", code, "view", str(self._folder), "--port", str(self._port))
+            command = (sys.executable, "-c", code, "view", str(self._folder), "--trust", "--port", str(self._port))
             variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
             self._process = self._stack.enter_context(subprocesses.started(command, variables))
             self._console.print(f"the run is to be seen at {address.address(Page().host, self._port)} in a moment")

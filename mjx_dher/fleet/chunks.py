@@ -97,8 +97,8 @@ def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[Ru
     by_name, waiting = {fingerprint.trial_name(spec): spec for spec in specs}, set(todo)
     earlier = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():
-        with contextlib.suppress(OSError, ValueError):  # damaged: its runs begin from the start
-            chunk = tuple(by_name[name] for name in json.loads(path.read_text(encoding="utf-8")) if name in by_name)
+        with contextlib.suppress(OSError, ValueError, TypeError):  # damaged: its runs begin from the start
+            chunk = tuple(by_name[name] for name in files.read_json(path) if name in by_name)
             if waiting & set(chunk):
                 waiting -= set(chunk)
                 earlier.append(chunk)

@@ -134,7 +134,7 @@ def pack(folder: Path) -> bytes:
     """Returns a run folder as bytes: all files except its lock and its checkpoints."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for path in sorted(folder.rglob("*")):
+        for path in files.inside(folder, folder.rglob("*")):
             name = path.relative_to(folder)
             if path.is_file() and name.parts[0] != run_folder.CHECKPOINTS and not files.is_lock(path):
                 entry = zipfile.ZipInfo(name.as_posix())  # without a time: the same run gives the same bytes

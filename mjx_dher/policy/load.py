@@ -11,11 +11,10 @@ import numpy as np
 
 from mjx_dher.policy import Policy, TrainedPolicy, bundled, from_arrays
 from mjx_dher.runs.folder.run_folder import POLICY_FILE, read_spec
-from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 
 
-def load_policy(run_dir: str | Path) -> TrainedPolicy:
+def load_policy(run_dir: str | Path, trust: bool = False) -> TrainedPolicy:
     """Loads a bundled policy, or that of a run folder. Imports only NumPy: no JAX, no MuJoCo.
 
     Custom learners and networks are an exception: their policy is a `learner_policy.LearnerPolicy`, which needs JAX and the
@@ -24,13 +23,25 @@ def load_policy(run_dir: str | Path) -> TrainedPolicy:
     Args:
       run_dir: a run folder, a policy.npz under any name, or the name of a bundled policy, such as "push". A run folder or file
         of that name in the current folder comes first.
+      trust: whether to import a custom learner or networks that the folder names and that you have not trained with here.
 
     Raises:
-      FolderError: no run folder, or a policy that is missing, damaged, or of a custom learner that cannot be imported or does
-        not fit.
+      FolderError: no run folder, or a policy that is missing, damaged, or of a custom learner that cannot be imported, is not
+        trusted or does not fit.
     """
+    return _load(run_dir, trust, "")
+
+
+def load_plain(run_dir: str | Path, use: str) -> Policy:
+    """Loads a policy of NumPy arrays, as `use` needs, and imports no custom code. Raises ValueError for another policy."""
+    policy = _load(run_dir, False, use)
+    assert isinstance(policy, Policy)
+    return policy
+
+
+def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     run_dir = bundled.find(run_dir)
-    spec, path = (None, run_dir) if run_dir.is_file() else (read_spec(run_dir), run_dir / POLICY_FILE)
+    spec, path = (None, run_dir) if run_dir.is_file() else (read_spec(run_dir, trust), run_dir / POLICY_FILE)
     if not path.is_file():
         raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")
     arrays = _read(path)
@@ -39,6 +50,8 @@ def load_policy(run_dir: str | Path) -> TrainedPolicy:
             return from_arrays(arrays)
         except ValueError as error:
             raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
+    if use:
+        raise ValueError(f"{use} needs a policy of NumPy arrays; {path} is the state of a custom learner, or of custom networks")
     if spec is None:
         raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
@@ -75,10 +88,3 @@ def check_fits(policy: TrainedPolicy, env: Any) -> None:
             f"the policy takes observations of {own[0]} and goals of {own[1]} numbers and gives actions of {own[2]}; the"
             f" environment has {theirs[0]}, {theirs[1]} and {theirs[2]}"
         )
-
-
-def check_plain(policy: TrainedPolicy, spec: RunSpec, use: str) -> Policy:
-    """Returns a policy that needs only NumPy, as `use` does. Raises ValueError for one that needs its learner."""
-    if isinstance(policy, Policy):
-        return policy
-    raise ValueError(f"{use} needs a policy of NumPy arrays; learner {spec.learner!r} with networks {spec.networks!r} has none")

@@ -13,6 +13,7 @@ from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import comparison, plotting, tables
+from mjx_dher.system import files
 from mjx_dher.tools import curves, figures, html
 from mjx_dher.tools.curves import Curve
 
@@ -74,7 +75,7 @@ def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
 
 
 def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
-    for path in sorted(folder.iterdir()):
+    for path in files.inside(folder, folder.iterdir()):
         if path.suffix.lower() not in html.VIDEOS or not path.is_file():
             continue
         if path.stat().st_size > html.LARGEST:

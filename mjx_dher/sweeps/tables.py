@@ -12,6 +12,7 @@ import numpy as np
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.sweeps.grid import CELLS
+from mjx_dher.system import files
 from mjx_dher.system.files import FolderError, atomic_write
 
 RESULTS = "results.csv"
@@ -26,9 +27,11 @@ def read(folder: Path) -> list[dict[str, Any]]:
     status and reason; curve, lists by column; and final, the last evaluation, empty for a run that failed.
 
     Raises:
-      FolderError: no sweep, none ended, or a trial that cannot be believed (`results.result_problem`).
+      FolderError: no sweep, none ended, a link that leads out of it, or a trial that cannot be believed
+        (`results.result_problem`).
     """
-    paths = sorted(path.parent for path in (folder / CELLS).glob(f"*/{run_folder.RESULT_FILE}"))
+    cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
+    paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]
     if not paths:
         raise FolderError(f"{folder} holds no finished run of a sweep")
     trials = [_read_trial(path) for path in paths]

@@ -18,6 +18,8 @@ from mjx_dher.system import memory
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
+LARGEST_JSON = 8 << 20  # bytes
+PARTIAL = ".partial"  # ending of a file that is being written; what has this name is deleted first
 LOCK = ".lock"  # name of the file in a folder by which it is locked
 _MARKER = f"{LOCK}.soft"  # the same, on a file system without locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)  # filelock itself marks the folder for ENOSYS
@@ -51,6 +53,40 @@ def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
         raise FolderError(f"out: there is no folder {out.parent}")
 
 
+def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
+    """Paths in a folder, none of which leads out of it.
+
+    Raises:
+      FolderError: one of them is a link to elsewhere.
+    """
+    paths, root = sorted(paths), Path(os.path.realpath(folder))
+    for path in paths:
+        if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
+            raise FolderError(f"{path} is a link that leads out of {folder}: remove it, or put a copy in its place")
+    return paths
+
+
+def read_json(file: Path) -> Any:
+    """Content of a JSON file.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      FolderError: it is larger than LARGEST_JSON, is not JSON, or cannot be read.
+    """
+    if file.exists() and not file.is_file():
+        raise FolderError(f"{file} is not a file")  # reading a FIFO would block
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(LARGEST_JSON + 1)
+        if len(content) > LARGEST_JSON:
+            raise ValueError(f"it is larger than {LARGEST_JSON >> 20} MB")
+        return json.loads(content.decode())
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise FolderError(f"{file} cannot be read ({error})") from error
+
+
 @contextlib.contextmanager
 def lock(folder: Path, wait: bool = False) -> Iterator[None]:
     """Locks a folder against other programs, and other threads of this one. Who has the lock can take it again.
@@ -64,6 +100,7 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
 
     Raises:
       BusyError: another program holds the lock, and `wait` is False.
+      FolderError: a link in it leads elsewhere, through which a file would be written or deleted.
       OSError: the folder does not exist or cannot be written to.
     """
     from filelock import FileLock, Timeout
@@ -83,6 +120,7 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
             path.unlink(missing_ok=True)
         held = _mark(folder, timeout)
     try:
+        inside(folder, (path for path in folder.iterdir() if path.suffix != PARTIAL))
         yield
     finally:
         held.release()
@@ -243,7 +281,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
     After an error `path` stays as it was, and the new file is deleted.
     """
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(path.name + PARTIAL)
     partial.unlink(missing_ok=True)  # what a kill has left, or a link, through which another file would be written
     try:
         with naming(path):

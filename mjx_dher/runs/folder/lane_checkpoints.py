@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -168,8 +167,9 @@ class LaneCheckpoints:
 
 
 def _names(path: Path) -> list[str]:
-    """Names of the runs that share a checkpoint; none if another process has just removed it."""
+    """Names of the runs that share a checkpoint; none if another process has just removed it, or if they are damaged."""
     try:
-        return list(json.loads(path.read_text(encoding="utf-8"))["cells"])
+        names = files.read_json(path)["cells"]
+        return names if all(name == Path(name).name for name in names) else []
     except (OSError, ValueError, KeyError, TypeError):
         return []

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
+from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
 
@@ -23,12 +23,10 @@ def read_result(folder: Path) -> dict[str, Any]:
       FolderError: it is missing or damaged.
     """
     path = folder / run_folder.RESULT_FILE
-    if path.exists() and not path.is_file():
-        raise FolderError(f"{path} is damaged: it is not a file")  # a reader of a FIFO would block
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = files.read_json(path)
         return {"reason": "", **content, "status": str(content["status"]), "epochs": int(content["epochs"])}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise FolderError(f"{path} is damaged ({type(error).__name__}: {error})") from error
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import __version__
+from mjx_dher import __version__, lookup, trust
 from mjx_dher import spec as spec_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint
@@ -89,6 +89,15 @@ def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) 
     run = {"physics": engine, "sources": own, "digest": fingerprint.digest(fingerprint.identity(spec, engine, own))}
     files.make_folder(path)
     files.write_json(path / CONFIG_FILE, {"schema": SCHEMA, **description, **run, **extra, "versions": _versions()})
+    record_names(spec)
+
+
+def record_names(spec: RunSpec) -> None:
+    """Records the custom components and demonstrations of a run that the user trains (`trust`)."""
+    for field, name in spec_lib.custom_components(spec).items():
+        trust.record(field, name, lookup.module_file(name), spec.env_kwargs if field == "env" else ())
+    if spec.demonstrations is not None:
+        trust.record("demonstrations", spec.demonstrations, spec_lib.find_demonstrations(spec.demonstrations))
 
 
 def _versions() -> dict[str, str]:
@@ -125,14 +134,7 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
       FileNotFoundError: there is no such file.
       FolderError: it cannot be read, or is of another schema.
     """
-    if file.exists() and not file.is_file():
-        raise FolderError(f"{file} is not a file")  # a reader of a FIFO would block
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
-        raise FolderError(f"{file} cannot be read ({error})") from error
+    content = files.read_json(file)
     written = content.get("schema") if isinstance(content, dict) else None
     if written != schema:
         raise FolderError(f"{file} is not of this program's schema {schema} (found {written!r})")
@@ -180,19 +182,21 @@ def _check_kinds(content: dict[str, Any]) -> None:
         raise TypeError("; ".join(wrong))
 
 
-def read_spec(path: Path) -> RunSpec:
+def read_spec(path: Path, trusted: bool = False) -> RunSpec:
     """Reads the description of the run in `path`; raises FolderError as `read_run` does."""
-    return read_run(path)[1]
+    return read_run(path, trusted)[1]
 
 
-def read_run(path: Path) -> tuple[dict[str, Any], RunSpec]:
+def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec]:
     """Reads config.json of the run in `path`: its content, and the run's description.
+
+    The code that it names is imported only if `trusted`, or if the user has trained with it (`trust`).
 
     Raises:
       FolderError: no run folder, one of another schema, or a config.json that was edited.
     """
     content = read_config(path)
-    spec = to_spec(path, content)
+    spec = to_spec(path, content, trusted)
     if edits := edited(path, content, spec):
         raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
     return content, spec
@@ -240,8 +244,10 @@ def written_identity(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
+def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSpec:
     """Makes the description of a run from the content of its config.json, at `path` or in the folder `path`.
+
+    Names of code and of demonstrations are marked as coming from a file, unless `trusted`.
 
     Raises:
       FolderError: an entry is missing or invalid.
@@ -259,6 +265,12 @@ def to_spec(path: Path, content: dict[str, Any]) -> RunSpec:
             env_kwargs=tuple(content["env_kwargs"]),
         )
         spec_lib.validate_values(spec)
-        return spec
     except (KeyError, TypeError, ValueError) as error:
         raise FolderError(f"{file} does not describe a run ({error})") from error
+    if trusted:
+        return spec
+    names = {**spec_lib.custom_components(spec), "demonstrations": spec.demonstrations}
+    marked: dict[str, Any] = {
+        field: trust.FromFile.of(name, file, spec.env_kwargs if field == "env" else ()) for field, name in names.items() if name
+    }
+    return dataclasses.replace(spec, **marked)

@@ -1,0 +1,77 @@
+"""Names that a file gives: of code to import and of data to read. They are used only if the user has named them before.
+
+Training records the names that the user typed or passed, in the user's state folder, with the file that each stands for. A
+name from a file is used if it has such a record, or with `--trust` (`trust=True` in Python).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+everything = False  # --trust of the command that runs
+
+
+class FromFile(str):
+    """A name that a file gives, equal to its text."""
+
+    file: Path
+    arguments: tuple[str, ...]  # of an environment, from the same file
+
+    @classmethod
+    def of(cls, name: str, file: Path, arguments: Sequence[str] = ()) -> FromFile:
+        """Marks a name as coming from a file."""
+        marked = cls(name)
+        marked.file, marked.arguments = file, tuple(arguments)
+        return marked
+
+
+def check(field: str, name: str, place: Path | None) -> None:
+    """Checks that a name may be used; `place` is the file that it stands for, or None.
+
+    Raises:
+      ValueError: the name comes from a file, and the user has neither trained with it nor given `--trust`.
+    """
+    if everything or not isinstance(name, FromFile):
+        return
+    try:
+        if _record(field, name, place, name.arguments).exists():
+            return
+        reason = "you have not trained with it here"
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+        reason = f"names that you trained with cannot be looked up ({error})"
+    arguments = f" with the arguments {' '.join(name.arguments)}" if name.arguments else ""
+    raise ValueError(
+        f"{field} {str(name)!r}{arguments} is named by {name.file}, and {reason}. If you trust that file and"
+        f" {place or 'the module'}, give --trust (trust=True in Python), or type the name yourself"
+    )
+
+
+def record(field: str, name: str, place: Path | None, arguments: Sequence[str] = ()) -> None:
+    """Records a name that the user has typed or passed. Does nothing if there is no state folder."""
+    if isinstance(name, FromFile):
+        return
+    with contextlib.suppress(OSError, RuntimeError):
+        _folder(make=True)
+        _record(field, name, place, arguments).touch()
+
+
+def _record(field: str, name: str, place: Path | None, arguments: Sequence[str]) -> Path:
+    content = json.dumps([field, name, None if place is None else str(place.resolve()), list(arguments)])
+    return _folder() / hashlib.sha256(content.encode("utf-8", "surrogateescape")).hexdigest()
+
+
+def _folder(make: bool = False) -> Path:
+    """Folder of the records. Raises OSError if others can write to it, or if it would depend on the current folder."""
+    folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "mjx-dher" / "trusted"
+    if not folder.is_absolute():
+        raise OSError(f"{folder} is not an absolute path")
+    if make:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if folder.exists() and ((status := folder.stat()).st_uid != os.getuid() or status.st_mode & 0o022):
+        raise OSError(f"others can write to {folder}")
+    return folder
