@@ -102,11 +102,11 @@ def load_import_path(field: str, value: str) -> Any:
 
 def module_file(value: str) -> Path | None:
     """File of the module in "module:attribute"; None if there is none. Neither it nor a package around it is imported."""
-    names = value.partition(":")[0].split(".")
+    top, *rest = value.partition(":")[0].split(".")
     try:
-        spec = importlib.util.find_spec(names[0])
-        for end in range(2, len(names) + 1):
-            spec = PathFinder.find_spec(".".join(names[:end]), spec.submodule_search_locations or ()) if spec else None
+        spec = importlib.util.find_spec(top)
+        for name in rest:
+            spec = PathFinder.find_spec(name, list(spec.submodule_search_locations or ())) if spec else None
     except (ValueError, ImportError):  # __main__ has no spec, for example
         return None
     return Path(spec.origin) if spec is not None and spec.origin and Path(spec.origin).is_file() else None

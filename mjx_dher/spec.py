@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -91,7 +92,7 @@ def custom_components(spec: RunSpec) -> dict[str, str]:
 
 
 def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
-    """Parses "NAME=VALUE" texts; a value is true, false, a number, or else a text.
+    """Parses "NAME=VALUE" texts; a value is true, false, a number, or else a text, which can have quotation marks ("007").
 
     Raises:
       ValueError: not such a text, a number that is not finite, or a name that is repeated or has its own option.
@@ -113,12 +114,21 @@ def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
 
 def to_texts(arguments: Mapping[str, Argument]) -> tuple[str, ...]:
     """Formats arguments as texts "NAME=VALUE" in the order of their names, the inverse of `to_arguments`."""
-    return tuple(f"{name}={str(x).lower() if isinstance(x, bool) else x}" for name, x in sorted(arguments.items()))
+    return tuple(f"{name}={_to_text(value)}" for name, value in sorted(arguments.items()))
+
+
+def _to_text(value: Argument) -> str:
+    if isinstance(value, str):
+        return value if value and _to_argument(value) == value else json.dumps(value, ensure_ascii=False)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _to_argument(value: str) -> Argument:
     if value in ("true", "false"):
         return value == "true"
+    if value.startswith('"') and value.endswith('"'):
+        with contextlib.suppress(ValueError):
+            return str(json.loads(value))
     for kind in (int, float):
         with contextlib.suppress(ValueError):
             return kind(value)

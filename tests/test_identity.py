@@ -167,7 +167,7 @@ OTHER_KINDS = [
     (("hparams",), "x", "hparams must be a dict"),
     (("physics",), 1, "physics must be a str"),
     (("physics",), None, "('physics')"),
-    (("config", "total_steps"), None, "('total_steps')"),
+    (("config", "total_steps"), None, "total_steps"),
     (("sources",), [], "sources must be a dict"),
     (("sources",), {"env": 10**20}, "sources.env must be a str"),
 ]

@@ -1,21 +1,29 @@
 """Files do not decide which code runs, and their names and links lead nowhere outside of their folder."""
 
+import base64
 import dataclasses
+import io
 import json
 import pickle
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from configs import TINY
 from conftest import refuses
+from rich.table import Table
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, envs, lookup, trust
+from mjx_dher.cli import train
+from mjx_dher.cli.output import PlainConsole
 from mjx_dher.components import COMPONENTS
+from mjx_dher.fleet import chunks, worker
 from mjx_dher.policy.numpy_policy import Policy
-from mjx_dher.runs.folder import run_folder
-from mjx_dher.spec import validate
+from mjx_dher.runs.folder import lane_checkpoints, run_folder
+from mjx_dher.spec import to_arguments, to_texts, validate
 from mjx_dher.system.files import FolderError
 
 OWN = RunSpec(env="point_mass:PointMass", config=TINY)
@@ -203,3 +211,128 @@ def test_marks_survive_copies(here):
         with refuses("env", "evil:Env", "a=1"):
             trust.check("env", copy.env, None)
     assert json.dumps(name) == '"evil:Env"'
+
+
+# Links
+
+
+@pytest.fixture
+def secret(here):
+    (here / "secret").write_bytes(b"the token")
+    return here / "secret"
+
+
+@pytest.mark.parametrize("name", ["x.gif", "v.webm", "metrics.csv"])
+def test_a_page_includes_no_file_from_elsewhere(here, secret, capsys, name):
+    write(here / "run", RunSpec(env="reach", config=TINY), "native")
+    (here / "run" / name).symlink_to(secret)
+    assert cli.main(["report", "run"]) == 2
+    assert not (here / "run" / "report.html").exists()
+    (here / "run" / name).unlink()
+    (here / "run" / "in.gif").write_bytes(b"GIF89a")
+    (here / "run" / "also.gif").symlink_to("in.gif")
+    (here / "named").symlink_to("run")
+    assert cli.main(["report", "named"]) == 0
+    assert base64.b64encode(b"the token") not in (here / "run" / "report.html").read_bytes()
+
+
+def test_a_parcel_includes_no_file_from_elsewhere(here, secret):
+    write(here / "run", RunSpec(env="reach", config=TINY), "native")
+    (here / "run" / "sub").mkdir()
+    (here / "run" / "sub" / "link").symlink_to(secret)
+    with refuses(here / "run" / "sub" / "link", error=FolderError):
+        worker.pack(here / "run")
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "metrics.csv", "tensorboard"])
+def test_nothing_is_written_or_deleted_through_a_link(here, capsys, name):
+    (here / "mine" / "epoch-000001").mkdir(parents=True)
+    run = write(here / "run", OWN)
+    (run / name).symlink_to(here / "mine")
+    (run / "checkpoints" / "epoch-000002").mkdir(parents=True, exist_ok=True)
+    before = sorted((here / "mine").rglob("*"))
+    assert cli.main(["resume", "run"]) == 2
+    assert str(Path("run") / name) in capsys.readouterr().err
+    assert sorted((here / "mine").rglob("*")) == before
+
+
+@pytest.mark.parametrize("link", ["cells", "cells/x", "unfinished"])
+def test_a_sweep_writes_through_no_link(here, capsys, link):
+    (here / "mine").mkdir()
+    (here / "sweep" / "cells").mkdir(parents=True)
+    if link == "cells":
+        (here / "sweep" / "cells").rmdir()
+    (here / "sweep" / link).symlink_to(here / "mine")
+    assert cli.main(["sweep", "--out", "sweep", "--env", "reach", "--preset", "cpu", "--dry-run"]) == 2
+    assert str(Path("sweep") / link) in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("names", [["/etc"], ["../.."], [5], [["x"]], "x", {"x": 1}, None])
+def test_names_in_a_file_are_names_in_the_folder(here, names):
+    (here / "cells.json").write_text(json.dumps({"cells": names}))
+    found = lane_checkpoints._names(here / "cells.json")
+    assert all(name == Path(name).name for name in found)
+    (here / "storage" / "x").mkdir(parents=True)
+    (here / "storage" / "x" / chunks.NAMES_FILE).write_text(json.dumps(names))
+    assert chunks.unfinished(here / "storage", [OWN], [OWN]) == []
+
+
+# Texts and sizes
+
+
+def test_control_characters_of_a_file_are_printed_as_escapes(here, capsys):
+    write(here / "run", OWN, "\x1b[31mnative\x9b2J\u202e")
+    content = json.loads((here / "run" / "config.json").read_text())
+    content["versions"]["mjx_dher"] = "9\x1b]0;title\x07"
+    (here / "run" / "config.json").write_text(json.dumps(content))
+    cli.main(["--config", "run", "--dry-run"])
+    content["env"] = "\x1b[2Jreach\r"
+    (here / "run" / "config.json").write_text(json.dumps(content))
+    cli.main(["eval", "run"])
+    out, err = capsys.readouterr()
+    assert "\\x1b]0;title\\x07" in out
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", out + err)
+    table, console = Table("a\x1b[2J"), PlainConsole(file=io.StringIO(), force_terminal=True, color_system=None)
+    table.add_row("b\x1b[2J")
+    console.print(table)
+    assert "\x1b" not in console.file.getvalue()
+
+
+def test_a_huge_file_is_not_read(here, capsys):
+    for file in (here / "config.json", here / "run" / "config.json"):
+        file.parent.mkdir(exist_ok=True)
+        with file.open("wb") as stream:
+            stream.truncate(1 << 40)
+        assert cli.main(["--config", str(file), "--dry-run"]) == 2
+        assert "larger than 8 MB" in capsys.readouterr().err
+
+
+# Settings from a file
+
+
+def test_a_file_that_lacks_a_setting_is_rejected_or_names_it(here, capsys):
+    write(here / "run", dataclasses.replace(OWN, config=dataclasses.replace(TINY, num_critics=3)))
+    content = json.loads((here / "run" / "config.json").read_text())
+    del content["config"]["num_critics"]
+    (here / "run" / "config.json").write_text(json.dumps(content))
+    assert cli.main(["--config", "run", "--dry-run"]) == 0
+    assert "edited since, and it lacks num_critics" in capsys.readouterr().out
+    del content["config"]["batch_size"]
+    (here / "run" / "config.json").write_text(json.dumps(content))
+    assert cli.main(["--config", "run", "--dry-run"]) == 2
+    assert "batch_size" in capsys.readouterr().err
+
+
+def test_arguments_of_an_environment_are_merged_with_those_of_the_file(here):
+    write(here / "run", RunSpec(env="reach", env_kwargs=("episode_length=9", "reward_type=dense"), config=TINY), "native")
+    args = train.parse_train_args(["--config", "run", "--env-kwargs", "episode_length=7"])
+    assert args.spec.env_kwargs == ("episode_length=7", "reward_type=dense")
+    args = train.parse_train_args(["--config", "run", "--env", "push", "--env-kwargs", "episode_length=7"])
+    assert args.spec.env_kwargs == ("episode_length=7",)
+
+
+@pytest.mark.parametrize("text", ["007", "true", "1e3", "", '"', '"a"', "nan", "a=b c", "\u00e9"])
+def test_a_text_that_looks_like_a_number_can_be_given(text):
+    (written,) = to_texts({"tag": text})
+    assert to_arguments([written]) == {"tag": text}
+    assert RunSpec(env_kwargs=(written,)).env_kwargs == (written,)

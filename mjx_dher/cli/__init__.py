@@ -9,8 +9,6 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from mjx_dher import __version__, lookup, trust
 from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS, run
@@ -46,7 +44,7 @@ def _run(name: str, argv: list[str]) -> int:
     try:
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
-        return run(name, argv, Console(highlight=False, markup=False, emoji=False, soft_wrap=True))
+        return run(name, argv, output.PlainConsole(soft_wrap=True))
     except KeyboardInterrupt:  # outside of training, which ends in order
         print("stopped", file=sys.stderr)
         return 128 + signal.SIGINT
@@ -55,7 +53,7 @@ def _run(name: str, argv: list[str]) -> int:
             raise  # a fault of this program, whose place its report should have
         with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
             for line in reason.splitlines():
-                print(f"error: {line}", file=sys.stderr)
+                print(f"error: {output.printable(line)}", file=sys.stderr)
         return 2
 
 

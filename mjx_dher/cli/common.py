@@ -18,6 +18,7 @@ from rich.progress import Progress as Bar
 from rich.table import Column, Table
 
 from mjx_dher import envs
+from mjx_dher.cli.output import PlainConsole
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
@@ -131,7 +132,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
         table.add_row(*row)
     width = Measurement.get(console, console.options.update(max_width=10_000), table).maximum
     if not console.is_terminal:
-        Console(file=console.file, width=width, highlight=False, markup=False, emoji=False).print(table)
+        PlainConsole(file=console.file, width=width).print(table)
     elif width <= console.width:
         console.print(table, soft_wrap=False)
     else:

@@ -22,6 +22,7 @@ from mjx_dher.cli.common import (
     read_run,
     settle_compiler,
 )
+from mjx_dher.cli.output import PlainConsole
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import RunSpec, to_arguments
 from mjx_dher.system.caches import keep_compiled_programs
@@ -55,7 +56,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
-    remarks = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True) if args.json else console
+    remarks = PlainConsole(stderr=True, soft_wrap=True) if args.json else console
     folders = [find_run(run, remarks) for run in args.runs]
     runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:

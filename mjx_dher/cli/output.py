@@ -5,10 +5,33 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Iterator
 from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+# Characters that act on a terminal or reverse its text, in place of being printed: all but tab and line feed.
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Text with its control characters escaped, as text from a file must be before a terminal gets it."""
+    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+
+
+class PlainConsole(Console):
+    """A console that prints texts as they are: without markup, and with control characters escaped."""
+
+    def __init__(self, **options: Any):
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Makes a text for the terminal."""
+        return super().render_str(printable(text), **options)
 
 
 class Guarded:

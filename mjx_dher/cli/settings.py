@@ -47,6 +47,9 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
     now = fingerprint.digest(run_folder.identity_of(content, run))
     edited = "; edited since" if content["digest"] != now else ""
+    lacking = fingerprint.settings(run).keys() - {*content, *content["config"], *content["hparams"]} if edited else ()
+    if lacking:
+        edited += f", and it lacks {', '.join(sorted(lacking))}, whose defaults are taken"
     return (
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
         f" {content['physics']}{edited}"

@@ -33,7 +33,7 @@ from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.signals import Stop
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import RunSpec, to_texts
 from mjx_dher.system import files
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
@@ -248,6 +248,9 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
             raise ValueError("config and preset are both whole settings: give one of them")
         base, options, notes = settings.load(chosen.config)
         args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
+        if args.spec.env == base.env:
+            merged = to_texts({**base.env_arguments, **args.spec.env_arguments})
+            args = dataclasses.replace(args, spec=dataclasses.replace(args.spec, env_kwargs=merged))
         for line in (*notes, settings.changes(base, args.spec)):
             report(line)
         return args

@@ -51,7 +51,7 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
         except ValueError as error:
             raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
     if use:
-        raise ValueError(f"{use} needs a policy of NumPy arrays; {path} is the state of a custom learner, or of custom networks")
+        raise ValueError(f"{use} needs a policy of NumPy arrays; {path} is of a custom learner or custom networks")
     if spec is None:
         raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
     from mjx_dher.policy.learner_policy import from_arrays as from_state

@@ -17,9 +17,9 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.spec import RunSpec, custom_components, find_demonstrations
 
 MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
-# A digest always includes these settings. It includes any other setting only if it differs from its default, so that a new
-# setting changes no digest and no trial's name.
-_ALWAYS = frozenset(
+# Every version has written these settings, and a digest always includes them. It includes any other setting only if it
+# differs from its default, so that a new setting changes no digest and no trial's name.
+ALWAYS = frozenset(
     (
         *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
         *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype", "learner_kernels"),
@@ -90,7 +90,7 @@ def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
 def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
     """Everything that a run computes with, for JSON: settings, seed, the physics that runs, and custom source files."""
     defaults = settings(RunSpec())
-    kept = {name: x for name, x in settings(spec).items() if name in _ALWAYS or x != defaults[name]}
+    kept = {name: x for name, x in settings(spec).items() if name in ALWAYS or x != defaults[name]}
     kept.pop("demonstrations", None)  # the file's digest is among the sources
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
@@ -106,7 +106,7 @@ def digest(content: Mapping[str, Any]) -> str:
 def trial_name(spec: RunSpec) -> str:
     """Name of a trial's folder: readable settings, and a digest of all settings and of custom code."""
     values, defaults = settings(spec), settings(RunSpec())
-    kept = {name: value for name, value in values.items() if name in _ALWAYS or value != defaults[name]}
+    kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]}
     kept.pop("demonstrations", None)
     numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests

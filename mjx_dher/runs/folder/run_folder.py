@@ -256,8 +256,8 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
     try:
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
-        if "total_steps" not in config:  # `resume` would take its default for a new value
-            raise KeyError("total_steps")
+        if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default is not what was meant
+            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         spec = RunSpec(
             config=Config(**config),
             hparams=HParams(**{name: math.inf if x == INFINITE else x for name, x in content["hparams"].items()}),
