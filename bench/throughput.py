@@ -2,7 +2,8 @@
 
     python bench/throughput.py [--env push pick_and_place slide] [--engines native jax] [--num-envs 16 32 128]
 
-On a GPU: --engines warp --num-envs 2048 8192 32768.
+On a GPU: --engines warp --num-envs 2048 8192 32768. A custom task is module:attribute. --path chooses how warp runs the model
+(both: --path fused graph), and --random plays random actions in place of the policy's.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ from mjx_dher.contract import env_spec
 from mjx_dher.rollout import rollout
 
 
-def measure(task: str, engine: str, num_envs: int, repeats: int = 5) -> tuple[float, float]:
-    """Environment steps a second, and seconds of the first call, which compiles."""
-    hparams, env = HParams(), envs.make(task, engine=engine)
+def measure(task: str, engine: str, num_envs: int, path: str, random: bool, repeats: int = 5) -> tuple[str, float, float]:
+    """The engine and its path, environment steps a second, and seconds of the first call, which compiles."""
+    hparams, env = HParams(), envs.make(task, engine=engine, **({"path": path} if engine == "warp" else {}))
     learner = learners.make("ddpg", Config(), env_spec(env))
     state = learner.init(jax.random.key(0))
 
     @jax.jit
     def play(key):
+        if random:
+            shape = (env.episode_length, num_envs, env.action_size)
+            actions = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+            return rollout(env, lambda action, obs: action, key, num_envs, actions)
         noise = learner.noise(key, env.episode_length, num_envs, hparams)
         policy = lambda noise, obs: learner.explore(state, obs, noise, hparams)  # noqa: E731
         return rollout(env, policy, key, num_envs, noise)
@@ -37,7 +42,8 @@ def measure(task: str, engine: str, num_envs: int, repeats: int = 5) -> tuple[fl
     keys = iter(jax.random.split(jax.random.key(2), 2 + repeats))
     seconds = median_seconds(lambda: play(next(keys)), repeats=repeats)
     env.check()
-    return num_envs * env.episode_length / seconds, compiled
+    name = f"{engine} {env.engine.path}" if engine == "warp" else engine
+    return name, num_envs * env.episode_length / seconds, compiled
 
 
 def main() -> None:
@@ -45,11 +51,13 @@ def main() -> None:
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engines", nargs="+", default=["native", "jax"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[16, 32, 128])
+    parser.add_argument("--path", nargs="+", default=["auto"], choices=["auto", "fused", "graph"])
+    parser.add_argument("--random", action="store_true", help="random actions")
     args = parser.parse_args()
     rows = []
-    for task, engine, num_envs in itertools.product(args.env, args.engines, args.num_envs):
-        rate, compiled = measure(task, engine, num_envs)
-        rows.append((task, engine, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
+    for task, engine, num_envs, path in itertools.product(args.env, args.engines, args.num_envs, args.path):
+        name, rate, compiled = measure(task, engine, num_envs, path, args.random)
+        rows.append((task, name, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
     print_table(("task", "engine", "num_envs", "env steps/s", "first call, s"), rows)
 
 

@@ -1,16 +1,18 @@
 """Engines on models that have nothing of a Fetch robot: an arm with joint servos, activations, several mocap bodies, none."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from conftest import refuses
+from conftest import names, refuses
 
+from mjx_dher import cli
 from mjx_dher.envs import Simulator
-from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines import Controls, Physics, graph, make_engine, pairs
 from mjx_dher.envs.engines import mjx as mjx_engine
 
 SUBSTEPS = 10
@@ -49,6 +51,20 @@ MODELS = {
 {BODY.format(0, "l")}{BODY.format(1, "r")}{BODY.format(2, "held")}</worldbody>
 <equality><weld body1="right" body2="r" relpose="0 0 0 1 0 0 0"/><connect body1="held" body2="world" anchor="0 0 0"/>
 <weld body1="left" body2="l" relpose="0 0 0 1 0 0 0"/></equality></mujoco>""",
+    "fingers": """
+<mujoco><option cone="elliptic" noslip_iterations="2"/>
+<default><joint frictionloss="0.01" damping="0.1" range="0 1.5"/><geom type="capsule" size="0.01" condim="4"/></default>
+<worldbody><geom name="floor" type="plane" size="1 1 0.1"/><body name="egg" pos="0.03 0 0.04"><freejoint/>
+<geom type="ellipsoid" size="0.02 0.03 0.02" condim="6"/></body>
+<body pos="0 0 0.1"><joint name="a" axis="0 1 0"/><geom name="one" fromto="0 0 0 0.06 0 0"/>
+<body pos="0.06 0 0"><joint name="b" axis="0 1 0"/><joint name="c" axis="0 0 1" range="-1 1"/>
+<geom name="two" fromto="0 0 0 0.05 0 0"/>
+</body></body></worldbody>
+<tendon><fixed name="pull" limited="true" range="0 2"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>
+<equality><joint joint1="c" joint2="b" polycoef="0 0.2 0 0 0"/></equality>
+<actuator><position tendon="pull" kp="1" ctrlrange="0 2" forcerange="-1 1"/>
+<motor joint="c" gear="-0.1" ctrlrange="-1 1"/></actuator>
+</mujoco>""",
     "nothing but a ball": '<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>',
 }
 
@@ -100,8 +116,64 @@ def test_native_is_a_loop_over_mj_step_for_any_model(name):
                 value[:] = np.float32(value)  # as between the steps of an engine
 
 
+CLOSE = 2e-4  # m and rad, after 8 steps of 10 timesteps
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "two mocap bodies" else name for name in MODELS]
+    "name", [name if name.startswith("nothing") else pytest.param(name, marks=pytest.mark.slow) for name in MODELS]
+)
+def test_mujoco_warp_in_a_graph_follows_native_on_any_model(name):
+    """On a CPU without the graph: the same kernels on the same memory, compiled for another device."""
+    model = mujoco.MjModel.from_xml_string(MODELS[name])
+    first, controls = start(model, (3,))
+    warp = make_engine("warp", model, SUBSTEPS, path="graph", allow_cpu=True)
+    assert warp.path == "graph"
+    native = make_engine("native", model, SUBSTEPS)
+    played = jax.jit(jax.vmap(lambda *given: play(warp, *given)))
+    here, there = played(first, controls), jax.jit(jax.vmap(lambda *given: play(native, *given)))(first, controls)
+    np.testing.assert_allclose(here.qpos, there.qpos, atol=2 * CLOSE)
+    np.testing.assert_allclose(here.act, there.act, atol=1e-5)
+    for again, once in zip(jax.tree.leaves(played(first, controls)), jax.tree.leaves(here), strict=True):
+        np.testing.assert_array_equal(again, once)  # nothing is left in memory from the steps before
+    warp.check()
+
+
+@pytest.mark.slow  # kernels compile for minutes
+def test_contacts_without_memory_are_reported_by_the_graph():
+    model = mujoco.MjModel.from_xml_string(arm())
+    engine = make_engine("warp", model, SUBSTEPS, path="graph", contacts=1, constraints=2, allow_cpu=True)
+    first, controls = start(model, (3,))
+    jax.block_until_ready(jax.jit(jax.vmap(engine.advance))(first, jax.tree.map(lambda x: x[:, 0], controls)))
+    with refuses("contacts=1", "constraints=2"):
+        engine.check()
+    engine.check()  # told once
+
+
+def test_the_path_of_warp_and_its_memory_follow_from_the_model():
+    model = mujoco.MjModel.from_xml_string(MODELS["two mocap bodies"])
+    engine = make_engine("warp", model, SUBSTEPS, allow_cpu=True)
+    assert engine.path == "graph"
+    assert "equality" in engine.note
+    with refuses("path", "grahp", "graph"):
+        make_engine("warp", model, SUBSTEPS, path="grahp", allow_cpu=True)
+    with refuses("fused", "equality"):
+        make_engine("warp", model, SUBSTEPS, path="fused", allow_cpu=True)
+    # The cube's four corners on the floor; 4 of 4 rows, 12 joints' friction and 5 limits with two sides.
+    assert pairs.most(mujoco.MjModel.from_xml_string(arm())) == (4, 4 * 4 + 12 + 2 * 5)
+    crowd = "".join(BODY.format(i, f"b{i}") for i in range(8))
+    crowded = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{crowd}</worldbody></mujoco>")
+    assert pairs.most(crowded)[0] == 28 * 8
+    assert graph.memory_for(crowded) == (graph._FEW_CONTACTS, graph._FEW_ROWS)
+    assert len(pairs.meeting(crowded)) == 28
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "two mocap bodies" else name
+        for name in MODELS
+        if name != "fingers"  # noslip
+    ],
 )
 def test_jax_follows_native_on_any_model(name):
     model = mujoco.MjModel.from_xml_string(MODELS[name])
@@ -109,7 +181,7 @@ def test_jax_follows_native_on_any_model(name):
     mjx, native = (make_engine(engine, model, SUBSTEPS) for engine in ("jax", "native"))
     here, there = (jax.jit(lambda *x, engine=engine: play(engine, *x))(first, controls) for engine in (mjx, native))
     assert np.ptp(there.qpos, axis=0).max() > 0.01
-    np.testing.assert_allclose(here.qpos, there.qpos, atol=2e-4)
+    np.testing.assert_allclose(here.qpos, there.qpos, atol=CLOSE)
     np.testing.assert_allclose(here.act, there.act, atol=1e-5)
 
 
@@ -152,3 +224,28 @@ def test_arrays_of_another_shape_are_rejected():
             wrong = [dataclasses.replace(x, **{field: jnp.ones(5)}) if hasattr(x, field) else x for x in (physics, controls)]
             with pytest.raises(ValueError, match=rf"{field} has shape \[5\]; the model's is"):
                 advance(*wrong)
+
+
+class Own:
+    """As much of a task as has a model."""
+
+    action_size, episode_length = 6, 5
+    reset = step = compute_reward = None
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(arm().replace("<worldbody>", '<option cone="elliptic"/><worldbody>'))
+
+
+def test_the_command_engines_says_what_takes_a_model_and_what_helps(capsys):
+    assert cli.main(["engines", "push", "--json"]) == 0
+    verdicts = {each["engine"]: each for each in json.loads(capsys.readouterr().out)}
+    assert [each["supported"] for each in verdicts.values()] == [True] * 4
+    assert cli.main(["engines", "test_any_model:Own", "--json"]) == 0
+    verdicts = {each["engine"]: each for each in json.loads(capsys.readouterr().out)}
+    assert [name for name, each in verdicts.items() if not each["supported"]] == ["warp fused"]
+    assert "elliptic" in verdicts["warp fused"]["reason"]
+    assert "pyramidal" in verdicts["warp fused"]["cure"]
+    assert cli.main(["engines", "push"]) == 0
+    assert "warp graph" in capsys.readouterr().out
+    assert cli.main(["engines", "point_mass:PointMass"]) == 2
+    names(capsys.readouterr().err, "point_mass:PointMass", "model")

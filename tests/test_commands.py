@@ -87,7 +87,7 @@ def completions(words, script):
 def test_bash_completes_commands_and_options(tmp_path):
     script = tmp_path / "mjx-dher"
     script.write_text(completion.script("bash"))
-    assert {"eval", "export"} == set(completions(["mjx-dher", "e"], script))
+    assert {"eval", "export", "engines"} == set(completions(["mjx-dher", "e"], script))
     assert completions(["mjx-dher", "eval", "--epi"], script) == ["--episodes"]
     assert {"--sampler"} <= set(completions(["mjx-dher", "train", "--sam"], script))
     assert set(completions(["mjx-dher", "train", "--engine", ""], script)) >= set(spec.ENGINES)

@@ -263,8 +263,11 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
 
 
 def test_an_unsupported_model_is_rejected():
-    with refuses("engine", "warp", "native"):
-        engines.make_engine("warp", welded(shape="sphere"), 20, allow_cpu=True)
+    with refuses("engine", "warp", "sphere"):
+        engines.make_engine("warp", welded(shape="sphere"), 20, path="fused", allow_cpu=True)
+    with refuses("engine", "warp", "actuator_armature", "native"):
+        model = welded('<actuator><motor name="m" joint="j" armature="1"/></actuator>')
+        engines.make_engine("warp", model, 20, allow_cpu=True)
 
 
 def test_most_rows_are_what_all_pairs_can_give_at_once():

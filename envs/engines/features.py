@@ -73,7 +73,7 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
       model: the compiled MJCF.
       concerns: whether a field, by its name, is looked at.
     """
-    features = []
+    features: list[str] = []
     defaults = _defaults()
     for name, value in fields(model):
         if not concerns(name):
@@ -96,4 +96,4 @@ def with_names(what: str, model: mujoco.MjModel, kind: str, indices: Any) -> str
     word = {"jnt": "joint", "eq": "equality"}.get(kind, kind)
     names = [getattr(model, word)(int(index)).name for index in indices]
     shown = [repr(name) if name else f"{word} {index}" for name, index in zip(names, indices)]
-    return f"{what} ({', '.join([*shown[:5], '...'] if len(shown) > 5 else shown)})"
+    return f"{what} ({', '.join([*shown[:5], '...'] if len(shown) > 5 else shown)})" if shown else what

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import re
 import warnings
 
 import jax
@@ -13,8 +14,9 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply
+from mjx_dher.envs.engines import pairs
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
-from mjx_dher.envs.engines.features import beyond_defaults
+from mjx_dher.envs.engines.features import beyond_defaults, with_names
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
 from mjx_dher.validation import check_count
@@ -134,6 +136,14 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
         warnings.warn(f"engine jax ignores the margin of contacts of boxes: {names}", stacklevel=2)
 
 
+def _geoms_in(model: mujoco.MjModel, message: str) -> list[int]:
+    """Geoms of the first pair whose two types MJX names in an error."""
+    for ends in [*pairs.meeting(model), *zip(model.pair_geom1, model.pair_geom2)]:
+        if all(re.search(rf"\bmjGEOM_{pairs.type_of(model, geom)}\b", message) for geom in ends):
+            return [int(geom) for geom in ends]
+    return []
+
+
 class MjxEngine:
     """MJX with impl="jax".
 
@@ -159,7 +169,8 @@ class MjxEngine:
             # NumPy leaves become constants of the program that traces them, on any device.
             self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
         except NotImplementedError as error:
-            raise ValueError(f"engine jax: MJX does not support this model: {error}; use engine native") from error
+            what = with_names(str(error).rstrip("."), model, "geom", _geoms_in(model, str(error)))
+            raise ValueError(f"engine jax: MJX does not support this model: {what}; use engine native") from error
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         check_shapes(self._mujoco_model, physics, controls)

@@ -1,4 +1,4 @@
-"""Physics on an NVIDIA GPU: one kernel, written in Warp, takes a whole step of thousands of environments.
+"""Physics on an NVIDIA GPU: a whole step of thousands of environments is one kernel, or else one CUDA graph of MuJoCo Warp's.
 
 Only the state goes in and out; `mjx.step` would pass some 170 arrays from Warp to XLA and back every substep.
 """
@@ -14,29 +14,39 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from mjx_dher.envs.engines import graph
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.fused import simulation, support
+from mjx_dher.lookup import check_name
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import load, prepare, wp
 from mjx_dher.validation import check_count
 
+PATHS = ("auto", "fused", "graph")
+_KEPT = 8  # numbers of environments, of those that were used last, whose memory is kept
+
 
 class WarpEngine:
-    """The kernel of `engines.fused` on the device of the JAX program around it.
+    """Physics on the device of the JAX program around it, by one of two paths.
 
-    It follows MuJoCo C to the rounding of single precision, the cylinder of Slide's puck included. No sum depends on the order
-    in which threads finish.
+    `fused` is the kernel of `engines.fused`: it follows MuJoCo C to the rounding of single precision, and no sum depends on the
+    order in which threads finish. `graph` is MuJoCo Warp, which supports more features and is slower; its sums have no fixed
+    order. `path` and `note` say which one runs and why.
 
     Args:
-      model: the compiled MJCF; `fused.support.unsupported` lists the features that it must not have.
+      model: the compiled MJCF.
       substeps: MuJoCo timesteps an environment step.
+      path: "fused", "graph", or "auto": fused if the kernel supports the model.
       iterations: maximum Newton iterations of the constraint solver; each environment stops by itself, most after one or two.
-      ls_iterations: maximum steps of the solver's line search.
-      constraints: constraint rows that fit into memory in each environment; by default all that can occur.
+        By default 50 for `fused`, and the model's for `graph`.
+      ls_iterations: maximum steps of the solver's line search; by default 20, or the model's.
+      constraints: constraint rows that fit into memory in each environment; by default all that can occur, or for `graph` with
+        large models half as many again as random controls cause.
+      contacts: contacts that fit into memory, likewise; `graph` only.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
 
     Raises:
-      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the kernel does not support the model.
+      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the path does not support the model.
     """
 
     name = "warp"
@@ -45,40 +55,49 @@ class WarpEngine:
         self,
         model: mujoco.MjModel,
         substeps: int,
-        iterations: int = simulation.ITERATIONS,
-        ls_iterations: int = simulation.LS_ITERATIONS,
+        path: str = "auto",
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
         constraints: int | None = None,
+        contacts: int | None = None,
         allow_cpu: bool = False,
     ):
+        check_name("path of engine warp", path, PATHS)
         prepare()
         if not allow_cpu:
             _check_gpu()
-        if left_out := support.unsupported(model):
-            raise ValueError(f"engine warp does not support features of the model: {', '.join(left_out)}; use engine native")
-        self.most_constraints = simulation.most_rows(model)
-        self._constraints = self.most_constraints if constraints is None else constraints
-        for name, count in {
-            "iterations": iterations,
-            "ls_iterations": ls_iterations,
-            "constraints": self._constraints,
-        }.items():
-            check_count(name, count)
-        self._model = copy.copy(model)
-        self._model.opt.iterations, self._model.opt.ls_iterations = iterations, ls_iterations
-        self._substeps = substeps
-        self._simulations: dict[tuple[str, int], simulation.Simulation] = {}
+        limits = {"iterations": iterations, "ls_iterations": ls_iterations, "constraints": constraints, "contacts": contacts}
+        for name, count in limits.items():
+            if count is not None:
+                check_count(name, count)
+        self._model, self._substeps = copy.copy(model), substeps
+        self.path, self.note = _choose(model, path)
+        if self.path == "graph":
+            most = graph.memory_for(model)
+            defaults = (model.opt.iterations, model.opt.ls_iterations)
+        else:
+            most = 0, simulation.most_rows(model)
+            defaults = (simulation.ITERATIONS, simulation.LS_ITERATIONS)
+        self._contacts, self._constraints = contacts or most[0], constraints or most[1]
+        self._most = most
+        self._model.opt.iterations, self._model.opt.ls_iterations = iterations or defaults[0], ls_iterations or defaults[1]
+        self._begin()
+
+    def _begin(self) -> None:
+        self._simulations: dict[tuple[str, int], simulation.Simulation | graph.Simulation] = {}
+        self._lost = 0  # contacts, in memory that is no longer kept
         self._lock = threading.Lock()
         self._loading: list[concurrent.futures.Future[None]] | None = None
         self._call = self._jax_callable()
 
     def __getstate__(self) -> dict[str, Any]:
         """The state of a copy or pickle, without locks, threads and device memory, which cannot be copied."""
-        left_out = ("_simulations", "_lock", "_loading", "_call")
+        left_out = ("_simulations", "_lost", "_lock", "_loading", "_call")
         return {name: value for name, value in vars(self).items() if name not in left_out}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _simulations={}, _lock=threading.Lock(), _loading=None)
-        self._call = self._jax_callable()
+        vars(self).update(state)
+        self._begin()
 
     def _jax_callable(self) -> Any:
         """Makes a JAX function that advances a batch and allocates the batch's memory on its first call."""
@@ -87,37 +106,38 @@ class WarpEngine:
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
             qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            warmstart: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            rest: wp.array2d(dtype=float),  # type: ignore[valid-type]
             inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
             qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
             qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+            rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
         ):
             if (me := engine()) is None:
                 raise RuntimeError("the engine that this program calls no longer exists; keep it for as long as the program")
             me._wait()
             with me._lock:
-                me._simulation(qpos.device, qpos.shape[0]).advance(
-                    (qpos, qvel, warmstart), inputs, (qpos_out, qvel_out, warmstart_out)
-                )
+                me._simulation(qpos.device, qpos.shape[0]).advance((qpos, qvel, rest), inputs, (qpos_out, qvel_out, rest_out))
 
-        nq, nv = self._model.nq, self._model.nv
+        nq, nv, na = self._model.nq, self._model.nv, self._model.na
         return wp.jax_callable(
             advance_all,
             num_outputs=3,
             graph_mode=wp.JaxCallableGraphMode.NONE,
             vmap_method="broadcast_all",
-            output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "warmstart_out": (1, nv)},
+            output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "rest_out": (1, nv + na)},
             module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it
         )
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         check_shapes(self._model, physics, controls)
         self._begin_loading()
-        rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, physics.warmstart)]
+        rest = jnp.concatenate([physics.warmstart, physics.act]) if self._model.na else physics.warmstart
+        rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, rest)]
         private_api.reset_call_id(self._call)
-        qpos, qvel, warmstart = self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None])
-        return Physics(qpos=qpos[0], qvel=qvel[0], warmstart=warmstart[0], act=physics.act)
+        qpos, qvel, rest = (x[0] for x in self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None]))
+        if not self._model.na:
+            return Physics(qpos=qpos, qvel=qvel, warmstart=rest, act=physics.act)
+        return Physics(qpos=qpos, qvel=qvel, warmstart=rest[: self._model.nv], act=rest[self._model.nv :])
 
     def check(self) -> None:
         """Checks that no contacts were lost since the last call; waits for the kernel to compile.
@@ -127,34 +147,59 @@ class WarpEngine:
         """
         self._wait()
         with self._lock:
-            lost = sum([each.overflow() for each in self._simulations.values()])
-        if lost:
-            raise ValueError(
-                f"the warp engine left out contacts that there was no room for: it was made with"
-                f" constraints={self._constraints}; constraints={self.most_constraints} are always enough"
-            )
+            lost = self._lost + sum([each.overflow() for each in self._simulations.values()])
+            self._lost = 0
+        if not lost:
+            return
+        if self.path == "fused":
+            cure = f"constraints={self._constraints}; constraints={self._most[1]} are always enough"
+        else:
+            cure = f"contacts={self._contacts} and constraints={self._constraints}; try twice as many"
+        raise ValueError(f"the warp engine left out contacts that there was no room for: it was made with {cure}")
 
     def _begin_loading(self) -> None:
         """Compiles the kernel in a thread while XLA compiles the rest: a quarter of a minute, once a machine."""
         if self._loading is None:
             pool = concurrent.futures.ThreadPoolExecutor(2)
             # Warp wants the module of the function that JAX calls, too, though there is no kernel in it.
-            self._loading = [pool.submit(self._made(1).load), pool.submit(load, wp.get_module(__name__))]
+            self._loading = [pool.submit(lambda: self._made(1).load()), pool.submit(load, wp.get_module(__name__))]
             pool.shutdown(wait=False)
 
     def _wait(self) -> None:
         for loading in self._loading or ():
             loading.result()
 
-    def _made(self, num_envs: int) -> simulation.Simulation:
+    def _made(self, num_envs: int) -> simulation.Simulation | graph.Simulation:
+        if self.path == "graph":
+            return graph.Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
         return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints)
 
-    def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation:
+    def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation | graph.Simulation:
         key = (str(device), num_envs)
-        if key not in self._simulations:
+        made = self._simulations.pop(key, None)
+        if made is None:
             with wp.ScopedDevice(device):  # several GPUs call from one process
-                self._simulations[key] = self._made(num_envs)
-        return self._simulations[key]
+                made = self._made(num_envs)
+        self._simulations[key] = made
+        if len(self._simulations) > _KEPT:
+            self._lost += self._simulations.pop(next(iter(self._simulations))).overflow()
+        return made
+
+
+def _choose(model: mujoco.MjModel, path: str) -> tuple[str, str]:
+    """Returns the path that runs, and why.
+
+    Raises:
+      ValueError: it does not support the model.
+    """
+    left_out = support.unsupported(model)
+    if path == "fused" and left_out:
+        raise ValueError(f"engine warp: the fused kernel does not support features of the model: {', '.join(left_out)}")
+    if path == "fused" or (path == "auto" and not left_out):
+        return "fused", "the fused kernel"
+    if unknown := graph.unsupported(model):
+        raise ValueError(f"engine warp does not support features of the model: {', '.join(unknown)}; use engine native")
+    return "graph", f"MuJoCo Warp; the fused kernel leaves out {', '.join(left_out)}" if left_out else "MuJoCo Warp, as asked"
 
 
 def _check_gpu() -> None:

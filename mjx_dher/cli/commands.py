@@ -28,6 +28,7 @@ COMMANDS = {
     "report": "mjx_dher.cli.report:report_command",
     "list": "mjx_dher.cli.listing:list_command",
     "check": "mjx_dher.cli.check:check_command",
+    "engines": "mjx_dher.cli.engines:engines_command",
     "doctor": "mjx_dher.cli.doctor:doctor_command",
     "completion": "mjx_dher.cli.completion:completion_command",
 }

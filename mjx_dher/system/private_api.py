@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -105,6 +106,31 @@ def drawing_with(backend: str) -> Iterator[None]:
         yield
     finally:
         module.GLContext = chosen
+
+
+@functools.cache
+def mujoco_warp() -> Any:
+    """Returns MuJoCo Warp, which MJX has a copy of.
+
+    Private: `mujoco.mjx.third_party.mujoco_warp`.
+    Why: MJX makes a substep a call, with some 170 arrays that XLA hands in and takes back. The engine calls the step itself, in
+      a CUDA graph. The separate package is another version, and needs another Warp.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):  # MJX may print a line
+        return importlib.import_module("mujoco.mjx.third_party.mujoco_warp")
+
+
+def overflow_of_memory() -> int:
+    """Returns the bits of `Data.overflow` of MuJoCo Warp that tell of contacts or rows without memory.
+
+    Private: `mujoco.mjx.third_party.mujoco_warp._src.types.OverflowType`.
+    Why: other bits tell of a solver that stopped at its limit of iterations, or of sensors.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
+    """
+    kinds = importlib.import_module("mujoco.mjx.third_party.mujoco_warp._src.types").OverflowType
+    names = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD", "NVMAX", "EPA_HORIZON")
+    return int(sum(int(kinds[name]) for name in names))
 
 
 def reset_call_id(callable_: Any) -> None:

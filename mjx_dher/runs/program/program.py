@@ -146,8 +146,10 @@ def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout:
     parts = f"{layout.shards} for each run" if layout.shards > 1 else ""
     number = f"{len(layout.devices)} devices ({', '.join(filter(None, (apart, parts)))}) of " if layout.devices else ""
     together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
+    note = getattr(getattr(env, "engine", None), "note", "")  # how the engine runs this model
+    physics = run_folder.engine_name(env) + (f" ({note})" if note else "")
     return (
-        f"{'one run' if len(specs) == 1 else together}; physics {run_folder.engine_name(env)}, learner on"
+        f"{'one run' if len(specs) == 1 else together}; physics {physics}, learner on"
         f" {number}{jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
     )
 

@@ -1,0 +1,53 @@
+"""Which engines take a model: what stands against each of them, and what would help."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+
+from mjx_dher.envs.engines import make_engine
+
+_NATIVE = "use engine native"
+# Words of a reason -> what a user can change in the MJCF.
+_CURES = {
+    "integrator": 'integrator="Euler"',
+    "elliptic": 'cone="pyramidal"',
+    "noslip": 'noslip_iterations="0"',
+    "solver": 'solver="Newton"',
+    "contacts of geoms that no pair lists": 'list the pairs in <contact>, with contype="0" conaffinity="0" on the geoms',
+    "nativeccd": '<flag nativeccd="disable"/>',
+    "stand_in": "add the geom that it names",
+    "friction in joints": 'frictionloss="0"',
+    "delays": "use mjx_dher.envs.Simulator",
+    "sleep": 'remove <flag sleep="enable"/>',
+}
+
+
+class Verdict(NamedTuple):
+    """Whether an engine takes a model."""
+
+    engine: str  # native, jax, warp fused or warp graph
+    reason: str  # "" if it does
+    cure: str
+
+
+def explain(model: mujoco.MjModel) -> list[Verdict]:
+    """Tries every engine, and both paths of warp, on a model. Where there is no GPU, warp is tried on the CPU."""
+    return [
+        _verdict(model, "native", "mjx_dher.envs.Simulator, or MuJoCo itself"),
+        _verdict(model, "jax", _NATIVE),
+        _verdict(model, "warp", "engine warp takes the path graph", path="fused", allow_cpu=True),
+        _verdict(model, "warp", _NATIVE, path="graph", allow_cpu=True),
+    ]
+
+
+def _verdict(model: mujoco.MjModel, engine: str, otherwise: str, **options: Any) -> Verdict:
+    name = f"{engine} {options['path']}" if options else engine
+    try:
+        make_engine(engine, model, 1, **options)
+    except ValueError as error:
+        reason = str(error).removesuffix(f"; {_NATIVE}")
+        cures = [cure for words, cure in _CURES.items() if words in reason]
+        return Verdict(name, reason, "; or ".join([*cures, otherwise]))
+    return Verdict(name, "", "")

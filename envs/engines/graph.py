@@ -1,0 +1,178 @@
+"""Simulations on a device that MuJoCo Warp's own kernels advance: for models that the fused kernel does not support.
+
+All substeps of an environment step are one CUDA graph on memory that stays where it is, so that starting some hundred kernels a
+substep costs little. Only the state goes in and out.
+"""
+# Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
+
+import copy
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.engines import pairs
+from mjx_dher.envs.engines.features import beyond_defaults
+from mjx_dher.system import private_api
+from mjx_dher.system.warp_setup import wp
+
+# Fields of MjModel that MuJoCo Warp ignores without an error (mujoco-mjx 3.17).
+IGNORED = ("actuator_armature", "opt.disableactuator")
+_PROBE = 2000  # timesteps
+_FEW_CONTACTS, _FEW_ROWS = 48, 160  # memory for fewer is not worth an overflow
+
+
+def unsupported(model: mujoco.MjModel) -> list[str]:
+    """Features of the model that MuJoCo Warp does not support, with names of the elements that have them."""
+    left_out = beyond_defaults(model, IGNORED.__contains__)
+    try:
+        with wp.ScopedDevice("cpu"):
+            private_api.mujoco_warp().put_model(model)
+    except NotImplementedError as error:
+        left_out.append(str(error).rstrip("."))
+    return left_out
+
+
+def memory_for(model: mujoco.MjModel) -> tuple[int, int]:
+    """Contacts and rows of constraints to have memory for in each environment.
+
+    All that can occur if that is little, else half as many again as random controls cause.
+    """
+    contacts, rows = pairs.most(model)
+    if contacts > _FEW_CONTACTS or rows > _FEW_ROWS:
+        seen_contacts, seen_rows = _probe(model)
+        contacts = min(contacts, max(1.5 * seen_contacts, _FEW_CONTACTS))
+        rows = min(rows, max(1.5 * seen_rows, _FEW_ROWS))
+    return max(1, round(contacts)), max(1, round(rows))
+
+
+def _probe(model: mujoco.MjModel) -> tuple[int, int]:
+    """The most contacts and rows under random controls, from the default and from keyframes."""
+    data, rng, contacts, rows = mujoco.MjData(model), np.random.default_rng(0), 0, 0
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    for warning in data.warning:
+        warning.number = 1  # else MuJoCo writes a log
+    starts = range(-1, min(model.nkey, 4))
+    for key in starts:
+        mujoco.mj_resetDataKeyframe(model, data, key) if key >= 0 else mujoco.mj_resetData(model, data)
+        for step in range(_PROBE // len(starts)):
+            if step % 20 == 0:
+                data.ctrl[:] = rng.uniform(low, high)
+            mujoco.mj_step(model, data)
+            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    return contacts, rows
+
+
+@wp.kernel(enable_backward=False, module="mjx_dher_graph")
+def _begin(
+    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    rest: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    act_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    mocap_pos: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
+    mocap_quat: wp.array2d(dtype=wp.quat),  # type: ignore[valid-type]
+    ctrl: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    time: wp.array(dtype=float),  # type: ignore[valid-type]
+):
+    """Copies state and controls into MuJoCo Warp's memory."""
+    env = wp.tid()
+    for i in range(qpos.shape[1]):
+        qpos_out[env, i] = qpos[env, i]
+    nv = qvel.shape[1]
+    for i in range(nv):
+        qvel_out[env, i] = qvel[env, i]
+        warmstart_out[env, i] = rest[env, i]
+    for i in range(rest.shape[1] - nv):
+        act_out[env, i] = rest[env, nv + i]
+    bodies = mocap_pos.shape[1]
+    for i in range(bodies):
+        at = 7 * i
+        mocap_pos[env, i] = wp.vec3(inputs[env, at], inputs[env, at + 1], inputs[env, at + 2])
+        mocap_quat[env, i] = wp.quat(inputs[env, at + 3], inputs[env, at + 4], inputs[env, at + 5], inputs[env, at + 6])
+    for i in range(inputs.shape[1] - 7 * bodies):
+        ctrl[env, i] = inputs[env, 7 * bodies + i]
+    time[env] = 0.0
+
+
+@wp.kernel(enable_backward=False, module="mjx_dher_graph")
+def _end(
+    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    warmstart: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    act: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """Copies the state out of MuJoCo Warp's memory."""
+    env = wp.tid()
+    for i in range(qpos_out.shape[1]):
+        qpos_out[env, i] = qpos[env, i]
+    nv = qvel_out.shape[1]
+    for i in range(nv):
+        qvel_out[env, i] = qvel[env, i]
+        rest_out[env, i] = warmstart[env, i]
+    for i in range(rest_out.shape[1] - nv):
+        rest_out[env, nv + i] = act[env, i]
+
+
+class Simulation:
+    """Environments that MuJoCo Warp advances, on Warp's current device.
+
+    Args:
+      model: a model for which `unsupported` is empty.
+      num_envs: number of environments.
+      substeps: timesteps an environment step.
+      contacts: contacts that there is memory for, in each environment on average.
+      rows: rows of constraints that there is memory for, in each environment.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, rows: int):
+        warp = private_api.mujoco_warp()
+        model = copy.copy(model)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # nobody reads them
+        self._step, self._model = warp.step, warp.put_model(model)
+        # MuJoCo Warp takes the velocity term of equality constraints from the timestep before.
+        self._before = (warp.kinematics, warp.com_pos, warp.com_vel) if model.neq else ()
+        self._model.opt.warn_overflow = 0  # a kernel that prints waits for the host
+        self._data = warp.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
+        self._substeps, self._num_envs, self._graph = substeps, num_envs, None
+
+    def load(self) -> None:
+        """Compiles the kernels, or takes them from Warp's cache."""
+        self._step(self._model, self._data)
+        wp.synchronize_device()
+
+    def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
+        """Advances coordinates, velocities, and the solver's first guess with activations behind it by an environment step."""
+        data = self._data
+        if self._graph is None and not wp.get_device().is_cpu:
+            self.load()  # which a capture must not do
+            with wp.ScopedCapture() as capture:
+                self._run()
+            self._graph = capture.graph
+        held = [data.qpos, data.qvel, data.qacc_warmstart, data.act]
+        outputs = [*held, data.mocap_pos, data.mocap_quat, data.ctrl, data.time]
+        wp.launch(_begin, dim=self._num_envs, inputs=[*state, inputs], outputs=outputs)
+        if self._graph is None:
+            self._run()
+        else:
+            wp.capture_launch(self._graph)
+        wp.launch(_end, dim=self._num_envs, inputs=held, outputs=list(result))
+
+    def overflow(self) -> int:
+        """Number of environments, since the last call, in which contacts or rows were left out because they did not fit."""
+        lost = int(np.count_nonzero(self._data.overflow.numpy() & private_api.overflow_of_memory()))
+        if lost:
+            self._data.overflow.zero_()
+        return lost
+
+    def _run(self) -> None:
+        for compute in self._before:
+            compute(self._model, self._data)
+        for _ in range(self._substeps):
+            self._step(self._model, self._data)
