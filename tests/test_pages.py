@@ -65,12 +65,13 @@ def test_the_tables_of_results_are_those_of_the_curves():
 
 
 def test_each_table_of_results_with_numbers_is_made_from_the_curves():
-    """But those of settings and departures, which are words: nobody would check a number in another table."""
+    """But those of settings, departures and commands: nobody would check a number in another table."""
     text = make_results_figures.PAGE.read_text()
     rest = re.sub(r"<!-- (\w+): docs/make_results_figures.py -->.*?<!-- end of \1 -->", "", text, flags=re.DOTALL)
     tables = [token.map for token in MARKDOWN.parse(rest) if token.type == "table_open"]
     heads = [rest.splitlines()[start] for start, _ in tables]
     assert heads.pop(0) == "| departure from the paper | where |"
+    assert heads.pop(0) == "| figure of the paper | ours | command | curves | on one H100 |"
     assert heads == ["| item | the paper | `--preset paper` | source, and whether it departs | to change it |"]
 
 
