@@ -26,6 +26,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import reliability_calls
+import reliability_machines
 import reliability_pairs
 import reliability_power
 from timing import print_table
@@ -48,7 +49,7 @@ SHAPES = {
 }
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
-PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls")
+PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", *reliability_machines.PARTS)
 
 
 class Failure(Exception):
@@ -189,8 +190,7 @@ def flips(runs, count, rng):
         shutil.rmtree(path)
     files = [path for path in sorted(newest.rglob("*")) if path.is_file() and path.stat().st_size]
     refused = harmless = 0
-    for _ in range(count):
-        path = rng.choice(files)
+    for path in rng.choices(files, k=count):
         whole = path.read_bytes()
         damaged = bytearray(whole)
         damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
@@ -222,7 +222,7 @@ def damage(runs, count, rng):
             expect(digest(found.state) == runs.right[found.epoch], "the older one is another")
             path.write_bytes(whole)
             tried += 1
-    manifest = newest / checkpoint.MANIFEST
+    manifest = newest / run_folder.MANIFEST
     manifest.write_text(manifest.read_text().replace(f'"schema": {checkpoint.SCHEMA}', '"schema": 0'))
     expect("schema" in checkpoint.restore(out, runs.template).refused[newest], "an older schema is not named")
     shutil.rmtree(older)
@@ -239,16 +239,12 @@ def disk(runs, count, rng):
     for limit in (16, 4, 1):
         process = runs.start(out, limit)
         stdout, stderr = process.communicate()
-        # Orbax's threads print more, before it and after.
         named = "error: cannot write the checkpoint" in stderr or "cannot be written to" in stderr
         expect(process.returncode == 2 and named, f"{limit}: {process.returncode} {stderr}")
         # A run goes on without a checkpoint that cannot be written, and says so, until its metrics cannot be written.
         told = stdout.count("cannot write the checkpoint")
         expect(runs.check(out, lost=(told + 1) * INTERVAL) >= before, "a checkpoint is gone")
-    return (
-        "files limited to 16, 4 and 1 kB",
-        "each epoch that is not saved is told, then a named error; the checkpoints stay whole",
-    )
+    return "files limited to 16, 4 and 1 kB", "each epoch not saved is told, then a named error; the checkpoints stay whole"
 
 
 def twice(runs, count, rng):
@@ -307,6 +303,13 @@ def calls(args, folder):
     return f"{tried} wrong calls of the command line", "each a sentence and status 2; nothing written, no traceback"
 
 
+def machines(args, folder):
+    """Disks and containers."""
+    tried, outcome, faults = reliability_machines.PARTS[folder.name](folder)
+    expect_none(faults)
+    return tried, outcome
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
@@ -321,6 +324,7 @@ def main() -> int:
     args = parser.parse_args()
     parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
     by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls}
+    by_itself |= dict.fromkeys(reliability_machines.PARTS, machines)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(args.env, folder) if set(args.parts) - set(by_itself) else None
