@@ -112,7 +112,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "td_error": Component(
             "mjx_dher.priorities:td_error",
             "episodes, and transitions with hindsight goals, by their errors of one step (HGR)",
-            (),
+            ("renewals",),
             "transitions",
         ),
         "curriculum": Component(

@@ -6,7 +6,7 @@ observations "observation/NAME".
 
 from __future__ import annotations
 
-import zipfile
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from mjx_dher import lookup
 from mjx_dher.contract import env_spec, episode_template
 from mjx_dher.spec import find_demonstrations
+from mjx_dher.system import npz
 from mjx_dher.types import Env, Episode
 
 _OPTIONAL = ("length", "terminal")
@@ -42,8 +43,10 @@ def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
     path, template = find_demonstrations(source), episode_template(env)
     names = _named(template)
     try:
-        arrays = _read_npz(path) if path.is_file() else _read_minari(path, names, env.episode_length)
-        _check_arrays(arrays, names, env, max_episodes)
+        check = functools.partial(_check_arrays, names=names, env=env, max_episodes=max_episodes)
+        arrays = npz.read(path, check=check) if path.is_file() else _read_minari(path, names, env.episode_length)
+        check(arrays)
+        _check_values(arrays, names, env, arrays["action"].shape[1])
     except ValueError as error:
         raise ValueError("\n".join(f"demonstrations {source}: {line}" for line in str(error).splitlines())) from error
     return _padded(arrays, template, env.episode_length)
@@ -53,14 +56,6 @@ def _named(episode: Episode) -> dict[str, Any]:
     """Leaves of an episode by name: "observation", or "observation/NAME" for each leaf of a tree."""
     leaves = jax.tree_util.tree_leaves_with_path(episode)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise ValueError(f"must be an .npz of arrays; {type(error).__name__}: {error}") from error
 
 
 def _read_minari(path: Path, names: Mapping[str, Any], num_steps: int) -> dict[str, np.ndarray]:
@@ -95,7 +90,7 @@ def _minari_row(episode: Any, names: Mapping[str, Any], num_steps: int) -> dict[
     return {name: np.asarray(value) for name, value in row.items()}
 
 
-def _check_arrays(arrays: dict[str, np.ndarray], names: Mapping[str, Any], env: Env, max_episodes: int) -> None:
+def _check_arrays(arrays: Mapping[str, Any], names: Mapping[str, Any], env: Env, max_episodes: int) -> None:
     """Raises ValueError with a line for each array that is missing, unknown, or does not fit the environment."""
     action, num_steps = arrays.get("action"), env.episode_length
     if action is None or action.ndim != 3 or not 1 <= action.shape[1] <= num_steps:
@@ -114,14 +109,14 @@ def _check_arrays(arrays: dict[str, np.ndarray], names: Mapping[str, Any], env: 
         if value is None or value.shape != shape or not np.can_cast(value.dtype, leaf.dtype, "same_kind"):
             given = "none" if value is None else f"{value.dtype}{list(value.shape)}"
             problems.append(f"{name} must be {leaf.dtype}{list(shape)}; got {given}")
-        elif value.dtype.kind == "f" and not np.all(np.abs(value) <= np.finfo(leaf.dtype).max):
-            problems.append(f"{name} must be finite, as {leaf.dtype}")
     if problems:
         raise ValueError("\n".join(problems))
-    _check_values(arrays, env, played[1])
 
 
-def _check_values(arrays: dict[str, np.ndarray], env: Env, num_steps: int) -> None:
+def _check_values(arrays: dict[str, np.ndarray], names: Mapping[str, Any], env: Env, num_steps: int) -> None:
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and not np.all(np.abs(value) <= np.finfo(names[name].dtype).max):
+            raise ValueError(f"{name} must be finite, as {names[name].dtype}")
     spec = env_spec(env)
     if np.any(np.abs(arrays["action"]) > 1):
         raise ValueError(f"action must lie in [-1, 1]; the largest magnitude is {np.abs(arrays['action']).max():g}")

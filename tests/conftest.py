@@ -71,6 +71,17 @@ def refuses(*parts, error=ValueError):
     names(str(raised.value), *parts)
 
 
+def save_policy(folder, policy=None):
+    """Writes the policy of the run in `folder`, as training does: with the settings in config.json. None: of three numbers."""
+    from mjx_dher.policy import Policy
+    from mjx_dher.runs.folder import run_folder
+
+    ones = np.ones(1, np.float32)
+    policy = policy or Policy(((np.ones((2, 1), np.float32), ones),), ones, ones, ones, ones, 5.0, 200.0)
+    content = run_folder.read_config(folder)
+    run_folder.save_policy(folder, policy, run_folder.identity_of(content, run_folder.to_spec(folder, content)))
+
+
 def load_recorded(task):
     """Episodes of the original task; see tests/data/README.md."""
     with np.load(ROOT / "tests" / "data" / f"fetch_{task}.npz") as file:

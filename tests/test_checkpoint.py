@@ -329,7 +329,9 @@ def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "keep must lie in" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")
     assert "checkpoint_every must lie in" in refusal(capsys, "resume", tmp_path / "run", "--checkpoint-every", "-1")
     assert "checkpoint_every must lie in" in refusal(capsys, "--env", "push", "--checkpoint-every", "-1")
-    write_json(tmp_path / "run" / "result.json", {"status": "finished", "epochs": 4})
+    rates = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate", "return_mean"), 0.5)
+    ended = {"status": "finished", "epochs": 4, "env_steps": 40, "wall_seconds": 1.0, "lanes": 1, "episodes": 4, **rates}
+    write_json(tmp_path / "run" / "result.json", {**ended, "digest": run_folder.read_config(tmp_path / "run")["digest"]})
     assert "has ended" in refusal(capsys, "resume", tmp_path / "run")
 
 

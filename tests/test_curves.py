@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from conftest import refuses
+from conftest import refuses, save_policy
 from test_plotting import texts
 
 from mjx_dher import Config, RunSpec, cli
@@ -36,7 +36,7 @@ def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", column
     sink.close()
     if status is None:
         return folder
-    (folder / "policy.npz").write_bytes(b"")
+    save_policy(folder)
     content = {"status": status, "reason": reason, "epochs": epochs + (status == "failed"), "env_steps": 1000 * epochs}
     content |= {"wall_seconds": 2.0 * epochs, "lanes": 1, "digest": digest}
     if status == "finished":

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import onnx
 import pytest
-from conftest import ROOT, names, refuses
+from conftest import ROOT, names, refuses, save_policy
 from onnx.reference import ReferenceEvaluator
 from safetensors import safe_open
 from safetensors.numpy import load_file
@@ -24,7 +24,7 @@ FORMATS = ("onnx", "safetensors")
 def save_run(path, policy):
     """A run folder that holds `policy`."""
     run_folder.write_config(path, RunSpec(env="slide", sampler="weighted", seed=3), "native", {})
-    policy.save(path / run_folder.POLICY_FILE)
+    save_policy(path, policy)
     return path
 
 

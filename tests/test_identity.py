@@ -14,7 +14,7 @@ from test_driver import rows_of
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, cli, envs
-from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -163,10 +163,10 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
 OTHER_KINDS = [
     (("config",), [], "config must be a dict"),
     (("config", "hidden_sizes"), 10**20, "config.hidden_sizes must be a list"),
-    (("config", "hidden_sizes"), None, "('hidden_sizes')"),
+    (("config", "hidden_sizes"), None, "'hidden_sizes'"),
     (("hparams",), "x", "hparams must be a dict"),
     (("physics",), 1, "physics must be a str"),
-    (("physics",), None, "('physics')"),
+    (("physics",), None, "'physics'"),
     (("config", "total_steps"), None, "total_steps"),
     (("sources",), [], "sources must be a dict"),
     (("sources",), {"env": 10**20}, "sources.env must be a str"),
@@ -244,7 +244,7 @@ def test_a_damaged_checkpoint_costs_no_whole_one(stopped, keep, capsys):
     train(stopped, until=3, keep=keep)
     expected = ["epoch-000003"] if keep == 1 else ["epoch-000003", "epoch-000002"]
     assert [path.name for path in run_folder.checkpoints(stopped)] == expected
-    assert checkpoint._read_manifest(run_folder.checkpoints(stopped)[0])["epoch"] == 3
+    assert run_folder.read_manifest(run_folder.checkpoints(stopped)[0])["epoch"] == 3
     assert older.exists() == (keep == 2)
 
 
@@ -254,7 +254,7 @@ def test_a_damaged_older_one_is_not_kept_for_a_whole_one(made, tmp_path):
     damage(newest)
     train(folder, until=5)
     assert [path.name for path in run_folder.checkpoints(folder)] == ["epoch-000005", "epoch-000004"]
-    assert [checkpoint._read_manifest(path)["epoch"] for path in run_folder.checkpoints(folder)] == [5, 4]
+    assert [run_folder.read_manifest(path)["epoch"] for path in run_folder.checkpoints(folder)] == [5, 4]
     assert not older.exists()
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from configs import LEARNS as SMALL
-from conftest import refuses
+from conftest import refuses, save_policy
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, learners, make_train, networks
@@ -246,7 +246,7 @@ SPEC = RunSpec(env="point_mass:PointMass", learner="mine:learner", networks="min
 def folder(tmp_path, trained, mine):
     learner, _, state, _ = trained
     run_folder.write_config(tmp_path / "run", SPEC, "none", {})
-    learner_policy.LearnerPolicy(learner, state, HP, TASK).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    save_policy(tmp_path / "run", learner_policy.LearnerPolicy(learner, state, HP, TASK))
     return tmp_path / "run"
 
 
@@ -273,7 +273,9 @@ def test_its_numbers_come_back_to_the_bit(folder, trained):
 
 @pytest.mark.parametrize("changes", [{"networks": "mlp"}, {"config": dataclasses.replace(SMALL, hidden_sizes=(16,))}])
 def test_a_stored_policy_of_other_networks_is_refused(folder, changes, mine):
+    policy = mjx_dher.load_policy(folder)
     run_folder.write_config(folder, dataclasses.replace(SPEC, **changes), "none", {})
+    save_policy(folder, policy)
     with refuses("policy.npz", changes.get("networks", "mine:networks"), "mine:learner"):
         mjx_dher.load_policy(folder)
 

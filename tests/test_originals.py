@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import refuses
+from conftest import refuses, save_policy
 
 from mjx_dher import RunSpec, cli, policy
 from mjx_dher.runs.folder import run_folder
@@ -18,7 +18,7 @@ def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "reach"
     run_folder.write_config(out, RunSpec(env="reach", engine="native"), "native", {})
     kernel = np.random.default_rng(0).normal(size=(13, 4)).astype(np.float32)
-    policy.Policy(
+    random = policy.Policy(
         layers=((kernel, np.zeros(4, np.float32)),),
         observation_mean=np.zeros(10),
         observation_std=np.ones(10),
@@ -26,7 +26,8 @@ def run(tmp_path_factory):
         goal_std=np.ones(3),
         norm_clip=5.0,
         obs_clip=200.0,
-    ).save(out / run_folder.POLICY_FILE)
+    )
+    save_policy(out, random)
     return out
 
 

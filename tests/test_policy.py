@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import ROOT, refuses
+from conftest import ROOT, refuses, save_policy
 
 import mjx_dher
 from mjx_dher import RunSpec, learners
@@ -40,7 +40,7 @@ def learner():
 @pytest.fixture
 def run_dir(tmp_path, learner):
     run_folder.write_config(tmp_path / "run", SPEC, "native", {"note": "for the reader"})
-    DDPG.export(learner, HP).save(tmp_path / "run" / run_folder.POLICY_FILE)
+    save_policy(tmp_path / "run", DDPG.export(learner, HP))
     return tmp_path / "run"
 
 

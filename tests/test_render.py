@@ -8,7 +8,7 @@ import sys
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from conftest import ROOT, names, refuses
+from conftest import ROOT, names, refuses, save_policy
 
 from mjx_dher import RunSpec, cli, envs, policy
 from mjx_dher.runs.folder import run_folder
@@ -73,7 +73,7 @@ def drawn(tmp_path_factory):
         norm_clip=5.0,
         obs_clip=200.0,
     )
-    still.save(folder / "run" / run_folder.POLICY_FILE)
+    save_policy(folder / "run", still)
     done = subprocess.run([sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode == NO_GL:
         pytest.skip(f"nothing on this machine can draw: {done.stdout.strip()}")

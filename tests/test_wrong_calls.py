@@ -117,12 +117,12 @@ DOCTOR = (
 
 @pytest.mark.parametrize(
     ("redirect", "expected"),
-    [("> /dev/full", 2), ("| head -1 > /dev/null; exit ${PIPESTATUS[0]}", 141), (">&-", 0)],
+    [("> /dev/full", 2), ("| head -1 > /dev/null; exit ${PIPESTATUS[0]}", 141), (">&-", 2)],
 )
 def test_a_command_whose_output_is_its_purpose_ends_with_an_error(redirect, expected):
     status, error = shell(DOCTOR, redirect)
     assert (status, "Traceback" in error) == (expected, False), error
-    assert ("cannot print (No space left on device)" in error) == (expected == 2)
+    assert ("cannot print" in error) == (expected == 2)
 
 
 @pytest.mark.parametrize("flag", ["--help", "--no-such-flag"])

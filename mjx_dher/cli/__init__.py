@@ -22,13 +22,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Else Python looks for cycles among all objects before it ends, which takes half a second after a run.
     atexit.register(gc.freeze)
     argv = list(sys.argv[1:] if argv is None else argv)
-    if argv == ["--version"]:
-        print(f"mjx-dher {__version__}")
-        return 0
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
         sys.path.append("")
-    trains = name in TRAINING
+    trains = name in TRAINING and not {"--dry-run", "--version"} & set(argv)
     with output.guarded() as stream:
         try:
             ended = _run(name, argv)
@@ -42,6 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(name: str, argv: list[str]) -> int:
     try:
+        if argv == ["--version"] and name == "train":
+            print(f"mjx-dher {__version__}")
+            return 0
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
         return run(name, argv, output.PlainConsole(soft_wrap=True))

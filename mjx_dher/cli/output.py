@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import re
@@ -39,7 +40,8 @@ class Guarded:
 
     def __init__(self, stream: Any):
         self.error: OSError | None = None
-        self._stream = stream
+        self._closed = stream is None  # before this program began
+        self._stream = open(os.devnull, "w") if self._closed else stream  # noqa: SIM115
 
     def write(self, text: str) -> int:
         """Writes `text`, or drops it."""
@@ -51,18 +53,19 @@ class Guarded:
         self._attempt("flush")
 
     def _attempt(self, method: str, *args: Any) -> None:
-        if self._stream is None or self.error is not None:
+        if self.error is not None:
             return
         try:
+            if self._closed and args:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
             getattr(self._stream, method)(*args)
         except OSError as error:
             self.error = error
-            with contextlib.suppress(OSError, ValueError):  # the interpreter would complain when it flushes what is left
+            # The interpreter would complain when it flushes what is left.
+            with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
     def __getattr__(self, name: str) -> Any:
-        if self._stream is None and name == "isatty":
-            return lambda: False
         return getattr(self._stream, name)
 
 

@@ -28,7 +28,7 @@ def join(distributed: bool, described: Mapping[str, Any], console: Console) -> C
     from mjx_dher.parallel import processes
 
     processes.connect()
-    versions = {"version of mjx_dher": __version__, "version of jax": metadata.version("jax")}
+    versions = {"version of mjx_dher": __version__, "version of jax": metadata.version("jax"), **fingerprint.jax_flags()}
     processes.check_equal({**versions, **described})
     return console if processes.leads() else Console(quiet=True)
 
@@ -48,12 +48,7 @@ def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes:
     if not resumes or out is None or not (out / run_folder.CONFIG_FILE).exists():
         return stack.enter_context(run_folder.claim_new(out, spec))
     stack.enter_context(files.lock(out))
-    content, begun = run_folder.read_run(out)
-    before = run_folder.identity_of(content, begun)
-    now = fingerprint.identity(spec, content["physics"], fingerprint.sources(spec))
-    changed = {name: text for name, text in fingerprint.differences(before, now).items() if name not in fingerprint.MAY_CHANGE}
-    if changed:
-        raise FolderError(f"out: {out} holds a run with other settings: {'; '.join(changed.values())}")
+    run_folder.check_same(out, spec)
     if results.has_result(out) and results.read_result(out)["status"] != run_folder.FAILED:
         raise FolderError(f"out: {out} holds this run, and it has ended")
     return out

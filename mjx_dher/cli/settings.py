@@ -15,6 +15,7 @@ from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
+from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
@@ -34,11 +35,16 @@ def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
     except FileNotFoundError:
         raise FolderError(f"config: there is no file {file}") from None
     run = run_folder.to_spec(file, content)
-    names = [field.name for field in dataclasses.fields(Options)]
-    options = Options(**{name: content[name] for name in names if name in content})
+    options = options_of(content)
     options.check()
-    options = dataclasses.replace(options, log=tuple(options.log))
     return run, options, [_origin(file, content, run), *run_folder.changed_code(content, run)]
+
+
+def options_of(content: dict[str, Any]) -> Options:
+    """The options in a config.json. Raises ValueError for an invalid one."""
+    options = Options(**{field.name: content[field.name] for field in dataclasses.fields(Options) if field.name in content})
+    options.check(installed=False)
+    return dataclasses.replace(options, log=tuple(options.log))
 
 
 def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
@@ -54,6 +60,14 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
         f" {content['physics']}{edited}"
     )
+
+
+def without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
+    """Returns a run with the `base`'s values of settings that its components do not read, and lines about those ignored."""
+    kept = grid.with_unread_of(base, run)
+    old, new = fingerprint.settings(kept), fingerprint.settings(run)
+    ignored = [f"{name} {text(new[name])}" for name in new if new[name] != old[name]]
+    return kept, [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []
 
 
 def changes(before: RunSpec, now: RunSpec) -> str:

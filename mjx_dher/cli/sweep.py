@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -110,8 +111,10 @@ class SweepArgs:
     """Say what would be trained, and write nothing."""
 
 
-def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
+def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> tuple[SweepArgs, list[RunSpec]]:
     """Returns the arguments of `sweep` and the trials in them, checked before JAX or MuJoCo is loaded.
+
+    `report` is called with the options that no trial reads, which are ignored.
 
     Raises:
       ValueError: one or more of them cannot be used.
@@ -124,11 +127,26 @@ def parse_sweep_args(argv: list[str]) -> tuple[SweepArgs, list[RunSpec]]:
     args = parse(SweepArgs, argv, default=default)
     _check(args)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
+    args = _without_unread(args, trials, report)
+    trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
     if args.fleet.ray is not None:
         return args, trials  # which preset is for the cluster is known once it is joined
     if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
         trials = _trials(args, preset)
     return args, trials
+
+
+def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:
+    """Returns the arguments without sizes and numbers that no trial reads, and reports these."""
+    groups: dict[str, Any] = {"changes": args.changes, "sweep": args.sweep}
+    read = [fingerprint.settings(run) for run in trials]
+    given = [name for own in groups.values() for name, value in vars(own).items() if value is not None]
+    unread = {name: None for name in given if not any(components.reads(settings, name) for settings in read)}
+    if unread:
+        report(f"ignored, because no component of these runs reads it: {', '.join(unread)}")
+    for group, own in groups.items():
+        groups[group] = dataclasses.replace(own, **{name: None for name in unread if hasattr(own, name)})
+    return dataclasses.replace(args, **groups)
 
 
 def _check(args: SweepArgs) -> None:
@@ -179,7 +197,7 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
 
 def sweep_command(argv: list[str], console: Console) -> int:
     """Trains a grid of runs."""
-    args, trials = parse_sweep_args(argv)
+    args, trials = parse_sweep_args(argv, console.print)
     if args.dry_run:
         return _dry_run(args, trials, console)
     if args.fleet.ray is not None:

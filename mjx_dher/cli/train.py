@@ -30,7 +30,7 @@ from mjx_dher.cli.common import (
 from mjx_dher.cli.processes import check_out, claim, join
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
-from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec, to_texts
@@ -81,7 +81,7 @@ class ResumeArgs:
     """Go on with a run that was stopped, or killed, from its newest checkpoint that is whole.
 
     With the engine that it had, on a CPU, it ends as if it had never stopped, to the bit. A run that has ended goes on, with a
-    larger --total-steps, if it was trained with --keep-end.
+    larger --total-steps, if it was trained with --keep-end. Options that are not given stay as the run last had them.
     """
 
     run: tyro.conf.Positional[Path]
@@ -93,21 +93,10 @@ class ResumeArgs:
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     total_steps: int | None = None
-    """Environment steps of the whole run, those that were made included; as the run was started with unless given."""
-    final_episodes: int | None = None
-    """Episodes of the last evaluation; as the run was started with unless given."""
-    checkpoint_every: int | None = None
-    """Epochs between checkpoints, or 0; as the run was started with unless given."""
-    keep: int | None = None
-    """Checkpoints to keep; as the run was started with unless given."""
-    keep_end: bool | None = None
-    """Checkpoint of the end, kept; as the run was started with unless given."""
-    log: tuple[str, ...] | None = None
-    """Logs beside metrics.csv: jsonl, tensorboard, wandb; as the run was started with unless given."""
-    stop_at: float | None = None
-    """Success rate that ends the run; as the run was started with unless given."""
+    """Environment steps of the whole run, those that were made included; as before unless given."""
     curve: bool = True
     """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
+    options: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
 
 
 def train_command(argv: list[str], console: Console) -> int:
@@ -158,9 +147,10 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
 
 def resume_command(argv: list[str], console: Console) -> int:
     """Goes on with a run that was stopped."""
-    args = parse(ResumeArgs, argv)
+    asked = parse(ResumeArgs, argv)  # which run it is
+    content = run_folder.read_config(asked.run)
+    args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
     check_engine(args.engine)
-    content = run_folder.read_config(args.run)
     settle_compiler(args.engine or content["physics"])
     described = {name: str(value) for name, value in vars(args).items()} | {"digest": content["digest"]}
     screen = join(args.distributed, described, console)
@@ -168,48 +158,48 @@ def resume_command(argv: list[str], console: Console) -> int:
 
     with contextlib.ExitStack() as stack:
         processes.broadcast(lambda: stack.enter_context(files.lock(args.run)))
-        run, options = _to_resume(args, content, screen)
+        run, options = _to_resume(args, asked.options.stop_at, content, screen)
         prepare()
         env = make_env(run, args.engine or (content["physics"] if envs.takes_engine(run.env) else None))
         return _train(env, run, args.run, options, args.curve, screen, content.get("devices", 1))
 
 
-def _to_resume(args: ResumeArgs, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
+def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
     """Returns the run in a folder, which is locked, with what may be other than it was; refuses other changes by name.
+
+    `stop_at` is that of the command line. What has ended a run does not end it again, unless it is given again.
 
     Raises:
       FolderError: the run has ended, has no checkpoint, or its settings were edited.
       ValueError: an option that cannot be used.
     """
-    run = run_folder.to_spec(args.run, content)
+    run, options = run_folder.to_spec(args.run, content), args.options
     edits = run_folder.edited(args.run, content, run)
     if refused := [text for name, text in edits.items() if name not in fingerprint.MAY_CHANGE]:
         raise FolderError(
             f"{args.run / run_folder.CONFIG_FILE} is not as the run wrote it, and a run goes on with what it began with:"
             f" {'; '.join(refused)}"
         )
+    run_folder.check_written(args.run, content, run)
     if args.total_steps is not None:
         run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
     spec.validate(run)
-    fields = [field.name for field in dataclasses.fields(Options)]
-    given = {name: getattr(args, name) for name in fields if getattr(args, name) is not None}
-    options = Options(**{**{name: content[name] for name in fields if name in content}, **given})
     options.check()
     if results.has_result(args.run) and (result := results.read_result(args.run))["status"] != run_folder.FAILED:
-        _check_ended(args, run, options, result)
-        options = dataclasses.replace(options, stop_at=args.stop_at)  # what has ended it does not end it again
+        _check_ended(args, run, stop_at, result)
+        options = dataclasses.replace(options, stop_at=stop_at)
     run_folder.checkpoints_to_resume(args.run)
     if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
         console.print(
             f"step sizes fall to {run.hparams.lr_end:g} of their start over the whole run, whose length has changed: they go on"
             " from what they would be at this point of a run of the new length"
         )
-    told = "; ".join(f"{name} {getattr(options, name)}" for name in fields if name != "log")
+    told = "; ".join(f"{name} {fingerprint.text(value)}" for name, value in vars(options).items())
     console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}")
-    return run, dataclasses.replace(options, log=tuple(options.log))
+    return run, options
 
 
-def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[str, Any]) -> None:
+def _check_ended(args: ResumeArgs, run: RunSpec, stop_at: float | None, result: dict[str, Any]) -> None:
     """Raises FolderError where a run that has ended cannot go on."""
     if not run_folder.checkpoints(args.run):
         raise FolderError(
@@ -221,9 +211,9 @@ def _check_ended(args: ResumeArgs, run: RunSpec, options: Options, result: dict[
             f"{args.run} has ended after {result['env_steps']:,} environment steps; total_steps must be more than that for it"
             f" to go on; got {run.config.total_steps}"
         )
-    if args.total_steps is None and args.stop_at is None:
+    if args.total_steps is None and stop_at is None:
         raise FolderError(
-            f"{args.run} has ended after {result['env_steps']:,} environment steps, at its stop_at {options.stop_at}:"
+            f"{args.run} has ended after {result['env_steps']:,} environment steps, at its stop_at {args.options.stop_at}:"
             " give --total-steps, or another --stop-at, to go on"
         )
 
@@ -248,24 +238,27 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
             raise ValueError("config and preset are both whole settings: give one of them")
         base, options, notes = settings.load(chosen.config)
         args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
-        if args.spec.env == base.env:
-            merged = to_texts({**base.env_arguments, **args.spec.env_arguments})
-            args = dataclasses.replace(args, spec=dataclasses.replace(args.spec, env_kwargs=merged))
-        for line in (*notes, settings.changes(base, args.spec)):
+        run = args.spec
+        if run.env == base.env:
+            run = dataclasses.replace(run, env_kwargs=to_texts({**base.env_arguments, **run.env_arguments}))
+        run, ignored = settings.without_unread(base, run)
+        for line in (*notes, settings.changes(base, run), *ignored):
             report(line)
-        return args
+        return dataclasses.replace(args, spec=run)
 
-    def parse_preset(preset: Any) -> TrainArgs:
-        default = TrainArgs(presets.preset(preset, chosen.env, chosen.learner))
-        origin = f"those of preset {preset} for {chosen.env}"
-        return dataclasses.replace(_parse(argv, default, origin), preset=preset)
+    def parse_preset(preset: Any) -> tuple[TrainArgs, list[str]]:
+        base = presets.preset(preset, chosen.env, chosen.learner)
+        args = _parse(argv, TrainArgs(base), f"those of preset {preset} for {chosen.env}")
+        run, ignored = settings.without_unread(base, args.spec)
+        return dataclasses.replace(args, spec=run, preset=preset), ignored
 
-    if chosen.preset != "auto":
-        return parse_preset(chosen.preset)
     # Asking for the machine's preset starts CUDA, so invalid arguments are rejected before, unless help is asked for.
-    on_cpu = None if {"-h", "--help"} & set(argv) else parse_preset("cpu")
-    preset = presets.machine_preset()
-    return on_cpu if on_cpu is not None and preset == "cpu" else parse_preset(preset)
+    on_cpu = None if chosen.preset != "auto" or {"-h", "--help"} & set(argv) else parse_preset("cpu")
+    preset = presets.machine_preset() if chosen.preset == "auto" else chosen.preset
+    args, ignored = on_cpu if on_cpu is not None and preset == "cpu" else parse_preset(preset)
+    for line in ignored:
+        report(line)
+    return args
 
 
 def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
@@ -292,7 +285,8 @@ def _train(
     from mjx_dher.runs.folder.locks import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}")
-    before = [row["success_rate"] for row in loggers.read_rows(folder / run_folder.METRICS_FILE)]
+    begun = (folder / run_folder.CONFIG_FILE).exists()
+    before = [row["success_rate"] for row in results.read_metrics(folder)] if begun else []
     stop, screen = Stop(console, folder), Screen(console, [run], before)
     curve = curve and processes.leads()
 
@@ -340,7 +334,7 @@ def _draw(folder: Path, curve: bool, console: Console) -> None:
         return
     from mjx_dher.tools import curves, figures
 
-    if not (figures.is_there() and loggers.whole_epochs(folder)):
+    if not (figures.is_there() and results.read_metrics(folder)):
         return
     picture = folder / f"{curves.CURVE}.png"
     try:

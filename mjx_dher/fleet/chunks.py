@@ -122,7 +122,8 @@ def make(
 def code_of(specs: Sequence[RunSpec]) -> dict[str, str]:
     """Returns versions and digests of the code that runs depend on: the package, and files of custom components."""
     own = {f"{field} {getattr(run, field)}": text for run in specs for field, text in fingerprint.sources(run).items()}
-    return {"version of mjx_dher": __version__, "files of mjx_dher": _files_digest(), **own}
+    flags = {name: str(value) for name, value in fingerprint.jax_flags().items()}
+    return {"version of mjx_dher": __version__, "files of mjx_dher": _files_digest(), **flags, **own}
 
 
 @functools.cache

@@ -57,7 +57,8 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
       ValueError: as `train_runs`; or this node has other code than the driver, or another storage.
     """
     here = chunks.code_of(chunk.specs)
-    wrong = [f"{name} is {here.get(name)}, not {text}" for name, text in chunk.code.items() if here.get(name) != text]
+    names = {**chunk.code, **here}
+    wrong = [f"{x} is {here.get(x)}, not {chunk.code.get(x)}" for x in names if here.get(x) != chunk.code.get(x)]
     if wrong:
         raise ValueError(f"ray: node {socket.gethostname()} must have the driver's code: {'; '.join(wrong)}")
     reporter = _Reporter(chunk.id, tell)

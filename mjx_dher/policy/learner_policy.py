@@ -68,7 +68,11 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolic
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
         raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
-    return LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, env_spec)
+    policy = LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, env_spec)
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), env_spec.observation)
+    if not np.all(np.isfinite(policy({"observation": zeros, "desired_goal": np.zeros(env_spec.goal_size, np.float32)}))):
+        raise ValueError("its action for an observation of zeros is not finite")
+    return policy
 
 
 def to_json(spec: EnvSpec) -> str:

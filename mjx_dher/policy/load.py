@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mjx_dher.policy import Policy, TrainedPolicy, bundled, from_arrays
-from mjx_dher.runs.folder.run_folder import POLICY_FILE, read_spec
+from mjx_dher.runs.folder import run_folder
+from mjx_dher.system import npz
 from mjx_dher.system.files import FolderError
 
 
@@ -26,8 +23,8 @@ def load_policy(run_dir: str | Path, trust: bool = False) -> TrainedPolicy:
       trust: whether to import a custom learner or networks that the folder names and that you have not trained with here.
 
     Raises:
-      FolderError: no run folder, or a policy that is missing, damaged, or of a custom learner that cannot be imported, is not
-        trusted or does not fit.
+      FolderError: no run folder, or a policy that is missing, damaged, of another run, or of a custom learner that cannot be
+        imported, is not trusted or does not fit.
     """
     return _load(run_dir, trust, "")
 
@@ -41,41 +38,25 @@ def load_plain(run_dir: str | Path, use: str) -> Policy:
 
 def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     run_dir = bundled.find(run_dir)
-    spec, path = (None, run_dir) if run_dir.is_file() else (read_spec(run_dir, trust), run_dir / POLICY_FILE)
+    folder = None if run_dir.is_file() else run_dir
+    path = run_dir if folder is None else run_dir / run_folder.POLICY_FILE
+    content, spec = run_folder.read_run(folder, trust) if folder else ({}, None)
     if not path.is_file():
         raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")
-    arrays = _read(path)
-    if not {"env_spec", "sizes"} & arrays.keys():
-        try:
+    with run_folder.checked(path, "is damaged or not a policy of this program"):
+        arrays: dict[str, Any] = npz.read(path, ratio=run_folder.POLICY_RATIO)
+        if spec and (other := run_folder.foreign(content, spec, run_folder.policy_settings(arrays))):
+            raise FolderError(f"{path} is of a run with other settings: {other}")
+        if not {"env_spec", "sizes"} & arrays.keys():
             return from_arrays(arrays)
-        except ValueError as error:
-            raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
     if use:
         raise ValueError(f"{use} needs a policy of NumPy arrays; {path} is of a custom learner or custom networks")
     if spec is None:
         raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
 
-    try:
+    with run_folder.checked(path, "cannot be played"):
         return from_state(arrays, spec)
-    except (ValueError, KeyError, TypeError) as error:
-        raise FolderError(f"{path} cannot be played: {error}") from error
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """Reads the arrays in a policy.npz; nothing is unpickled."""
-    try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("it is one array")
-        with file:
-            arrays = {name: file[name] for name in file.files}  # all of them, so that damage anywhere is seen
-        arrays.pop("settings", None)
-        return arrays
-    except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, zlib.error) as error:
-        raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
-    except (zipfile.BadZipFile, OverflowError, RuntimeError) as error:  # RuntimeError: it asks for a password
-        raise FolderError(f"{path} is damaged or not a policy of this program ({error})") from error
 
 
 def check_fits(policy: TrainedPolicy, env: Any) -> None:

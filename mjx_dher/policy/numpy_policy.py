@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mjx_dher.system import files
 
@@ -126,6 +127,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
     for name in ("observation", "goal"):
         if arrays[f"{name}_mean"].shape != arrays[f"{name}_std"].shape:
             raise ValueError(f"{name}_mean and {name}_std differ in shape")
+    _check_bounds([[np.abs(arrays[f"layer{i}_{part}"]) for part in ("kernel", "bias")] for i in range(num_layers)], arrays)
     return Policy(
         layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
         **{field: arrays[field] for field in _VECTORS},
@@ -142,6 +144,16 @@ def _check_array(name: str, array: Any) -> None:
         raise ValueError(f"{name} must be finite")
     if (name in _SCALARS or name.endswith("_std")) and not np.all(array > 0):
         raise ValueError(f"{name} must be greater than 0; the least is {array.min():g}")
+
+
+def _check_bounds(layers: Sequence[Sequence[NDArray]], arrays: Mapping[str, Any]) -> None:
+    """Raises ValueError if a hidden unit could overflow, and an action be NaN, for some observation."""
+    most = np.full(len(layers[0][0]), float(arrays["norm_clip"]))
+    for number, (kernel, bias) in enumerate(layers):
+        with np.errstate(over="ignore"):
+            most = most @ kernel.astype(np.float64) + bias
+        if not np.all(most < np.finfo(np.float32).max):
+            raise ValueError(f"layer{number} has weights so large that an action could be NaN")
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:

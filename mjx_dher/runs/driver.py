@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import diagnostics
-from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
 from mjx_dher.runs.folder.locks import Claims, Run, named
 from mjx_dher.runs.folder.loggers import Sink
@@ -168,7 +167,8 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     options = session.options
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
-    runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec)) for spec in specs]
+    flags = fingerprint.jax_flags()
+    runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec), flags) for spec in specs]
     checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
     num_epochs = config_lib.num_epochs(specs[0].config, session.env.episode_length)
@@ -216,7 +216,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
 
 
 def _success_rates(folder: Path) -> list[float]:
-    return [row["success_rate"] for row in loggers.read_rows(folder / loggers.METRICS_FILE)]
+    return [row["success_rate"] for row in results.read_metrics(folder)]
 
 
 def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
@@ -237,14 +237,15 @@ def _open(
     folder: Path,
     run: dict[str, Any],
 ) -> list[Sink]:
-    """Writes config.json of a run that starts, or resumes with other settings, and opens the sinks for its metrics.
+    """Writes config.json of a run that starts, or resumes with other settings or options, and opens its metrics' sinks.
 
     `ended` is the number of epochs that its metrics have.
     """
     digest = fingerprint.digest(run)
-    if ended == 0 or run_folder.read_config(folder)["digest"] != digest:
-        placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
-        run_folder.write_config(folder, spec, run["physics"], {**dataclasses.asdict(session.options), **placed})
+    earlier = results.earlier_digests(folder, digest) if ended else []
+    placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
+    extra = {**dataclasses.asdict(session.options), **placed}
+    run_folder.write_config(folder, spec, run["physics"], extra, earlier, resumes=ended > 0)
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)
     opened = [*loggers.open_sinks(folder, session.options.log, ended, steps, digest), *own]
@@ -279,7 +280,7 @@ def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, ru
         from mjx_dher.policy.learner_policy import LearnerPolicy
 
         policy = LearnerPolicy(program.learner, learner, spec.hparams, program.spec)
-    policy.save(folder / run_folder.POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
+    run_folder.save_policy(folder, policy, run)
 
 
 def _finish(

@@ -26,14 +26,14 @@ class Options:
     stop_at: float | None = None
     """Success rate that ends a run early, as the mean of its last three evaluations."""
 
-    def check(self) -> None:
-        """Raises ValueError for an invalid option."""
+    def check(self, installed: bool = True) -> None:
+        """Raises ValueError for an invalid option, or, if they must be `installed`, for a log whose package is missing."""
         check_count("final_episodes", self.final_episodes)
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
         if not isinstance(self.keep_end, bool):
             raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
-        loggers.check_logs(self.log)
+        loggers.check_logs(self.log, installed)
         if self.stop_at is not None:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
 

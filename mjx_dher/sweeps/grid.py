@@ -27,7 +27,7 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
     first: dict[str, RunSpec] = {}
     for spec in specs:
         base = first.setdefault(spec.env, spec)
-        settings[dataclasses.replace(_with_unread_of(base, spec), seed=0)] = None
+        settings[dataclasses.replace(with_unread_of(base, spec), seed=0)] = None
     grouped = itertools.groupby(settings, key=lambda spec: spec.env)
     return [
         dataclasses.replace(spec, seed=seed)
@@ -37,7 +37,7 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
     ]
 
 
-def _with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
+def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
     """Returns `spec` with those settings of `base` that neither its sampler nor its learner reads."""
     settings = fingerprint.settings(spec)
     unread = [name for name in settings if not reads(settings, name)]

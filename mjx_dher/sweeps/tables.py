@@ -43,15 +43,16 @@ def _read_trial(path: Path) -> dict[str, Any]:
         raise FolderError(f"{problem}; the sweep's command trains it again, or remove the folder")
     result, (content, spec) = results.read_result(path), run_folder.read_run(path)
     failed = result["status"] == FAILED
+    flags = [f"{name} {value}" for name, value in content.get("jax_flags", {}).items()]
     try:
-        rows = loggers.read_rows(path / run_folder.METRICS_FILE)
+        rows = results.read_metrics(path)
         columns = [name for name in (rows[0] if rows else ()) if name != loggers.DIGEST]
         return {
             "folder": path,
             "settings": {
                 **fingerprint.settings(spec),
                 "engine": content["physics"],
-                "source": ", ".join(dict.fromkeys(content["sources"].values())),
+                "source": ", ".join([*dict.fromkeys(content["sources"].values()), *flags]),
             },
             "seed": spec.seed,
             "status": result["status"],

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher import stats
-from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
@@ -52,10 +52,10 @@ def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
     content, spec = run_folder.read_run(folder)
     result: dict[str, Any] = {}
     if results.has_result(folder):
-        if (problem := results.result_problem(folder)) is not None:
+        if (problem := results.result_problem(folder, with_policy=False)) is not None:
             raise FolderError(problem)
         result = results.read_result(folder)
-    rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
+    rows = results.read_metrics(folder)
     status = result.get("status", NOT_ENDED)
     if not rows and not allow_empty:
         told = f"it failed in its first epoch: {result['reason']}" if status == FAILED else "no epoch of the run has ended"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher.policy import bundled, load
-from mjx_dher.runs.folder import loggers, results, run_folder
+from mjx_dher.runs.folder import results, run_folder
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
 from mjx_dher.system.files import FolderError
 from mjx_dher.viewer import critic
@@ -103,7 +103,7 @@ class Cast:
                     f"{text}, trained: success {measured['success_rate']:.3f} in {measured['episodes']:,} episodes after"
                     f" {result['env_steps']:,} steps"
                 )
-            row: Mapping[str, Any] = loggers.read_rows(folder / run_folder.METRICS_FILE)[-1]
+            row: Mapping[str, Any] = results.read_metrics(folder)[-1]
             return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
         except (FolderError, KeyError, IndexError, OSError, ValueError):  # what it plays is whole, and that is what counts
             return text

@@ -19,11 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher.runs.folder.fingerprint import sha256_of
-from mjx_dher.runs.folder.run_folder import CHECKPOINTS, MANIFEST, checkpoints, checkpoints_to_resume, epoch_of, read_versioned
+from mjx_dher.runs.folder.run_folder import (
+    CHECKPOINTS,
+    MANIFEST,
+    SCHEMA,
+    checkpoints,
+    checkpoints_to_resume,
+    epoch_of,
+    read_manifest,
+)
 from mjx_dher.system import files, private_api
 from mjx_dher.system.files import FolderError
 
-SCHEMA = 2
 _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
@@ -152,7 +159,7 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
 
 def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
     """The failed runs; raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
-    manifest = _read_manifest(path)
+    manifest = read_manifest(path)
     failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
     for lane, whole in enumerate(lines):
         if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
@@ -161,8 +168,10 @@ def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]
 
 
 def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    manifest = _read_manifest(path)
+    manifest, present = read_manifest(path), {file.relative_to(path).as_posix() for file in _files(path)}
     for name, digest in manifest["files"].items():
+        if name not in present:  # nor is a file of another folder read
+            raise CheckpointError(f"{path} is damaged: {name} is missing")
         try:
             digest_now = _digest(path / name)
         except OSError as error:
@@ -231,16 +240,6 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
     if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
         raise CheckpointError(f"{path} does not fit this run: it holds {extra[0]}, which is not needed")
     return fitted
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    try:
-        content = read_versioned(path / MANIFEST, SCHEMA)
-    except FileNotFoundError:
-        raise CheckpointError(f"{path} is damaged: it has no {MANIFEST}") from None
-    if content.pop("sha256", None) != sha256_of(content):
-        raise CheckpointError(f"{path} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
-    return content
 
 
 def _say(leaf: list[Any]) -> str:

@@ -6,7 +6,9 @@ import dataclasses
 import functools
 import hashlib
 import json
+import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,15 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.spec import RunSpec, custom_components, find_demonstrations
 
 MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
+# JAX's settings that change numbers by more than rounding, and JAX's defaults. Digests include those that differ.
+JAX_FLAGS: dict[str, Any] = {
+    "JAX_ENABLE_X64": 0,
+    "JAX_DEFAULT_MATMUL_PRECISION": "default",  # read on GPUs
+    "JAX_THREEFRY_PARTITIONABLE": 1,
+    "JAX_DEFAULT_PRNG_IMPL": "threefry2x32",
+    "JAX_RANDOM_SEED_OFFSET": 0,
+}
+_WORDS = {**dict.fromkeys(("y", "yes", "t", "true", "on"), 1), **dict.fromkeys(("n", "no", "f", "false", "off"), 0)}
 # Every version has written these settings, and a digest always includes them. It includes any other setting only if it
 # differs from its default, so that a new setting changes no digest and no trial's name.
 ALWAYS = frozenset(
@@ -87,15 +98,32 @@ def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
     return f"{path.name} {content.hexdigest()[:10]}"
 
 
-def identity(spec: RunSpec, physics: str, own_sources: Mapping[str, str]) -> dict[str, Any]:
-    """Everything that a run computes with, for JSON: settings, seed, the physics that runs, and custom source files."""
+def jax_flags() -> dict[str, Any]:
+    """Those of `JAX_FLAGS` that differ from JAX's defaults: as JAX has them or, before it is imported, will read them."""
+    flags: dict[str, Any] = {}
+    for name, default in JAX_FLAGS.items():
+        config = getattr(sys.modules.get("jax"), "config", None)
+        value = os.environ.get(name) if config is None else getattr(config, name.lower(), default)
+        word = str(default if value is None else value)
+        if isinstance(default, int):
+            word = word.lower()
+            flags[name] = int(word) if word.isdecimal() else _WORDS.get(word, word)
+        else:
+            flags[name] = word
+    return {name: value for name, value in flags.items() if value != JAX_FLAGS[name]}
+
+
+def identity(
+    spec: RunSpec, physics: str, own_sources: Mapping[str, str], flags: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Everything that a run computes with, as JSON: settings, seed, physics, custom source files and JAX's flags."""
     defaults = settings(RunSpec())
     kept = {name: x for name, x in settings(spec).items() if name in ALWAYS or x != defaults[name]}
     kept.pop("demonstrations", None)  # the file's digest is among the sources
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
-    return {**content, "sources": dict(own_sources)}
+    return {**content, "sources": dict(own_sources), **(flags or {})}
 
 
 def digest(content: Mapping[str, Any]) -> str:
@@ -104,14 +132,14 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 def trial_name(spec: RunSpec) -> str:
-    """Name of a trial's folder: readable settings, and a digest of all settings and of custom code."""
+    """Name of a trial's folder: readable settings, and a digest of all settings, custom code and JAX's flags."""
     values, defaults = settings(spec), settings(RunSpec())
     kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]}
     kept.pop("demonstrations", None)
     numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests
-    own_sources = sources(spec)
-    hashed = sha256_of([1, kept, numbers, spec.seed, *([own_sources] if own_sources else [])])
+    beside = [own for own in (sources(spec), jax_flags()) if own]
+    hashed = sha256_of([1, kept, numbers, spec.seed, *beside])
     return f"{in_a_path(spec.env)}-{in_a_path(spec.sampler)}-s{spec.seed}-{hashed[:10]}"
 
 
@@ -122,7 +150,7 @@ def in_a_path(name: str) -> str:
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
     """Differences between two identities, a sentence for each name: "gamma was 0.98 and is 0.1"."""
-    defaults = {**settings(RunSpec()), "sources": {}}
+    defaults = {**settings(RunSpec()), "sources": {}, **JAX_FLAGS}
 
     def value(content: Mapping[str, Any], name: str) -> Any:
         return content.get(name, defaults.get(name))

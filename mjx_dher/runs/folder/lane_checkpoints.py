@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.parallel import processes
-from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, results, run_folder
 from mjx_dher.runs.folder.checkpoint import Restored
 from mjx_dher.runs.program.loop import Progress, Start
 from mjx_dher.system import files
@@ -97,7 +97,7 @@ class LaneCheckpoints:
         """Returns the newest whole checkpoint; raises FolderError in all processes if one of them cannot read it."""
         problem: FolderError | None = None
         try:
-            restored = checkpoint.restore(self.folder, template, [*map(loggers.whole_epochs, self.folders)])
+            restored = checkpoint.restore(self.folder, template, [len(results.read_metrics(folder)) for folder in self.folders])
         except FolderError as error:
             problem = error
         if processes.any_process(problem is not None):
@@ -111,8 +111,13 @@ class LaneCheckpoints:
 
     def _compare(self, restored: Restored) -> None:
         """Reports changes of settings since the checkpoint. Raises FolderError for those that must not change."""
+        if len(restored.runs) != len(self.runs):
+            raise FolderError(f"{restored.path} is of {len(restored.runs)} runs, not of {len(self.runs)}")
         changed: dict[str, str] = {}
-        for before, now in zip(restored.runs, self.runs):
+        for folder, before, now in zip(self.folders, restored.runs, self.runs):
+            content = run_folder.read_config(folder)
+            if other := run_folder.foreign(content, run_folder.to_spec(folder, content), before):
+                raise FolderError(f"{restored.path} is of a run with other settings: {other}")
             changed |= fingerprint.differences(before, now)
         if refused := [text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE]:
             raise FolderError(f"{restored.path} is of a run with other settings: {'; '.join(refused)}")

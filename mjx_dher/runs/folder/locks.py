@@ -77,9 +77,11 @@ class Claims:
         Raises:
           FolderError: it is not, and this is no sweep.
         """
+        if not self.sweep and (folder / run_folder.CONFIG_FILE).exists():
+            run_folder.check_same(folder, spec)
         if not results.has_result(folder):
             return True
-        problem = results.result_problem(folder)
+        problem = results.result_problem(folder, with_policy=self.sweep)
         if self.sweep and problem is not None:
             self.report(f"{problem}; it is trained again")
         if self.sweep:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mjx_dher.lookup import check_name, require_extra
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import contents, fingerprint, run_folder
 from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, memory
 from mjx_dher.system.files import FolderError
@@ -48,10 +48,9 @@ class CsvSink:
     def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
         self._writer: csv.DictWriter[str] | None = None
         self._digest = digest
-        kept = _whole_lines(path)[: 1 + epochs] if epochs else []
-        if epochs and len(kept) != 1 + epochs:
-            whole = max(0, len(kept) - 1)
+        if epochs and (whole := len(read_rows(path))) < epochs:
             raise FolderError(f"{path} is damaged: {epochs} epochs had ended, and it has whole lines of {whole}")
+        kept = _whole_lines(path)[: 1 + epochs] if epochs else []
         _write(path, kept)
         self._file = path.open("a", newline="", encoding="utf-8")
         if kept:
@@ -96,30 +95,43 @@ class JsonlSink:
         self._file.close()
 
 
-def whole_epochs(folder: Path) -> int:
-    """Number of epochs, from the first, for which metrics.csv in `folder` has whole lines."""
-    return max(0, len(_whole_lines(folder / METRICS_FILE)) - 1)
+def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str, Any]]:
+    """Reads the lines of a metrics.csv as numbers, up to the first that is truncated; the digest stays text.
 
+    Args:
+      path: of the file.
+      digests: those that the run has had, the first one first. None: unknown.
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Reads the whole lines of a metrics.csv as numbers; the digest stays text."""
+    Raises:
+      FolderError: a line is missing, has an invalid value, or is of another run.
+    """
     head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
-    return [{name: x if name == DIGEST else _to_number(x) for name, x in zip(head, line)} for line in lines]
+    rows: list[dict[str, Any]] = []
+    left = list(digests or ())
+    for number, line in enumerate(lines, 1):
+        with run_folder.checked(path, f"has an invalid line of epoch {number}"):
+            row: dict[str, Any] = {name: x if name == DIGEST else _to_number(name, x) for name, x in zip(head, line)}
+            contents.check_row(row)
+            if row["epoch"] != number or (rows and row["env_steps"] <= rows[-1]["env_steps"]):
+                raise ValueError(f"epoch {row['epoch']} with env_steps {row['env_steps']} does not follow")
+            while left and left[0] != row.get(DIGEST):
+                del left[0]
+            if digests is not None and not left:
+                raise ValueError(f"its digest {row.get(DIGEST)} is of another run; this one has {', '.join(digests)}")
+        rows.append(row)
+    return rows
 
 
 def _whole_lines(path: Path) -> list[str]:
-    """Head of metrics.csv, and its lines up to the first that is truncated or out of order."""
+    """Head of metrics.csv, and its lines up to the first that is truncated."""
     if not path.exists():
         return []
-    head, *lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) or [""]
-    columns = head.count(",")
+    with run_folder.checked(path):
+        head, *lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) or [""]
     if not head.startswith(",".join(FIRST_COLUMNS) + ","):
         return []
-    whole = itertools.takewhile(
-        lambda i: lines[i].startswith(f"{i + 1},") and lines[i].endswith("\n") and lines[i].count(",") == columns,
-        range(len(lines)),
-    )
-    return [head, *(lines[i] for i in whole)]
+    columns = head.count(",")
+    return [head, *itertools.takewhile(lambda line: line.endswith("\n") and line.count(",") == columns, lines)]
 
 
 def _write(path: Path, lines: Sequence[str]) -> None:
@@ -128,8 +140,11 @@ def _write(path: Path, lines: Sequence[str]) -> None:
         files.flush(partial)
 
 
-def _to_number(text: str) -> int | float:
-    return int(text) if text.isdigit() else float(text)
+def _to_number(name: str, text: str) -> int | float:
+    try:
+        return int(text) if text.isdecimal() else float(text)
+    except ValueError:
+        raise ValueError(f"{name} must be a number; got {text[:40]!r}") from None
 
 
 def _to_json(row: dict[str, Any]) -> str:
@@ -196,13 +211,13 @@ class WandbSink:
 EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # extras, and their packages
 
 
-def check_logs(logs: Sequence[str]) -> None:
-    """Raises ValueError unless all names are in LOGS and their packages are installed."""
+def check_logs(logs: Sequence[str], installed: bool = True) -> None:
+    """Raises ValueError unless all names are in LOGS and their packages, if they must be, are installed."""
     if not isinstance(logs, (list, tuple)):
         raise ValueError(f"log must be names among {', '.join(LOGS)}; got {logs!r}")
     for log in logs:
         check_name("log", log, LOGS)
-        if log in EXTRAS:
+        if installed and log in EXTRAS:
             require_extra(f"log {log}", EXTRAS[log], log)
 
 

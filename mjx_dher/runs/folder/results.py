@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
-from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.folder import contents, loggers, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -23,11 +24,35 @@ def read_result(folder: Path) -> dict[str, Any]:
       FolderError: it is missing or damaged.
     """
     path = folder / run_folder.RESULT_FILE
-    try:
-        content = files.read_json(path)
-        return {"reason": "", **content, "status": str(content["status"]), "epochs": int(content["epochs"])}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FolderError(f"{path} is damaged ({type(error).__name__}: {error})") from error
+    with run_folder.checked(path):
+        content = {"reason": "", **files.read_json(path)}
+        contents.check_result(content)
+    return content
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Reads the lines of metrics.csv, all of which must be of the run in `folder`.
+
+    Raises:
+      FolderError: no run folder, a line that is missing or has an invalid value, or one of another run.
+    """
+    path, content = folder / run_folder.METRICS_FILE, run_folder.read_config(folder)
+    rows = loggers.read_rows(path, run_folder.digests(content))
+    strange = {row.get(loggers.DIGEST) for row in rows} - {content["digest"]}
+    if strange and "earlier" not in content:
+        warnings.warn(
+            f"{path} has lines of digest {', '.join(map(str, strange))}, {run_folder.CONFIG_FILE} has {content['digest']}; the"
+            " version that wrote it kept no earlier digests, so the lines may be of another run",
+            stacklevel=2,
+        )
+    return rows
+
+
+def earlier_digests(folder: Path, digest: str) -> list[str]:
+    """Digests that a run has had before it resumes with `digest`."""
+    content, lines = run_folder.read_config(folder), [row[loggers.DIGEST] for row in read_metrics(folder)]
+    known = run_folder.digests(content) or [*dict.fromkeys(lines), content["digest"]]
+    return [one for one, after in zip(known, [*known[1:], digest]) if one != after]
 
 
 def can_go_on(folder: Path, total_steps: int) -> bool:
@@ -37,25 +62,30 @@ def can_go_on(folder: Path, total_steps: int) -> bool:
       FolderError: its result is damaged.
     """
     result = read_result(folder)
-    due = result["status"] == FAILED or result.get("env_steps", total_steps) < total_steps
+    due = result["status"] == FAILED or result["env_steps"] < total_steps
     return due and bool(run_folder.checkpoints(folder))
 
 
-def result_problem(folder: Path) -> str | None:
-    """Reason why a run with a result is not whole: metrics are missing, or files have other settings. None if it is whole."""
+def result_problem(folder: Path, with_policy: bool = True) -> str | None:
+    """Reason why a run with a result is not whole: its files are damaged, or are of other runs. None if it is whole.
+
+    A run can go on without its policy, and so can be looked at without it.
+    """
     try:
         result = read_result(folder)
-        content, _ = run_folder.read_run(folder)
+        content, spec = run_folder.read_run(folder)
+        rows = read_metrics(folder)
+        if with_policy and result["status"] == FINISHED:
+            if not (folder / run_folder.POLICY_FILE).exists():
+                return f"{folder} has no {run_folder.POLICY_FILE}"
+            if other := run_folder.foreign(content, spec, run_folder.read_policy_settings(folder)):
+                return f"{folder / run_folder.POLICY_FILE} is of a run with other settings: {other}"
     except FolderError as error:
         return str(error)
     epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
-    whole = loggers.whole_epochs(folder)
-    if whole != epochs:
-        return f"{folder / run_folder.METRICS_FILE} has whole lines of {whole} of {epochs} epochs"
-    if result["status"] == FINISHED and not (folder / run_folder.POLICY_FILE).exists():
-        return f"{folder} has no {run_folder.POLICY_FILE}"
+    if len(rows) != epochs:
+        return f"{folder / run_folder.METRICS_FILE} has whole lines of {len(rows)} of {epochs} epochs"
     digest = content["digest"]
-    rows = loggers.read_rows(folder / run_folder.METRICS_FILE)
     last = {run_folder.RESULT_FILE: result, run_folder.METRICS_FILE: rows[-1] if rows else {loggers.DIGEST: digest}}
     for name, values in last.items():
         if (other := values.get(loggers.DIGEST)) != digest:

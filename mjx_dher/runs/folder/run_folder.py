@@ -8,7 +8,7 @@ import datetime
 import json
 import math
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,10 @@ import numpy as np
 from mjx_dher import __version__, lookup, trust
 from mjx_dher import spec as spec_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.runs.folder import fingerprint
+from mjx_dher.runs.folder import contents, fingerprint
 from mjx_dher.runs.folder.fingerprint import in_a_path
 from mjx_dher.spec import RunSpec
-from mjx_dher.system import files
+from mjx_dher.system import files, npz
 from mjx_dher.system.files import FolderError
 
 SCHEMA = 2
@@ -31,10 +31,8 @@ RESULT_FILE = "result.json"
 CHECKPOINTS = "checkpoints"
 MANIFEST = "manifest.json"  # of a checkpoint
 INFINITE = "inf"  # in place of an infinite number, which JSON lacks
-
-# Statuses in result.json.
-FINISHED = "finished"
-FAILED = "failed"
+POLICY_RATIO = 20.0  # of a policy's arrays to its file, which is written without compression
+FINISHED, FAILED = contents.FINISHED, contents.FAILED
 
 
 @contextlib.contextmanager
@@ -73,7 +71,9 @@ def engine_name(env: Any) -> str:
     return next((value.name for value in values if hasattr(value, "advance") and hasattr(value, "name")), "none")
 
 
-def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) -> None:
+def write_config(
+    path: Path, spec: RunSpec, engine: str, extra: Mapping[str, Any], earlier: Sequence[str] = (), resumes: bool = False
+) -> None:
     """Makes the folder and writes config.json.
 
     Args:
@@ -81,14 +81,20 @@ def write_config(path: Path, spec: RunSpec, engine: str, extra: dict[str, Any]) 
       spec: the run's description.
       engine: the physics that runs (`spec.engine` may be auto).
       extra: further entries, for the reader and for `resume`.
+      earlier: digests that the run had before it resumed with other settings, the first one first.
+      resumes: whether to leave a file that differs in nothing but versions as it is.
     """
     hparams = {name: INFINITE if value == math.inf else float(value) for name, value in spec.hparams._asdict().items()}
     description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     description |= {"config": dataclasses.asdict(spec.config), "hparams": hparams}
-    own = fingerprint.sources(spec)
-    run = {"physics": engine, "sources": own, "digest": fingerprint.digest(fingerprint.identity(spec, engine, own))}
+    own, flags = fingerprint.sources(spec), fingerprint.jax_flags()
+    now = fingerprint.digest(fingerprint.identity(spec, engine, own, flags))
+    run = {"physics": engine, "sources": own, "digest": now, "earlier": list(earlier)}
+    run |= {"jax_flags": flags} if flags else {}
+    content = json.loads(json.dumps({"schema": SCHEMA, **description, **run, **extra}))
     files.make_folder(path)
-    files.write_json(path / CONFIG_FILE, {"schema": SCHEMA, **description, **run, **extra, "versions": _versions()})
+    if not resumes or {**read_config(path), "versions": None} != {**content, "versions": None}:
+        files.write_json(path / CONFIG_FILE, {**content, "versions": _versions()})
     record_names(spec)
 
 
@@ -162,24 +168,23 @@ def read_config_file(file: Path) -> dict[str, Any]:
       FileNotFoundError: there is no such file.
       FolderError: it does not describe a run, or is of another schema.
     """
+    content = read_versioned(file, SCHEMA)
+    with checked(file, "does not describe a run"):
+        contents.check_config(content)
+    return content
+
+
+@contextlib.contextmanager
+def checked(file: Path, problem: str = "is damaged") -> Iterator[None]:
+    """Turns the errors of a block that reads the content of `file` into a FolderError."""
     try:
-        content = read_versioned(file, SCHEMA)
-        _check_kinds(content)
-        return content
-    except (KeyError, AttributeError, TypeError) as error:
-        raise FolderError(f"{file} does not describe a run ({error})") from error
-
-
-def _check_kinds(content: dict[str, Any]) -> None:
-    """Raises TypeError if a value in config.json has another type than the readers need."""
-    kinds = {"config": dict, "hparams": dict, "physics": str, "env_kwargs": list, "sources": dict, "digest": str}
-    values = {name: (content[name], kind) for name, kind in kinds.items()}
-    if isinstance(content["config"], dict):
-        values["config.hidden_sizes"] = content["config"]["hidden_sizes"], list
-    if isinstance(content["sources"], dict):
-        values |= {f"sources.{name}": (text, str) for name, text in content["sources"].items()}
-    if wrong := [f"{name} must be a {kind.__name__}" for name, (value, kind) in values.items() if not isinstance(value, kind)]:
-        raise TypeError("; ".join(wrong))
+        yield
+    except FolderError:
+        raise
+    except KeyError as error:
+        raise FolderError(f"{file} {problem} ({error} is missing)") from error
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise FolderError(f"{file} {problem} ({error})") from error
 
 
 def read_spec(path: Path, trusted: bool = False) -> RunSpec:
@@ -199,49 +204,107 @@ def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec
     spec = to_spec(path, content, trusted)
     if edits := edited(path, content, spec):
         raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
+    check_written(path, content, spec)
     return content, spec
 
 
 def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
     """The `identity` of the run that config.json describes."""
-    return fingerprint.identity(spec, content["physics"], content["sources"])
+    return fingerprint.identity(spec, content["physics"], content["sources"], content.get("jax_flags"))
+
+
+def digests(content: Mapping[str, Any]) -> list[str] | None:
+    """Digests that a run has had, the first one first; None if config.json is of a version that did not keep them."""
+    return [*content["earlier"], content["digest"]] if "earlier" in content else None
+
+
+def foreign(content: dict[str, Any], spec: RunSpec, written: Mapping[str, Any]) -> str | None:
+    """How a file's settings differ from any that the run has had; None if the file is the run's."""
+    changed, known = fingerprint.differences(written, identity_of(content, spec)), digests(content)
+    if known is None:  # then a run that was resumed cannot be told from another one that differs in these
+        changed = {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
+    elif fingerprint.digest(written) in known:
+        return None
+    return "; ".join(changed.values()) or None
+
+
+def check_written(path: Path, content: dict[str, Any], spec: RunSpec) -> None:
+    """Raises FolderError if the newest checkpoint, or else the policy, is of a run with other settings."""
+    file, written = written_identity(path)
+    if written is not None and (other := foreign(content, spec, written)):
+        raise FolderError(f"{file} is of a run with other settings: {other}")
 
 
 def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
-    """Settings in config.json that differ from those that the run was trained with: a sentence for each, by name.
-
-    The settings of training are in the newest checkpoint, or else in the policy.
-    """
-    now, written = identity_of(content, spec), written_identity(path)
+    """Settings in config.json that differ from those that the run was trained with: a sentence for each, by name."""
+    now = identity_of(content, spec)
+    if content["digest"] == fingerprint.digest(now):
+        return {}
+    _, written = written_identity(path)
     changed = {} if written is None else fingerprint.differences(written, now)
-    if content["digest"] == fingerprint.digest(now):  # by `resume`, if at all
-        return {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
     return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {fingerprint.digest(now)}"}
 
 
 def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
-    """Sentences about custom source files that have changed since the run was trained."""
-    before = identity_of(content, spec)
-    return list(
-        fingerprint.differences(before, {**before, "sources": {**content["sources"], **fingerprint.sources(spec)}}).values()
-    )
+    """Sentences about custom source files, and flags of JAX, that have changed since the run was trained."""
+    own = {**content["sources"], **fingerprint.sources(spec)}
+    now = fingerprint.identity(spec, content["physics"], own, fingerprint.jax_flags())
+    return list(fingerprint.differences(identity_of(content, spec), now).values())
 
 
-def written_identity(path: Path) -> dict[str, Any] | None:
-    """The `identity` in the run's newest checkpoint, or else in its policy; None without either."""
+def check_same(path: Path, spec: RunSpec) -> None:
+    """Raises FolderError, which names the differences, if the folder holds a run with other settings than may change."""
+    content = read_config(path)
+    before = identity_of(content, to_spec(path, content))
+    now = fingerprint.identity(spec, content["physics"], content["sources"], fingerprint.jax_flags())
+    changed = fingerprint.differences(before, now)
+    if refused := [text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE]:
+        raise FolderError(f"{path} holds a run with other settings: {'; '.join(refused)}")
+
+
+def read_manifest(checkpoint: Path) -> dict[str, Any]:
+    """Reads the manifest of a checkpoint. Raises FolderError if it is missing or damaged."""
+    file = checkpoint / MANIFEST
+    if not file.exists():
+        raise FolderError(f"{checkpoint} is damaged: it has no {MANIFEST}")
+    content = read_versioned(file, SCHEMA)
+    if content.pop("sha256", None) != fingerprint.sha256_of(content):
+        raise FolderError(f"{checkpoint} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
+    with checked(file):
+        contents.check_manifest(content)
+    return content
+
+
+def save_policy(path: Path, policy: Any, run: Mapping[str, Any]) -> None:
+    """Writes policy.npz of the run in `path`, with the run's `identity`."""
+    policy.save(path / POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
+
+
+def read_policy_settings(path: Path) -> dict[str, Any]:
+    """Reads the `identity` in policy.npz of the run in `path`. Raises FolderError if it has none, or is damaged."""
+    file = path / POLICY_FILE
+    with checked(file, "is damaged or not a policy of this program"):
+        return policy_settings(npz.read(file, ("settings",), POLICY_RATIO))
+
+
+def policy_settings(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """The `identity` among the arrays of a policy.npz. Raises ValueError, KeyError or TypeError if there is none."""
+    if "settings" not in arrays:
+        raise ValueError("it has no settings, which the policies of runs have")
+    settings = json.loads(arrays["settings"].tobytes())
+    contents.check_identity(settings)
+    return dict(settings)
+
+
+def written_identity(path: Path) -> tuple[Path, dict[str, Any] | None]:
+    """The run's newest checkpoint, or else its policy, and the `identity` in it; None without either."""
     for checkpoint in checkpoints(path):
-        try:
-            (content,) = read_versioned(checkpoint / MANIFEST, SCHEMA)["runs"]
-            return dict(content)
-        except (OSError, ValueError, KeyError, TypeError):  # damaged, or of several runs
-            continue
-    try:
-        if not (path / POLICY_FILE).is_file():
-            return None
-        with np.load(path / POLICY_FILE, allow_pickle=False) as arrays:
-            return dict(json.loads(arrays["settings"].tobytes()))
-    except Exception:  # NumPy, zipfile and zlib raise many errors for a damaged file; `load_policy` reports them
-        return None
+        with contextlib.suppress(FolderError, ValueError):  # damaged, or of several runs
+            (content,) = read_manifest(checkpoint)["runs"]
+            return checkpoint, dict(content)
+    with contextlib.suppress(FolderError):  # `load_policy` reports a damaged one
+        return path / POLICY_FILE, read_policy_settings(path)
+    return path, None
 
 
 def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSpec:
@@ -253,7 +316,7 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
       FolderError: an entry is missing or invalid.
     """
     file = path / CONFIG_FILE if path.is_dir() else path
-    try:
+    with checked(file, "does not describe a run"):
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
         if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default is not what was meant
@@ -265,8 +328,6 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
             env_kwargs=tuple(content["env_kwargs"]),
         )
         spec_lib.validate_values(spec)
-    except (KeyError, TypeError, ValueError) as error:
-        raise FolderError(f"{file} does not describe a run ({error})") from error
     if trusted:
         return spec
     names = {**spec_lib.custom_components(spec), "demonstrations": spec.demonstrations}

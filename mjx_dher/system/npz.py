@@ -1,0 +1,80 @@
+"""Reads .npz files, which may come from anyone: headers first, arrays only if they are as large as the headers say."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+class Header(NamedTuple):
+    """Shape and type of an array that has not been read."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+
+def read(
+    path: Path,
+    names: Sequence[str] | None = None,
+    ratio: float = math.inf,
+    check: Callable[[Mapping[str, Header]], None] = lambda headers: None,
+) -> dict[str, np.ndarray]:
+    """Reads the arrays of an .npz; nothing is unpickled.
+
+    Args:
+      path: of the file.
+      names: arrays to read. None: all.
+      ratio: most bytes of the arrays for each byte of the file; weights hardly compress, gigabytes of zeros do.
+      check: called with all headers before any array is read; raises ValueError for an array that is not wanted.
+
+    Raises:
+      OSError: it cannot be read.
+      ValueError: it is damaged, or not an .npz.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("it is not a file")  # a reader of a FIFO would block
+    try:
+        with zipfile.ZipFile(path) as archive:
+            headers = {info.filename.removesuffix(".npy"): _header(archive, info) for info in archive.infolist()}
+            if len(headers) != len(archive.infolist()):
+                raise ValueError("an array is there twice")
+            if sum(info.file_size for info in archive.infolist()) > ratio * path.stat().st_size:
+                raise ValueError(f"its {path.stat().st_size} bytes would become more than {ratio:g} times as many")
+            check(headers)
+            arrays = {}
+            for name in headers if names is None else [name for name in names if name in headers]:
+                with archive.open(f"{name}.npy") as member:
+                    arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+                    if member.read(1):  # also compares the checksum
+                        raise ValueError(f"{name} is longer than its header says")
+            return arrays
+    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, MemoryError) as error:
+        raise ValueError(str(error)) from error
+    except (NotImplementedError, OverflowError, RuntimeError, SyntaxError) as error:  # RuntimeError: it asks for a password
+        raise ValueError(str(error)) from error
+
+
+def _header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
+    """Reads the header of an array. Raises ValueError unless it is one of plain numbers that fills its part of the file."""
+    if not info.filename.endswith(".npy") or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{info.filename} is not an array")
+    with archive.open(info) as member:
+        shape, _, dtype = _HEADERS[np.lib.format.read_magic(member)](member)
+        size = member.tell() + math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or dtype.kind not in "biufcU":
+        raise ValueError(f"{info.filename} is not of numbers: {dtype}")
+    if size != info.file_size or min(shape, default=0) < 0:
+        raise ValueError(f"{info.filename} has {info.file_size} bytes, and its shape {list(shape)} takes {size}")
+    return Header(shape, dtype)
