@@ -25,7 +25,7 @@ def by_mean(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """d / mean d; 1 if every candidate lies on the goal. `linear` at temperature 1 then is 2 - d / mean d."""
     del scale
     distance = jnp.where(candidates, distance, 0.0)
-    mean = jnp.sum(distance) / jnp.sum(candidates, dtype=distance.dtype)
+    mean = _sum(distance) / jnp.sum(candidates, dtype=distance.dtype)
     return jnp.where(candidates & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
 
 
@@ -37,7 +37,7 @@ def mirrored(distance: Array, candidates: Array, scale: Array | float) -> Array:
 def by_sum(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """1 + d / sum d: `linear` at temperature 1 is 1 - d / sum d."""
     del scale
-    return _one_and(distance, jnp.sum(jnp.where(candidates, distance, 0.0)), candidates)
+    return _one_and(distance, _sum(jnp.where(candidates, distance, 0.0)), candidates)
 
 
 def by_max(distance: Array, candidates: Array, scale: Array | float) -> Array:
@@ -56,6 +56,12 @@ def by_range(distance: Array, candidates: Array, scale: Array | float) -> Array:
 def by_scale(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """1 + d / scale, a length in metres: `softmax` at temperature 1 is exp(-d / scale)."""
     return _one_and(distance, scale, candidates)
+
+
+def _sum(distance: Array) -> Array:
+    """Sum [] of distances; NaN if it overflows, so that no goal is offered, which training counts."""
+    total = jnp.sum(distance)
+    return jnp.where(total < jnp.inf, total, jnp.nan)
 
 
 def _largest(distance: Array, candidates: Array) -> Array:

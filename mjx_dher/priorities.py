@@ -144,6 +144,7 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
         weight = weigh(sample, batch, context)
         weight = check.array("priority: weights [B] of transitions", weight, batch.reward.shape, jnp.number)
         weight = replay.as_priority(weight).reshape(number, CANDIDATES)
+        weight = weight * replay.sum_factor(weight)
         total = jnp.cumsum(jnp.where(jnp.sum(weight, axis=1, keepdims=True) > 0, weight, 1.0), axis=1)
         # 1 - u lies in (0, 1], so a weight of 0 is never the first to reach it.
         threshold = (1.0 - jax.random.uniform(key, (number, 1))) * total[:, -1:]

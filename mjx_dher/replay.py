@@ -18,6 +18,8 @@ from flax import struct
 from mjx_dher.check import array, describe
 from mjx_dher.types import Array, Episode, PRNGKey, PyTree, check_size
 
+HUGE = 2.0**64  # a weight above which sums could overflow
+
 
 @struct.dataclass
 class ReplayState:
@@ -188,17 +190,27 @@ def can_sample(state: ReplayState) -> Array:
     return state.size > 0
 
 
-def mean_priority(state: ReplayState) -> Array:
-    """Mean priority [] of the rows that hold an episode; 0 for an empty ring."""
-    return jnp.sum(state.priority) / jnp.maximum(state.size, 1).astype(jnp.float32)
+def sum_factor(weights: Array) -> Array:
+    """Power of two [] for weights of 0 or more: times it, they can be summed without overflow. It is 1 unless one is huge.
+
+    A power of two keeps every digit, so proportions and, divided by it again, means stay what they are.
+    """
+    return jnp.where(jnp.max(weights) > HUGE, 1.0 / HUGE, 1.0)
+
+
+def mean_weight(weights: Array, number: Array | int) -> Array:
+    """Mean [] of the `number` weights among `weights` [E], of which others are 0; 0 if there is none."""
+    factor = sum_factor(weights)
+    return jnp.sum(weights * factor) / jnp.maximum(number, 1).astype(jnp.float32) / factor
 
 
 def cumulative(state: ReplayState) -> Cumulative:
     """Cumulative weights of the ring's rows, for `draw_rows`."""
+    priority = state.priority * sum_factor(state.priority)
     if not state.ends:
-        return Cumulative(_cumulate(state.priority), None)
+        return Cumulative(_cumulate(priority), None)
     length = state.episodes.length.astype(jnp.float32)
-    return Cumulative(_cumulate(state.priority * length), _cumulate(length))
+    return Cumulative(_cumulate(priority * length), _cumulate(length))
 
 
 def _cumulate(weight: Array) -> Array:

@@ -239,7 +239,9 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": jnp.mean(weights) if loop.priority.renew is None else replay.mean_priority(ring),
+        "priority_mean": replay.mean_weight(
+            *((ring.priority, ring.size) if loop.priority.renew else (weights, config.num_envs))
+        ),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,

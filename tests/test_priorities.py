@@ -1,5 +1,7 @@
 """Priorities of episodes, by hand, and what of an own one is refused."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,3 +115,41 @@ def test_batches_are_drawn_in_proportion_to_the_weights():
     found = np.bincount(np.asarray(batch.action[..., 0], int).ravel(), minlength=3)
     expected = 9000 * (0.25 / 3 + 0.75 * np.array([1 / 7, 6 / 7, 0]))
     assert np.sum((found - expected) ** 2 / expected) < 13.8  # 99.9 % point at 2 degrees of freedom
+
+
+# Weights that are finite one by one, and whose sum is not.
+HUGE = np.array([1e38, 3e38, 2e38, 0.0, 3e38], np.float32)
+SHARES = HUGE / HUGE.astype(np.float64).sum()
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_episodes_are_drawn_by_weights_whose_sum_overflows(ends):
+    rows = jax.tree.map(lambda x: jnp.stack([x[1]] * 5), EPISODES.filled())
+    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], rows), 5, ends), rows, HUGE)
+    drawn = replay.draw_rows(ring, jax.random.key(0), 20_000, 1.0, replay.cumulative(ring))
+    np.testing.assert_allclose(np.bincount(drawn, minlength=5) / 20_000, SHARES, atol=0.02)
+    np.testing.assert_allclose(replay.mean_weight(ring.priority, ring.size), 1.8e38, rtol=1e-6)
+
+
+def test_transitions_are_chosen_by_weights_whose_sum_overflows():
+    candidates = 4 * 5_000
+    choose = priorities.by_weight(lambda sample, batch, context: jnp.tile(HUGE[:4], 5_000))
+    batch = SimpleNamespace(reward=jnp.zeros(candidates))
+    kept = choose(jax.random.key(0), None, batch, 5_000, CONTEXT) % 4
+    np.testing.assert_allclose(np.bincount(kept, minlength=4) / 5_000, np.array([1, 3, 2, 0]) / 6, atol=0.03)
+
+
+def test_weights_whose_sum_is_fine_are_drawn_as_ever():
+    weights = np.random.default_rng(0).lognormal(0, 8, 1_000).astype(np.float32)
+    for scale in (1.0, 2.0**-20, 2.0**40, 2.0**70):  # a power of two changes no digit
+        np.testing.assert_array_equal(
+            replay._cumulate(weights * scale * replay.sum_factor(weights * scale)), replay._cumulate(weights)
+        )
+
+
+@pytest.mark.parametrize("normalization", ["mean", "sum", "far"])
+def test_distances_whose_sum_overflows_offer_no_goal(normalization):
+    distances = jnp.array([0.0, 3e38, 2e38, 3e38])
+    sampler = samplers.make("weighted", metric=lambda achieved, desired: distances, normalization=normalization)
+    log_weights = samplers.weigh(sampler, jnp.zeros((4, 2)), jnp.zeros(2), jnp.int32(0), HP)
+    assert samplers.draw(jax.random.key(0), log_weights[None]) == 4  # no index: the transition keeps its goal, and is counted
