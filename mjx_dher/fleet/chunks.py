@@ -114,8 +114,7 @@ def make(
     folder = None if storage is None else storage / own
     if folder is not None:
         files.make_folder(folder)
-        with files.atomic_write(folder / NAMES_FILE) as partial:
-            partial.write_text(json.dumps(names), encoding="utf-8")
+        files.write(folder / NAMES_FILE, json.dumps(names).encode())
     return Chunk(own, specs, options, lanes, None if task.gpus else task.cpus, folder, code)
 
 

@@ -163,10 +163,7 @@ def unpack(folder: Path, parcel: bytes) -> None:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
             archive.extractall(folder, [name for name in content if name != run_folder.RESULT_FILE])
             files.flush_all(folder)
-            with files.atomic_write(folder / run_folder.RESULT_FILE) as partial:
-                partial.write_bytes(content[run_folder.RESULT_FILE])
-                files.flush(partial)
-            files.flush(folder)
+            files.write(folder / run_folder.RESULT_FILE, content[run_folder.RESULT_FILE])
     except OSError as error:
         raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); run the same command again") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError) as error:

@@ -262,9 +262,14 @@ def remove(path: Path) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes `content` as JSON, atomically, so that it survives a power cut; what is not finite becomes null."""
+    """Writes `content` as JSON, as `write` does; what is not finite becomes null."""
+    write(path, f"{json.dumps(_without_nan(content), indent=2, allow_nan=False)}\n".encode())
+
+
+def write(path: Path, content: bytes) -> None:
+    """Writes a file atomically, so that it survives a power cut."""
     with atomic_write(path) as partial:
-        partial.write_text(json.dumps(_without_nan(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        partial.write_bytes(content)
         flush(partial)
     flush(path.parent)
 

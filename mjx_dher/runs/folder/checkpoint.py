@@ -180,12 +180,11 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
             raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
     if manifest["epoch"] != epoch_of(path):
         raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
-    saved = {name: [name, shape, dtype] for name, shape, dtype in manifest["leaves"]}
-    arrays = dict(zip(saved, _read_arrays(path / _STATE, [dtype for _, _, dtype in saved.values()])))
-    for name, array in arrays.items():
-        if [name, list(array.shape), str(array.dtype)] != saved[name]:
-            read = _say([name, list(array.shape), str(array.dtype)])
-            raise CheckpointError(f"{path} was read as {read}, and was written as {_say(saved[name])}")
+    read = _read_arrays(path / _STATE, [dtype for _, _, dtype in manifest["leaves"]])
+    arrays = {name: array for (name, _, _), array in zip(manifest["leaves"], read)}
+    for name, shape, dtype in manifest["leaves"]:
+        if (held := _say(name, arrays[name])) != (saved := f"{name} {dtype}{shape}"):
+            raise CheckpointError(f"{path} was read as {held}, and was written as {saved}")
     shapes = _to_shapes(template)
     arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
     _check_devices(path, arrays, shapes)
@@ -224,17 +223,16 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
     """
     fitted = []
     for name, leaf in shapes.items():
-        needed = [name, list(leaf.shape), str(leaf.dtype)]
+        needed = _say(name, leaf)
         if name not in arrays and name.startswith(_HPARAMS):
             fitted.append(np.zeros(leaf.shape, leaf.dtype))
         elif name not in arrays and name in _EARLIER:  # written before episodes could end early: all have T steps
             steps = shapes[".replay.episodes.action"].shape[-2]
             fitted.append(np.full(leaf.shape, steps if name.endswith("length") else 0, leaf.dtype))
         elif name not in arrays:
-            raise CheckpointError(f"{path} does not fit this run: it has no {_say(needed)}")
-        elif [name, list(arrays[name].shape), str(arrays[name].dtype)] != needed:
-            held = _say([name, list(arrays[name].shape), str(arrays[name].dtype)])
-            raise CheckpointError(f"{path} does not fit this run: it holds {held} where {_say(needed)} is needed")
+            raise CheckpointError(f"{path} does not fit this run: it has no {needed}")
+        elif (held := _say(name, arrays[name])) != needed:
+            raise CheckpointError(f"{path} does not fit this run: it holds {held} where {needed} is needed")
         else:
             fitted.append(arrays[name])
     if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
@@ -242,9 +240,8 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
     return fitted
 
 
-def _say(leaf: list[Any]) -> str:
-    name, shape, dtype = leaf
-    return f"{name} {dtype}{shape}"
+def _say(name: str, array: Any) -> str:
+    return f"{name} {array.dtype}{list(array.shape)}"
 
 
 def _files(folder: Path) -> list[Path]:

@@ -51,7 +51,7 @@ class CsvSink:
         if epochs and (whole := len(read_rows(path))) < epochs:
             raise FolderError(f"{path} is damaged: {epochs} epochs had ended, and it has whole lines of {whole}")
         kept = _whole_lines(path)[: 1 + epochs] if epochs else []
-        _write(path, kept)
+        files.write(path, "".join(kept).encode())
         self._file = path.open("a", newline="", encoding="utf-8")
         if kept:
             self._writer = self._make_writer(kept[0].strip().split(","))
@@ -84,7 +84,7 @@ class JsonlSink:
         lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) if epochs and path.exists() else []
         whole = list(itertools.takewhile(lambda line: line.endswith("}\n"), lines))[:epochs]
         missing = read_rows(path.with_name(METRICS_FILE))[len(whole) : epochs] if epochs else []
-        _write(path, [*whole, *map(_to_json, missing)])
+        files.write(path, "".join([*whole, *map(_to_json, missing)]).encode())
         self._file = path.open("a", encoding="utf-8")
 
     def write(self, row: dict[str, Any]) -> None:
@@ -132,12 +132,6 @@ def _whole_lines(path: Path) -> list[str]:
         return []
     columns = head.count(",")
     return [head, *itertools.takewhile(lambda line: line.endswith("\n") and line.count(",") == columns, lines)]
-
-
-def _write(path: Path, lines: Sequence[str]) -> None:
-    with files.atomic_write(path) as partial:
-        partial.write_bytes("".join(lines).encode())
-        files.flush(partial)
 
 
 def _to_number(name: str, text: str) -> int | float:
