@@ -49,7 +49,8 @@ SHAPES = {
 }
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
-PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", *reliability_machines.PARTS)
+PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages")
+PARTS += (*reliability_machines.PARTS,)
 
 
 class Failure(Exception):
@@ -310,20 +311,25 @@ def machines(args, folder):
     return tried, outcome
 
 
+def messages(args, folder):
+    """Hostile messages to every port."""
+    import reliability_messages  # which needs the extras view and ray
+
+    ports, faults = reliability_messages.messages(folder, args.messages, args.seed)
+    expect_none(faults)
+    return f"{args.messages} hostile messages to each of {ports} ports", "nothing ended or blocked; a browser still served"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--stops", type=int, default=20)
-    parser.add_argument("--flips", type=int, default=200)
-    parser.add_argument("--pairs", type=int, default=100)
-    parser.add_argument("--power", type=int, default=50)
-    parser.add_argument("--workers", type=int, default=1)
+    numbers = {"kills": 200, "stops": 20, "flips": 200, "pairs": 100, "power": 50, "messages": 200, "workers": 1, "seed": 0}
+    for name, number in numbers.items():
+        parser.add_argument(f"--{name}", type=int, default=number)
     parser.add_argument("--env", default="reach")
-    parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
-    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls}
+    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls, "messages": messages}
     by_itself |= dict.fromkeys(reliability_machines.PARTS, machines)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
