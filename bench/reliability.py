@@ -37,16 +37,8 @@ from mjx_dher.runs.program import loop
 
 ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.
-SHAPES = {
-    "num_envs": 2,
-    "cycles_per_epoch": 1,
-    "updates_per_cycle": 2,
-    "target_period": 1,
-    "batch_size": 16,
-    "hidden_sizes": (8, 8),
-    "replay_size": 50_000,
-    "eval_episodes": 2,
-}
+SHAPES = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_period": 1, "batch_size": 16}
+SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
 PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages")
