@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
-from mjx_dher.envs.base import GoalEnv, State
-from mjx_dher.envs.engines import Controls, Physics, make_engine
-from mjx_dher.types import Array, EnvSpec, GoalObs, PRNGKey
-from mjx_dher.validation import check_count, check_number
+from mjx_dher.envs.base import State
+from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.task import MujocoTask, Position
+from mjx_dher.types import Array, EnvSpec, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
 # Beyond either speed the physics has blown up.
@@ -65,71 +65,46 @@ class FetchTask:
         return bounds
 
 
-class FetchEnv(GoalEnv):
+class FetchEnv(MujocoTask):
     """The Fetch arm and, except for reaching, an object; the goal is a position of the object (or of the gripper).
 
-    Args:
-      engine: "auto", "native", "jax" or "warp".
-      reward_type: "sparse" (0 where the goal is reached, else -1) or "dense" (minus the distance).
-      distance_threshold: distance, in m, below which the goal is reached.
-      episode_length: steps of an episode.
-      **engine_options: options of the engine; see `make_engine`.
+    Arguments as for `MujocoTask`; the threshold is 0.05 m. Dense rewards count from -1, so distances must not exceed 1 m.
     """
 
     task: ClassVar[FetchTask]
-    goal_size = 3
     action_size = 4
 
-    def __init__(
-        self,
-        engine: str = "auto",
-        reward_type: str = "sparse",
-        distance_threshold: float = 0.05,
-        episode_length: int = 50,
-        **engine_options: Any,
-    ):
-        if reward_type not in ("sparse", "dense"):
-            raise ValueError(f"reward_type must be 'sparse' or 'dense'; got {reward_type!r}")
-        distance_threshold, episode_length = _plain(distance_threshold), _plain(episode_length)
-        check_number("distance_threshold", distance_threshold, "(0, inf)", float)
-        check_count("episode_length", episode_length)
-        self.reward_type = reward_type
-        self.distance_threshold = distance_threshold
-        self.episode_length = episode_length
-        self.model = mujoco.MjModel.from_xml_path(str(ASSETS / self.task.xml))
-        self.engine = make_engine(engine, self.model, SUBSTEPS, **engine_options)
-        self.has_object = self.task.object_height is not None
-        self.observation_size = 25 if self.has_object else 10
+    def load(self) -> mujoco.MjModel:
+        return mujoco.MjModel.from_xml_path(str(ASSETS / self.task.xml))
+
+    def bind(self) -> None:
+        """Looks up the arm, the fingers and the object. The models have been tried out: nothing else is."""
+        has_object = self.task.object_height is not None
+        self.goal = Position("body:object" if has_object else "site:grip", *self.task.goal_bounds).bind(self.model)
+        self.goal_size, self.goal_distance = self.goal.size, self.goal.distance
+        self.observation_size = 25 if has_object else 10
         self.arm = Chain(self.model, body="gripper", site="grip")
+        qpos, qvel = np.zeros(self.model.nq, np.float32), np.zeros(self.model.nv, np.float32)
+        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
+        qpos[self.arm.qpos], qvel[self.arm.qvel] = self.task.arm_qpos, self.task.arm_qvel
         # Two finger joints, right and left. Without actuators they are blocked: put back after every step.
         self.has_fingers = any(self.model.joint(i).name == "finger_r" for i in range(self.model.njnt))
         self.drives_fingers = self.model.nu > 0
         if self.has_fingers:
             self._finger_qpos, self._finger_qvel = _joint_slices(self.model, "finger_r", width=2)
-        if self.has_object:
+            qvel[self._finger_qvel] = self.task.finger_qvel
+        self._object = None
+        if has_object:
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
+            self._object = (self._object_qpos.start, self._object_qvel.start, *self.task.object_bounds)
+            # After the physics blew up, the object is next to the gripper, as near as a reset would put it.
+            x, y, _ = self.task.initial_grip_pos
+            qpos[self._object_qpos] = x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0
+        self._rest: Any = Physics(qpos, qvel, warmstart=np.zeros_like(qvel), act=np.zeros(0, np.float32))  # type: ignore[arg-type]
 
     @property
     def spec(self) -> EnvSpec:
-        """The task's contract. Dense rewards count from -1, so distances must not exceed 1 m."""
-        observation = jax.ShapeDtypeStruct((self.observation_size,), jnp.float32)
-        return EnvSpec(observation, self.goal_size, self.action_size, self.episode_length, reward_range=(-1.0, 0.0))
-
-    @property
-    def goal_bounds(self) -> np.ndarray:
-        """Lowest and highest coordinates [2, 3] of the goals that a reset draws."""
-        return self.task.goal_bounds
-
-    @property
-    def object_bounds(self) -> np.ndarray:
-        """Lowest and highest coordinates [2, 3] at which a reset puts the object."""
-        return self.task.object_bounds
-
-    def reset(self, key: PRNGKey) -> State:
-        """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
-        object_key, goal_key = jax.random.split(key)
-        object_qpos = self._sample_object(object_key) if self.has_object else None
-        return self.init_state(object_qpos, self._sample_goal(goal_key))
+        return dataclasses.replace(super().spec, reward_range=(-1.0, 0.0))
 
     def init_state(self, object_qpos: Array | None, desired_goal: Array) -> State:
         """Returns the state at a given start, for example from a recorded episode. The arm starts as always.
@@ -138,81 +113,37 @@ class FetchEnv(GoalEnv):
           object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
           desired_goal: [3] m.
         """
-        physics = self._start(object_qpos)
-        obs = self._observe(physics, jnp.asarray(desired_goal, jnp.float32))
-        return State(
-            physics=physics,
-            obs=obs,
-            reward=jnp.zeros((), jnp.float32),
-            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
-            step=jnp.zeros((), jnp.int32),
-            failed=jnp.zeros((), bool),
-        )
+        physics: Physics = jax.tree.map(jnp.asarray, self._rest)
+        if object_qpos is not None:
+            qpos = physics.qpos.at[self._object_qpos].set(jnp.asarray(object_qpos, jnp.float32))
+            physics = dataclasses.replace(physics, qpos=qpos)
+        return self.first_state(physics, desired_goal)
 
-    def with_goal(self, state: State, goal: Array) -> State:
-        """Returns the state with another desired goal, [3] m."""
-        obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
-        return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
+    def reset(self, key: PRNGKey) -> State:
+        """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
+        object_key, goal_key = jax.random.split(key)
+        return self.init_state(self._sample_object(object_key) if self.has_object else None, self.sample_goal(goal_key))
 
-    def with_object(self, state: State, position: Array) -> State:
-        """Returns the state with the object at `position`, [3] m, upright and at rest."""
-        upright = jnp.concatenate([jnp.asarray(position, jnp.float32), jnp.array([1.0, 0.0, 0.0, 0.0])])
-        before = state.physics
-        qpos, qvel = before.qpos.at[self._object_qpos].set(upright), before.qvel.at[self._object_qvel].set(0.0)
-        physics = before.replace(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(before.warmstart))
-        obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
-        return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
+    def controls(self, physics: Physics, action: Array) -> Controls:
+        """Moves the gripper's target by 5 cm times `action[:3]` (x, y, z).
 
-    def step(self, state: State, action: Array) -> State:
-        """Moves the gripper's target by 5 cm times `action[:3]` (x, y, z) and holds it for one step of 40 ms.
-
-        `action[3]` opens and closes the fingers if actuators drive them. If the physics blows up (a value is not finite, or a
-        speed above its limit), the state goes back to a start, and `failed` stays True until `reset`.
+        `action[3]` opens and closes the fingers if actuators drive them. As in the original, targets are relative to the
+        present places of gripper and fingers, not to earlier targets, and the target's orientation lies half-way between the
+        gripper's and straight down.
         """
-        action = jnp.clip(self.check_action(action), -1.0, 1.0)
-        # As in the original, targets are relative to the present places of gripper and fingers, not to earlier targets, and the
-        # target's orientation lies half-way between the gripper's and straight down.
-        pos, quat = self.arm.pose(self._at_observation(state.physics).qpos[self.arm.qpos])
+        pos, quat = self.arm.pose(self.observed(physics).qpos[self.arm.qpos])
         quat = quat + POINTING_DOWN
         target = jnp.concatenate([pos + ACTION_SCALE * action[:3], quat / jnp.linalg.norm(quat)])
-        ctrl = state.physics.qpos[self._finger_qpos] + action[3] if self.drives_fingers else jnp.zeros(0)
-        physics = self.engine.advance(state.physics, Controls(ctrl=ctrl, mocap=target[None]))
-        if self.has_fingers and not self.drives_fingers:
-            physics = dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
-        sound = self._is_sound(physics)
-        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._start(self._resting_place()))
-        failed = state.failed | ~sound
-        obs = self._observe(self._at_observation(physics), state.obs["desired_goal"])
-        return State(
-            physics=physics,
-            obs=obs,
-            reward=self.compute_reward(obs["achieved_goal"], obs["desired_goal"]),
-            success=jnp.where(failed, 0.0, self._success(obs["achieved_goal"], obs["desired_goal"])),
-            step=state.step + 1,
-            failed=failed,
-        )
+        ctrl = physics.qpos[self._finger_qpos] + action[3] if self.drives_fingers else jnp.zeros(0)
+        return Controls(ctrl=ctrl, mocap=target[None])
 
-    def check(self) -> None:
-        self.engine.check()
+    def advance(self, physics: Physics, action: Array) -> Physics:
+        physics = super().advance(physics, action)
+        if not self.has_fingers or self.drives_fingers:
+            return physics
+        return dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
 
-    def _start(self, object_qpos: Array | None) -> Physics:
-        qpos = jnp.zeros(self.model.nq, jnp.float32).at[self.arm.qpos].set(jnp.array(self.task.arm_qpos, jnp.float32))
-        if self.has_object:
-            qpos = qpos.at[self._object_qpos].set(jnp.asarray(object_qpos, jnp.float32))
-        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
-        qvel = jnp.zeros(self.model.nv, jnp.float32).at[self.arm.qvel].set(jnp.array(self.task.arm_qvel, jnp.float32))
-        if self.has_fingers:
-            qvel = qvel.at[self._finger_qvel].set(jnp.array(self.task.finger_qvel, jnp.float32))
-        return Physics(qpos=qpos, qvel=qvel, warmstart=jnp.zeros(self.model.nv, jnp.float32), act=jnp.zeros(0, jnp.float32))
-
-    def _resting_place(self) -> Array | None:
-        """The object's qpos [7] after the physics blew up: next to the gripper, as near as a reset would put it."""
-        if self.task.object_height is None:
-            return None
-        x, y, _ = self.task.initial_grip_pos
-        return jnp.array([x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0])
-
-    def _is_sound(self, physics: Physics) -> Array:
+    def is_sound(self, physics: Physics) -> Array:
         """Whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
         qpos, qvel = physics.qpos, physics.qvel
         sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
@@ -223,16 +154,9 @@ class FetchEnv(GoalEnv):
             sound &= jnp.linalg.norm(qvel[self._object_qvel][:3]) < MAX_OBJECT_SPEED
         return sound
 
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Returns rewards: [..., 3], [..., 3] -> [...]. Sparse: 0 within the threshold, else -1. Dense: minus the distance."""
-        distance = goal_distance(achieved_goal, desired_goal)
-        if self.reward_type == "dense":
-            return -distance
-        return -(~(distance <= self.distance_threshold)).astype(jnp.float32)  # -1, too, where the distance is NaN
-
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
         # Strict, unlike the reward: the original differs at a distance of exactly the threshold, so we do.
-        return (goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
+        return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
     def _sample_object(self, key: PRNGKey) -> Array:
         """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` from it."""
@@ -245,7 +169,7 @@ class FetchEnv(GoalEnv):
         xy = jnp.array(task.initial_grip_pos[:2]) + offsets[index]
         return jnp.concatenate([xy, jnp.array([task.object_height, 1.0, 0.0, 0.0, 0.0])])
 
-    def _sample_goal(self, key: PRNGKey) -> Array:
+    def sample_goal(self, key: PRNGKey) -> Array:
         """Draws a goal [3] around the gripper plus the task's offset; with an object, at its height or (half of them) above."""
         task = self.task
         # Scaled by `uniform`, whose result XLA rounds alike wherever it computes it: reset and first step give the same goal.
@@ -256,7 +180,7 @@ class FetchEnv(GoalEnv):
             return goal
         return goal.at[2].set(task.object_height + jnp.maximum(drawn[3], 0.0))
 
-    def _at_observation(self, physics: Physics) -> Physics:
+    def observed(self, physics: Physics) -> Physics:
         """Returns the physics from which the observation after a step is computed.
 
         If actuators drive the fingers, the original does not recompute positions after its last substep: gripper and object are
@@ -270,32 +194,20 @@ class FetchEnv(GoalEnv):
             late = late.at[self._object_qpos].set(integrate(qpos[self._object_qpos], qvel[self._object_qvel], -TIMESTEP))
         return dataclasses.replace(physics, qpos=late)
 
-    def _observe(self, physics: Physics, desired_goal: Array) -> GoalObs:
+    def observe(self, physics: Physics) -> Array:
         grip_pos, grip_vel = self.arm.site_motion(physics.qpos[self.arm.qpos], physics.qvel[self.arm.qvel])
         blocked = jnp.zeros(2)
         finger_pos = physics.qpos[self._finger_qpos] if self.has_fingers else blocked
         finger_vel = physics.qvel[self._finger_qvel] if self.has_fingers else blocked
         if not self.has_object:
-            observation = jnp.concatenate([grip_pos, finger_pos, grip_vel * DT, finger_vel * DT])
-            return _in_float32(observation, grip_pos, desired_goal)
+            return jnp.concatenate([grip_pos, finger_pos, grip_vel * DT, finger_vel * DT])
         object_qpos, object_qvel = physics.qpos[self._object_qpos], physics.qvel[self._object_qvel]
-        observation = fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, finger_pos, finger_vel)
-        return _in_float32(observation, object_qpos[:3], desired_goal)
+        return fetch_observation(grip_pos, grip_vel, object_qpos, object_qvel, finger_pos, finger_vel)
 
-
-def _in_float32(observation: Array, achieved_goal: Array, desired_goal: Array) -> GoalObs:
-    """Converts an observation to float32, also if JAX computes in 64 bits."""
-    observation, achieved_goal, desired_goal = (x.astype(jnp.float32) for x in (observation, achieved_goal, desired_goal))
-    return GoalObs(observation=observation, achieved_goal=achieved_goal, desired_goal=desired_goal)
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def goal_distance(achieved_goal: Array, desired_goal: Array) -> Array:
-    """Returns Euclidean distances, m: [..., G], [..., G] -> [...]."""
-    return jnp.linalg.norm(achieved_goal - desired_goal, axis=-1)
+    def achieved(self, physics: Physics) -> Array:
+        if self.has_object:
+            return physics.qpos[self._object_qpos][:3]
+        return self.arm.site_motion(physics.qpos[self.arm.qpos], physics.qvel[self.arm.qvel])[0]
 
 
 def fetch_observation(

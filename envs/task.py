@@ -96,13 +96,17 @@ class MujocoTask(GoalEnv):
         self.episode_length = _plain(type(self).episode_length if episode_length is None else episode_length)
         check_count("episode_length", self.episode_length)
         self.name = getattr(type(self), "name", type(self).__name__)
-        self.model = load_model(type(self))
+        self.model = self.load()
         substeps = substeps_of(self.hz, self.model.opt.timestep)
         self.dt = substeps * float(self.model.opt.timestep)  # s
         self.engine = make_engine(engine, self.model, substeps, **engine_options)
         self.bind()
         self.distance_threshold = _plain(self.goal.threshold if distance_threshold is None else distance_threshold)
         check_number("distance_threshold", self.distance_threshold, "(0, inf)", float)
+
+    def load(self) -> mujoco.MjModel:
+        """Compiles the model."""
+        return load_model(type(self))
 
     def bind(self) -> None:
         """Looks up the declared names in the model, and tries the model out."""
@@ -113,14 +117,11 @@ class MujocoTask(GoalEnv):
         self.goal_size = self.goal.size
         self.goal_distance: DistanceFn = self.goal.distance
         self._bind_start()
-        self.layout: dict[str, slice] = {}  # of the observation, by the name of its parts
-        self._terms = {text: term(self.model, text) for text in self.observations}
-        end = 0
-        for text, part in self._terms.items():
-            size = jax.eval_shape(part, self._rest).shape[0]
-            self.layout[text] = slice(end, end + size)
-            end += size
-        self.observation_size = end
+        texts = (self.observations,) if isinstance(self.observations, str) else self.observations
+        self._terms = {text: term(self.model, text) for text in texts}
+        ends = np.cumsum([0, *(jax.eval_shape(part, self._rest).shape[0] for part in self._terms.values())]).tolist()
+        self.layout = {text: slice(*ends) for text, *ends in zip(self._terms, ends, ends[1:])}  # of the observation
+        self.observation_size = ends[-1]
         probes.check_stable(self.model, np.asarray(self._rest.qpos), self._rest_ctrl, self.dt * self.episode_length)
         probes.check_reachable(self.model, np.asarray(self._rest.qpos), self.goal)
 
@@ -153,16 +154,16 @@ class MujocoTask(GoalEnv):
     def reset(self, key: PRNGKey) -> State:
         """Draws a start and a goal."""
         start_key, goal_key = jax.random.split(key)
-        return self.init_state(self.start_physics(start_key), self.sample_goal(goal_key))
+        return self.first_state(self.start_physics(start_key), self.sample_goal(goal_key))
 
-    def init_state(self, physics: Physics, desired_goal: Array) -> State:
+    def first_state(self, physics: Physics, desired_goal: Array) -> State:
         """Returns the first state of an episode that starts from `physics`, with a goal [G]."""
         obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
             physics=physics,
             obs=obs,
             reward=jnp.zeros((), jnp.float32),
-            success=self._success(obs),
+            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
             step=jnp.zeros((), jnp.int32),
             failed=jnp.zeros((), bool),
         )
@@ -170,7 +171,7 @@ class MujocoTask(GoalEnv):
     def with_goal(self, state: State, goal: Array) -> State:
         """Returns the state with another desired goal [G]."""
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
-        return dataclasses.replace(state, obs=obs, success=self._success(obs))
+        return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
 
     def step(self, state: State, action: Array) -> State:
         """Applies an action [A] for one step.
@@ -178,16 +179,16 @@ class MujocoTask(GoalEnv):
         If the physics blows up, the state goes back to the start, and `failed` stays True until `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
-        physics = self.engine.advance(state.physics, self.controls(state.physics, action))
+        physics = self.advance(state.physics, action)
         sound = self.is_sound(physics)
         physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._rest)
         failed = state.failed | ~sound
-        obs = self.observe_goal(physics, state.obs["desired_goal"])
+        obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
         return State(
             physics=physics,
             obs=obs,
             reward=self.compute_reward(obs["achieved_goal"], obs["desired_goal"]),
-            success=jnp.where(failed, 0.0, self._success(obs)),
+            success=jnp.where(failed, 0.0, self._success(obs["achieved_goal"], obs["desired_goal"])),
             step=state.step + 1,
             failed=failed,
         )
@@ -199,8 +200,8 @@ class MujocoTask(GoalEnv):
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
         qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)
         physics = dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel))
-        obs = self.observe_goal(physics, state.obs["desired_goal"])
-        return dataclasses.replace(state, physics=physics, obs=obs, success=self._success(obs))
+        obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
+        return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
 
     def check(self) -> None:
         self.engine.check()
@@ -238,6 +239,14 @@ class MujocoTask(GoalEnv):
             begin += part.size
         return controls
 
+    def advance(self, physics: Physics, action: Array) -> Physics:
+        """The physics one step later."""
+        return self.engine.advance(physics, self.controls(physics, action))
+
+    def observed(self, physics: Physics) -> Physics:
+        """The physics that is observed after a step: by default as it is."""
+        return physics
+
     def observe(self, physics: Physics) -> Array:
         """The observation [D]; `layout` has the slices of its parts."""
         return jnp.concatenate([part(physics) for part in self._terms.values()])
@@ -256,8 +265,8 @@ class MujocoTask(GoalEnv):
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(physics)]
         return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < self.max_speed)
 
-    def _success(self, obs: GoalObs) -> Array:
-        return self.reached(obs["achieved_goal"], obs["desired_goal"]).astype(jnp.float32)
+    def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        return self.reached(achieved_goal, desired_goal).astype(jnp.float32)
 
     def _bind_start(self) -> None:
         """Sets the start's physics, the inputs that hold it, and the ranges [first index in qpos and in qvel, low, high]."""
