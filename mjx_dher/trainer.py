@@ -235,13 +235,12 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     # While the ring is empty, nothing is learned.
     can_learn = split.all_true(replay.can_sample(ring), loop.axis_name)
     learner = jax.tree.map(lambda new, old: jnp.where(can_learn, new, old), learned, learner)
+    drawn = (ring.priority, ring.size) if loop.priority.renew else (weights, config.num_envs)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": replay.mean_weight(
-            *((ring.priority, ring.size) if loop.priority.renew else (weights, config.num_envs))
-        ),
+        "priority_mean": replay.mean_weight(*drawn),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,
@@ -294,8 +293,7 @@ def _update_normalizers(
     batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, context.hparams, valid)
     learners.check_kept("update_normalizers", learner, updated)
-    metrics = _relabel_metrics(context, sample.desired_goal, batch.desired_goal)
-    return updated, {**metrics, "no_goal_share": no_goal_share}
+    return updated, {**_relabel_metrics(context, sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
 
 
 def _relabel_metrics(context: Context, goal: Array, hindsight: Array) -> Metrics:
