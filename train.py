@@ -2,7 +2,7 @@
 
 import sys
 
-from mjx_dher.cli import main
+from mjx_dher.__main__ import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -34,10 +34,9 @@ from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
-from mjx_dher.system import files
+from mjx_dher.system import files, signals
 from mjx_dher.system.caches import prepare
 
 TOY_TASK = "point_mass:PointMass"
@@ -121,18 +120,18 @@ def train(args: argparse.Namespace, console: Console) -> bool:
     """Trains what is not done; returns whether all is."""
     prepare()
     until = time.monotonic() + 60 * args.minutes
-    with Stop(console, args.out) as stop:
+    with signals.taken(), signals.held(console.print, args.out):
         for learner in args.learners:
             for task in args.tasks:
                 for group in args.experiment.groups:
-                    if stop.asked is not None or time.monotonic() > until:
+                    if signals.are_asked() or time.monotonic() > until:
                         return False
-                    if not _train_group(args, (learner, task, group), console, stop, until):
+                    if not _train_group(args, (learner, task, group), console, until):
                         return False
     return True
 
 
-def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console: Console, stop: Stop, until: float) -> bool:
+def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console: Console, until: float) -> bool:
     """Trains the runs of a group that are not done, in one program; returns whether all of them are."""
     learner, task, group = which
     folder = folder_of(args, learner, task)
@@ -149,7 +148,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
             make_env,
             options=Options(final_episodes=100 if args.toy else 500, checkpoint_every=1 if args.toy else 5),
             lanes=args.lanes,
-            should_stop=lambda: stop.asked is not None or time.monotonic() > until,
+            should_stop=lambda: signals.are_asked() or time.monotonic() > until,
             report=console.print,
             on_epoch=screen.show,
         )

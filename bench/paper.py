@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from mjx_dher.cli.settings import check_writable  # noqa: E402
 from mjx_dher.sweeps import comparison, tables  # noqa: E402
-from mjx_dher.system import files  # noqa: E402
+from mjx_dher.system import files, signals  # noqa: E402
 from mjx_dher.system.files import FolderError  # noqa: E402
 
 CURVES = ROOT / "docs" / "paper"
@@ -166,19 +166,16 @@ def plan(sweeps: Sequence[Sweep], out: Path, toy: bool) -> str:
 def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: int) -> int:
     """Runs sweeps, `at_once` of them side by side, and collects the curves of each that ends; returns the first bad status.
 
-    A signal to stop goes to those that run, which save what they have; those that wait do not begin.
+    The first signal goes on to those that run, which save what they have; those that wait do not begin.
     """
-    waiting, running, status = list(sweeps), {}, 0
+    waiting, running, status, number = list(sweeps), {}, 0, None
 
-    def stop(number: int, frame: object) -> None:
-        nonlocal status
-        status = status or 128 + number  # a signal, as a shell gives it
-        if number == signal.SIGTERM:  # a terminal sends SIGINT to all of them
-            for child in running.values():
-                child.send_signal(number)
+    def send(number: int) -> None:
+        for child in running.values():
+            child.send_signal(number)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
+    # An error, or a second signal, ends those that run, too.
+    with signals.taken(), signals.held(print, out), signals.cleaning(lambda: send(signal.SIGTERM)):
         while running or (waiting and not status):
             while waiting and not status and len(running) < at_once:
                 sweep = waiting.pop(0)
@@ -186,12 +183,10 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
             for sweep in [sweep for sweep, child in running.items() if child.poll() is not None]:
                 own = ended(sweep, running.pop(sweep).returncode, out, curves)
                 status = status or own
+            if number is None and (number := signals.asked()) is not None:
+                status = status or 128 + number
+                send(number)  # a terminal has sent it to all of them: two in so short a time are one
             time.sleep(0.2)
-    finally:
-        for child in running.values():  # where an error ends this
-            child.terminate()
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return status
 
 

@@ -15,7 +15,8 @@ import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
 from mjx_dher.learners import ddpg
 from mjx_dher.runs import driver
-from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
+from mjx_dher.runs.folder import checkpoint, fingerprint, lane_checkpoints, run_folder
+from mjx_dher.runs.folder.lane_checkpoints import Schedule
 from mjx_dher.sweeps import comparison, tables
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass
@@ -143,13 +144,59 @@ def test_a_checkpoint_that_cannot_be_written_is_told_each_time_and_costs_nothing
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(checkpoint, "_write_arrays", fill)
-    lines, options = [], Options(final_episodes=2, checkpoint_every=1)
+    for name in ("SECONDS_TO_FIRST", "SECONDS_BETWEEN", "SHARE"):  # by the clock after every epoch
+        monkeypatch.setattr(lane_checkpoints, name, 1e9 if name == "SHARE" else 0.0)
+    lines, options = [], Options(final_episodes=2, checkpoint_every=0)
     (result,) = mjx_dher.train_runs(PointMass(), [SPEC], [tmp_path / "run"], options=options, report=lines.append)
     assert [line.split(" (")[0].rsplit("/", 1)[-1] for line in lines if "No space left" in line] == [
         "epoch-000001",
         "epoch-000002",
     ]
     assert (result.status, result.epoch, len(rows_of(tmp_path / "run"))) == ("finished", 3, 3)
+
+
+def test_checkpoints_are_due_by_epochs_and_by_the_clock(monkeypatch):
+    """After two minutes, then every ten, or so seldom that they take a twentieth of the time."""
+    now = [0.0]
+    monkeypatch.setattr(lane_checkpoints.time, "monotonic", lambda: now[0])
+    schedule, by_epochs = Schedule(0), Schedule(3)
+    saved = []
+    for epoch in range(1, 60):
+        now[0] += 60
+        assert by_epochs.is_due(epoch) == (epoch >= 2)  # it is not saved
+        if schedule.is_due(epoch):
+            saved.append(epoch)
+            with schedule.saving():
+                now[0] += 60 if len(saved) == 3 else 1
+    assert saved == [2, 12, 22, 42, 52]
+    assert [Schedule(3).is_due(epoch) for epoch in range(1, 7)] == [False, False, True] * 2
+    assert not Schedule(0).is_due(1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 2])
+def test_a_run_that_is_killed_goes_on_from_a_checkpoint_by_the_clock(tmp_path, monkeypatch, lanes):
+    """Without checkpoints by epochs; it ends as one without any, to the bit."""
+    specs = [dataclasses.replace(SPEC, seed=seed) for seed in range(10, 10 + lanes)]
+    options, lines = Options(final_episodes=2, checkpoint_every=0), []
+
+    def train(name, **more):
+        folders = [tmp_path / name / fingerprint.trial_name(spec) for spec in specs]
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+        mjx_dher.train_runs(PointMass(), specs, folders, options=options, report=lines.append, **more)
+        return [(rows_of(folder), result_of(folder)) for folder in folders]
+
+    def kill(specs, progress):
+        if progress.epoch == 2:
+            raise ZeroDivisionError
+
+    whole = train("whole")
+    monkeypatch.setattr(lane_checkpoints, "SECONDS_TO_FIRST", 0.0)
+    with pytest.raises(ZeroDivisionError):
+        train("killed", on_epoch=kill)
+    assert train("killed") == whole
+    assert sum("after epoch 1" in line for line in lines) == 1
 
 
 def test_an_aim_is_the_mean_of_three_evaluations():

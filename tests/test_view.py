@@ -230,7 +230,7 @@ def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGABRT)  # with what each thread was at
         pytest.fail(process.communicate()[1])
-    assert (process.returncode, out, err) == (0, "the viewer has ended\n", "")
+    assert (process.returncode, out, err) == (128 + signal.SIGINT, "", "stopped\n")
     assert address.check("127.0.0.1", port) == port
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import atexit
 import contextlib
 import gc
-import signal
 import sys
 from collections.abc import Sequence
 
 from mjx_dher import __version__, lookup, trust
 from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS, run
+from mjx_dher.system import signals
 
 MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that decide it
 TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk, not on the screen
@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
         sys.path.append("")
     trains = name in TRAINING and not {"--dry-run", "--version"} & set(argv)
-    with output.guarded() as stream:
+    with signals.taken(), output.guarded() as stream:
         try:
             ended = _run(name, argv)
         except SystemExit as error:  # of --help, and of arguments that cannot be parsed
@@ -45,9 +45,6 @@ def _run(name: str, argv: list[str]) -> int:
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
         return run(name, argv, output.PlainConsole(soft_wrap=True))
-    except KeyboardInterrupt:  # outside of training, which ends in order
-        print("stopped", file=sys.stderr)
-        return 128 + signal.SIGINT
     except Exception as error:
         if (reason := sentence(error)) is None:
             raise  # a fault of this program, whose place its report should have

@@ -20,11 +20,12 @@ from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.locks import Claims
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
-from mjx_dher.system import files
+from mjx_dher.system import files, signals
 from mjx_dher.system.caches import prepare
+
+SECONDS_WITHOUT_NEWS = 7.0  # of a cluster, after a signal: it has gone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,11 +56,11 @@ def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
     return worker.train(chunk, make_env, tell)
 
 
-def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec], int | None]:
+def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec]]:
     """Trains a sweep on a cluster.
 
     Returns:
-      All trials, those that had not ended before, and the signal that asked for a stop, or None.
+      All trials, and those that had not ended before.
 
     Raises:
       ValueError: the cluster cannot be used, or a run cannot be trained.
@@ -83,8 +84,9 @@ def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec],
             todo = order.announce(trials)
             claims = Claims(True, report)
             free = [run for run in todo if claims.is_free(run, grid.folder_of(order.out, run))]
-            signum = _train(order, ray, task, trials, free, report, console) if free else None
-    return trials, todo, signum
+            if free:
+                _train(order, ray, task, trials, free, report, console)
+    return trials, todo
 
 
 def _train(
@@ -95,8 +97,8 @@ def _train(
     todo: Sequence[RunSpec],
     report: Callable[[str], None],
     console: Console,
-) -> int | None:
-    """Trains runs that no other program has; returns the signal that asked for a stop, or None."""
+) -> None:
+    """Trains runs that no other program has, until a signal asks for a stop."""
     nodes = [node for node in ray.resources() if task.slots(node)]
     slots = sum(map(task.slots, nodes))
     report(
@@ -105,22 +107,25 @@ def _train(
     before = chunks.unfinished(order.storage, trials, todo)
     others = [run for run in todo if not any(run in chunk for chunk in before)]
     parts = [*before, *chunks.split(others, task, slots, order.lanes, order.fleet.ray_chunk)]
-    stop, screen = Stop(console, order.out), _Screen(console, todo)
+    screen = _Screen(console, todo)
     code = chunks.code_of(todo)
     for run in todo:  # the nodes write the folders
         run_folder.record_names(run)
-    with stop:
-        asked = lambda: stop.asked is not None  # noqa: E731
+    with signals.held(report, order.out, SECONDS_WITHOUT_NEWS) as held:
+
+        def show(state: driver.State) -> None:
+            held.alive()
+            screen.show(state)
+
         own = (order.options, order.lanes, task, order.storage, code, train_chunk)
-        lost = driver.run(ray, driver.Job(order.out, parts, *own, report, screen.show, asked))
+        lost = driver.run(ray, driver.Job(order.out, parts, *own, report, show, signals.are_asked))
     if lost:
         tries = cluster.RETRIES + 1
         raise ValueError(f"ray: {len(lost)} tasks were lost {tries} times ({'; '.join(lost[:3])}); run the same command again")
-    if stop.asked is None and order.storage is not None:
+    if not signals.are_asked() and order.storage is not None:
         for path in (order.storage, order.storage.parent) if order.fleet.storage is None else (order.storage,):
             with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
-    return stop.asked
 
 
 def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:

@@ -21,10 +21,9 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.fleet.options import FleetOptions
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import Engine, RunSpec
 from mjx_dher.sweeps import grid
-from mjx_dher.system import files
+from mjx_dher.system import files, signals
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
 from mjx_dher.validation import check_count, check_devices, check_number
@@ -219,8 +218,10 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         return [places[trial] for trial in _announce(args, trials, console)]
 
     todo = [trials[place] for place in processes.broadcast(begin)]
-    signum = _train(args, todo, console) if todo else None
-    return int(processes.broadcast(lambda: _end(args, trials, todo, signum, console)))
+    if todo:
+        _train(args, todo, console)
+    number = processes.highest(signals.asked() or 0)
+    return int(processes.broadcast(lambda: _end(args, trials, todo, number, console)))
 
 
 def _sweep_fleet(args: SweepArgs, console: Console) -> int:
@@ -232,8 +233,7 @@ def _sweep_fleet(args: SweepArgs, console: Console) -> int:
 
     announce = lambda trials: _announce(args, trials, console)  # noqa: E731
     order = fleet.Order(args.fleet, args.out, args.engine, args.lanes, args.options, make_trials, announce)
-    trials, todo, signum = fleet.train(order, console)
-    return _end(args, trials, todo, signum, console)
+    return _end(args, *fleet.train(order, console), signals.asked() or 0, console)
 
 
 def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
@@ -246,13 +246,14 @@ def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[
     return todo
 
 
-def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], signum: int | None, console: Console) -> int:
-    """Writes the tables of the trials that have ended, and reports the others."""
+def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: int, console: Console) -> int:
+    """Writes the tables of the trials that have ended, and reports the others; `number` is of the signal to stop, or 0."""
     left = [trial for trial in todo if not grid.is_done(args.out, trial)]
-    if left and signum is not None:
+    if left and number:
         ended = len(trials) - len(left)
         console.print(f"stopped; {ended} runs are done; run the same command again for the other {len(left)}")
-        return 128 + signum
+        return 128 + number
+    signals.forget()
     if len(left) == len(trials):
         raise files.BusyError(f"{args.out}: all {len(left)} runs are being trained by another program")
     _write_tables(args, console)
@@ -286,8 +287,8 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     return 0
 
 
-def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None:
-    """Trains trials; returns the signal that asked for a stop, or None."""
+def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
+    """Trains trials, until a signal asks for a stop."""
     from mjx_dher.sweeps import sweep
 
     prepare()
@@ -295,23 +296,21 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> int | None
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.custom_components, own)):
             try_components(make_env(own[0]), own, console)
-    stop, screen = Stop(console, args.out), Screen(console, todo)
+    screen = Screen(console, todo)
     try:
-        with stop:
-            sweep.run(
-                args.out,
-                todo,
-                make_env,
-                options=args.options,
-                lanes=args.lanes,
-                devices=args.devices,
-                should_stop=lambda: stop.asked is not None,
-                report=lambda text: console.print(text, soft_wrap=True),
-                on_epoch=screen.show,
-            )
+        sweep.run(
+            args.out,
+            todo,
+            make_env,
+            options=args.options,
+            lanes=args.lanes,
+            devices=args.devices,
+            should_stop=signals.are_asked,
+            report=lambda text: console.print(text, soft_wrap=True),
+            on_epoch=screen.show,
+        )
     finally:
         screen.close()
-    return stop.asked
 
 
 def _write_tables(args: SweepArgs, console: Console) -> None:

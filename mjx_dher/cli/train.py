@@ -32,9 +32,8 @@ from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.signals import Stop
 from mjx_dher.spec import RunSpec, to_texts
-from mjx_dher.system import files
+from mjx_dher.system import files, signals
 from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
 from mjx_dher.validation import check_all, check_devices
@@ -287,7 +286,7 @@ def _train(
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}")
     begun = (folder / run_folder.CONFIG_FILE).exists()
     before = [row["success_rate"] for row in results.read_metrics(folder)] if begun else []
-    stop, screen = Stop(console, folder), Screen(console, [run], before)
+    screen = Screen(console, [run], before)
     curve = curve and processes.leads()
 
     def on_epoch(specs: Any, progress: Any) -> None:
@@ -300,17 +299,16 @@ def _train(
 
     warn_of_tau(run.hparams.polyak, console)
     try:
-        with stop:
-            (result,) = driver.train_runs(
-                env,
-                [run],
-                [folder],
-                options=options,
-                devices=devices,
-                should_stop=lambda: stop.asked is not None,
-                report=console.print,
-                on_epoch=on_epoch,
-            )
+        (result,) = driver.train_runs(
+            env,
+            [run],
+            [folder],
+            options=options,
+            devices=devices,
+            should_stop=signals.are_asked,
+            report=console.print,
+            on_epoch=on_epoch,
+        )
     finally:
         screen.close()
     if result.status == driver.STOPPED:
@@ -318,7 +316,8 @@ def _train(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
             f" `{lookup.command_name()} resume {folder}` goes on"
         )
-        return 128 + (stop.asked or 0)
+        return 128 + processes.highest(signals.asked() or 0)
+    signals.forget()
     if result.status == run_folder.FAILED:
         _draw(folder, curve, console)
         raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")

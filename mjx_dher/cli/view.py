@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +81,7 @@ def view_command(argv: list[str], console: Console) -> int:
 
 
 def _view(args: ViewArgs, console: Console) -> int:
-    """Serves the page until Ctrl-C, which is how it is meant to end: status 0."""
+    """Serves the page until a signal ends the process, or the run that it shows has ended."""
     if not args.runs and args.env is None:
         raise ValueError(f"view takes run folders, policies of the package ({', '.join(bundled.names())}), or --env")
     if args.env is not None:
@@ -105,42 +103,17 @@ def _view(args: ViewArgs, console: Console) -> int:
     given = given or [sources.by_random(str(args.env), args.env_kwargs)]
     others = [source for source in sources.of_package() if source.label not in [label for label, _ in folders]]
     keep_compiled_programs()
-    try:
-        with (
-            server.Viewer([*given, *others], _maker(args.engine), args.page.host, port, args.seed) as viewer,
-            _until_ctrl_c() as stopped,
-        ):
-            console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)")
-            if not address.is_loopback(args.page.host):
-                place = "any address of this machine" if address.is_everywhere(args.page.host) else args.page.host
-                console.print(f"whoever can reach {place} can see the page, and move things in it")
-            if args.page.open and not address.open_browser(viewer.address):
-                console.print("there is no browser here that could be opened: open that address in one")
-            sys.stdout.flush()
-            viewer.run(lambda: stopped.is_set() or (PARENT in os.environ and os.environ[PARENT] != str(os.getppid())))
-        interrupted = stopped.is_set()
-    except KeyboardInterrupt:
-        interrupted = True
-    if interrupted:
-        console.print("the viewer has ended")
+    maker = _maker(args.engine)
+    with server.Viewer([*given, *others], maker, args.page.host, port, args.seed) as viewer:
+        console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)")
+        if not address.is_loopback(args.page.host):
+            place = "any address of this machine" if address.is_everywhere(args.page.host) else args.page.host
+            console.print(f"whoever can reach {place} can see the page, and move things in it")
+        if args.page.open and not address.open_browser(viewer.address):
+            console.print("there is no browser here that could be opened: open that address in one")
+        sys.stdout.flush()
+        viewer.run(lambda: PARENT in os.environ and os.environ[PARENT] != str(os.getppid()))
     return 0
-
-
-@contextlib.contextmanager
-def _until_ctrl_c() -> Iterator[threading.Event]:
-    """Gives what is set by Ctrl-C. An exception instead could be raised, and lost, in a callback; a second Ctrl-C raises it."""
-    stopped = threading.Event()
-
-    def stop(number: int, frame: object) -> None:
-        if stopped.is_set():
-            raise KeyboardInterrupt
-        stopped.set()
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield stopped
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 class Beside:
@@ -171,7 +144,7 @@ class Beside:
             from mjx_dher.viewer import address
 
             place = str(subprocesses.PACKAGE.parent)  # of this package, which need not be installed
-            code = f"import sys; sys.path.append({place!r}); from mjx_dher.cli import main; sys.exit(main())"
+            code = f"import sys; sys.path.append({place!r}); from mjx_dher.__main__ import main; sys.exit(main())"
             command = (sys.executable, "-c", code, "view", str(self._folder), "--trust", "--port", str(self._port))
             variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
             self._process = self._stack.enter_context(subprocesses.started(command, variables))

@@ -8,7 +8,6 @@ import os
 import secrets
 import socket
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from mjx_dher.fleet import worker
 from mjx_dher.fleet.chunks import Chunk, Task
 from mjx_dher.fleet.options import LOCAL
 from mjx_dher.fleet.worker import News, Tell
-from mjx_dher.system import subprocesses
+from mjx_dher.system import files, signals, subprocesses
 
 RETRIES = 5  # of a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # for the head of a cluster
@@ -75,7 +74,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
     with contextlib.ExitStack() as stack:
         if address == LOCAL:
-            private = stack.enter_context(tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True))
+            private = stack.enter_context(files.temporary_folder("ray-"))
             place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}
             # Ray then listens on 127.0.0.1 alone, and only processes with this token can call it.
@@ -86,11 +85,28 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
         import ray
 
         stack.callback(ray.shutdown)
+        stack.enter_context(signals.cleaning(subprocesses.kill_sessions))
         try:
-            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+            with _sessions_of_their_own():
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except Exception as error:  # Ray raises errors of many kinds
             raise ValueError(f"ray: the cluster at {address} cannot be joined ({_first_line(error)})") from error
+        signals.take_back()
         yield Cluster()
+
+
+@contextlib.contextmanager
+def _sessions_of_their_own() -> Iterator[None]:
+    """Starts processes, in the block, that a signal to this one's group does not reach: Ray has no option for it."""
+    _starting.append(True)
+    try:
+        yield
+    finally:
+        _starting.clear()
+
+
+_starting: list[bool] = []
+os.register_at_fork(after_in_child=lambda: os.setsid() if _starting else None)
 
 
 def _check_answers(address: str) -> None:

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from mjx_dher.system import signals
+
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 TIMEOUTS = {"initialization_timeout": 60, "heartbeat_timeout_seconds": 30, "shutdown_timeout_seconds": 30}
 _PIECE = 1 << 28  # bytes that `fetch` holds on a device at a time
@@ -37,6 +39,7 @@ def connect() -> None:
         size, number = (int(os.environ[name]) if name in os.environ else None for name in VARIABLES[1:])
         own: dict[str, Any] = {**TIMEOUTS, "coordinator_bind_address": _bind_address()}
         jax.distributed.initialize(num_processes=size, process_id=number, **own)
+        signals.take_back()  # JAX has taken SIGTERM
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"distributed: {error} Start it with srun or mpirun, or set {', '.join(VARIABLES)}") from error
 
@@ -90,11 +93,16 @@ def broadcast(decide: Callable[[], T]) -> T:
     return content["value"]
 
 
-def any_process(flag: bool) -> bool:
-    """Whether `flag` is true in any process."""
+def highest(number: int) -> int:
+    """The highest `number` of all processes."""
     from jax.experimental import multihost_utils
 
-    return flag if is_alone() else bool(multihost_utils.process_allgather(np.array(flag)).any())
+    return number if is_alone() else int(multihost_utils.process_allgather(np.array(number)).max())
+
+
+def any_process(flag: bool) -> bool:
+    """Whether `flag` is true in any process."""
+    return bool(highest(flag))
 
 
 def check_equal(described: Mapping[str, Any]) -> None:

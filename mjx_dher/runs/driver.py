@@ -21,7 +21,7 @@ from mjx_dher import spec as spec_lib
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
-from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints
+from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
 from mjx_dher.runs.folder.locks import Claims, Run, named
 from mjx_dher.runs.folder.loggers import Sink
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
@@ -31,7 +31,7 @@ from mjx_dher.runs.program import program as program_lib
 from mjx_dher.runs.program.loop import Progress, Start
 from mjx_dher.runs.program.program import Program
 from mjx_dher.spec import RunSpec
-from mjx_dher.system import files
+from mjx_dher.system import files, signals
 from mjx_dher.types import Env
 
 STOPPED = "stopped"
@@ -45,10 +45,6 @@ class Result(NamedTuple):
     epoch: int  # epochs that have ended
     num_epochs: int
     content: dict[str, Any]  # of result.json; empty for a run that was stopped
-
-
-def _no_sinks(spec: RunSpec, folder: Path) -> Sequence[Sink]:
-    return ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +75,7 @@ def train_runs(
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
-    make_sinks: Callable[[RunSpec, Path], Sequence[Sink]] = _no_sinks,
+    make_sinks: Callable[[RunSpec, Path], Sequence[Sink]] = lambda spec, folder: (),
 ) -> list[Result]:
     """Trains runs that share a program, as many side by side as possible, each into its own folder.
 
@@ -114,17 +110,18 @@ def train_runs(
     _check_runs(env, specs, folders, options, sweep)
     placed_on = mesh.find(devices)
     shared = folders[0].parent / "unfinished" if shared is None else shared
-    most, number = mesh.most_lanes(lanes, placed_on), max(1, len(placed_on))
     asked = lambda: processes.any_process(should_stop())  # noqa: E731
-    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, number)
+    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, max(1, len(placed_on)))
     claims = Claims(sweep, report)
     free = processes.broadcast(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
     waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
     if not waiting:
         return []
-    program = program_lib.compile_runs(env, [spec for spec, _ in waiting], most, options.final_episodes, report, placed_on)
-    processes.check_equal({"lanes": program.lanes})  # memory decides them where the user does not
-    return _train_in_turn(session, program, claims, waiting)
+    with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
+        own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
+        program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
+        processes.check_equal({"lanes": program.lanes})  # memory decides them where the user does not
+        return _train_in_turn(session, program, claims, waiting)
 
 
 def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], options: Options, sweep: bool) -> None:
@@ -147,7 +144,7 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
             if not claimed:
                 break
             specs, folders = zip(*claimed)
-            with named(folders[0]):
+            with named(folders[0]), signals.held(session.report, folders[0] if not session.sweep else session.shared.parent):
                 results += _train(session, program, specs, folders)
     return results
 
@@ -185,6 +182,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         own = zip(ended, specs, folders, runs) if processes.leads() else ()
         logs = [_open(stack, session, program.lanes, *run) for run in own]
         success = processes.broadcast(lambda: _success_rates(folders[0]))  # of one run, see stop_at
+        schedule = Schedule(options.checkpoint_every)
         for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
@@ -202,8 +200,9 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
             if session.should_stop():
                 session.report(f"saved {checkpoints.save(progress)}")
                 return [Result(folder, STOPPED, progress.epoch, progress.num_epochs, {}) for folder in folders]
-            if options.checkpoint_every and progress.epoch % options.checkpoint_every == 0:
-                checkpoints.try_save(progress)
+            if processes.any_process(schedule.is_due(progress.epoch)):
+                with schedule.saving():
+                    checkpoints.try_save(progress)
     if progress.epoch < progress.num_epochs and options.is_reached(success):
         session.report(f"stop_at {options.stop_at:g} is reached after epoch {progress.epoch} of {progress.num_epochs}")
     if options.keep_end and not watch.failed:

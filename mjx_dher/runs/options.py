@@ -16,7 +16,8 @@ class Options:
     final_episodes: int = 500
     """Episodes of the last evaluation."""
     checkpoint_every: int = 10
-    """Epochs between checkpoints, from which a run resumes; 0: only when it is stopped (Ctrl-C, SIGTERM)."""
+    """Epochs between checkpoints, from which a run resumes; 0: none. There is also one after 2 minutes, then every 10,
+    and one when the run is stopped (Ctrl-C, SIGTERM, SIGHUP)."""
     keep: int = 2
     """Newest checkpoints to keep (one, if runs are side by side). They are deleted when the run has ended."""
     keep_end: bool = False

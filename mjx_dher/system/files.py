@@ -8,12 +8,13 @@ import functools
 import json
 import os
 import shutil
+import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.system import memory
+from mjx_dher.system import memory, signals
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -153,16 +154,17 @@ def new_folder(folder: Path) -> Iterator[None]:
       FolderError: it holds something already.
       OSError: it cannot be made or written to.
     """
+
+    def unlink_lock() -> None:
+        if not is_used(folder):
+            (folder / LOCK).unlink(missing_ok=True)  # none will wait for it: the folder goes, too
+
     with made(folder):
         if not (folder / LOCK).exists():  # else another program may be at work on it, which says more
             _refuse_used(folder)  # before a lock is left in what is someone else's
-        with lock(folder):
+        with lock(folder), signals.cleaning(unlink_lock):
             _refuse_used(folder)
-            try:
-                yield
-            finally:
-                if not is_used(folder):
-                    (folder / LOCK).unlink(missing_ok=True)  # none will wait for it: the folder goes, too
+            yield
 
 
 def _refuse_used(folder: Path) -> None:
@@ -197,16 +199,22 @@ def make_folder(folder: Path) -> list[Path]:
 def made(folder: Path) -> Iterator[None]:
     """Makes a folder, and those above it that are missing. Those of them that stay empty are removed at the end."""
     missing = make_folder(folder)
-    try:
+    with signals.cleaning(lambda: _remove_empty(missing)):
         yield
-    finally:
-        _remove_empty(missing)
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):  # something is in it
             folder.rmdir()
+
+
+@contextlib.contextmanager
+def temporary_folder(prefix: str) -> Iterator[Path]:
+    """Makes a private folder, which is removed at the end of the block."""
+    folder = tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+    with signals.cleaning(folder.cleanup):
+        yield Path(folder.name)
 
 
 @contextlib.contextmanager
@@ -288,9 +296,6 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """
     partial = path.with_name(path.name + PARTIAL)
     partial.unlink(missing_ok=True)  # what a kill has left, or a link, through which another file would be written
-    try:
-        with naming(path):
-            yield partial
-            partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with signals.cleaning(lambda: partial.unlink(missing_ok=True)), naming(path):
+        yield partial
+        partial.replace(path)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
+
+from mjx_dher.system import signals
 
 PACKAGE = Path(__file__).resolve().parents[1]  # the folder mjx_dher
 
@@ -30,19 +33,36 @@ class Answer(NamedTuple):
 def started(command: Sequence[str], variables: Mapping[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
     """Starts a program, with `variables` added to this one's environment, and kills it at the end of the block.
 
-    Its output goes to files, because a program stops at a full pipe that nobody reads.
+    Its output goes to files, because a program stops at a full pipe that nobody reads. It has a session of its own: a signal to
+    this program's group is this program's to answer.
     """
     environment = {**os.environ, **(variables or {})}
     with (
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as out,
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as err,
-        subprocess.Popen(command, env=environment, stdout=out, stderr=err, text=True) as process,
+        subprocess.Popen(command, env=environment, stdout=out, stderr=err, text=True, start_new_session=True) as process,
+        signals.cleaning(lambda: kill(process)),
     ):
         process.stdout, process.stderr = out, err
-        try:
-            yield process
-        finally:
-            process.kill()
+        yield process
+
+
+def kill(process: subprocess.Popen[Any]) -> None:
+    """Kills a program that leads a session, and those that it has started there."""
+    with contextlib.suppress(ProcessLookupError):  # all have ended
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def kill_sessions() -> None:
+    """Kills the processes, of whatever parent, in sessions that children of the main thread lead. Needs Linux."""
+    own = os.getpid()
+    with contextlib.suppress(OSError):
+        children = {int(pid) for pid in Path(f"/proc/{own}/task/{own}/children").read_text("ascii").split()}
+        leaders = [pid for pid in children if os.getsid(pid) == pid]  # they first: they start the others
+        for pid in (*leaders, *(int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())):
+            with contextlib.suppress(OSError):  # it has just ended
+                if os.getsid(pid) in leaders:
+                    os.kill(pid, signal.SIGKILL)
 
 
 def answer(process: subprocess.Popen[str], seconds: float | None = None) -> Answer:
@@ -51,7 +71,7 @@ def answer(process: subprocess.Popen[str], seconds: float | None = None) -> Answ
     try:
         process.wait(seconds)
     except subprocess.TimeoutExpired:
-        process.kill()
+        kill(process)
         process.wait()
         failure = f"did not end within {seconds:g} s"
     out, err = (_written(file) for file in (process.stdout, process.stderr))

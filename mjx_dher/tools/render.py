@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher import lookup
-from mjx_dher.system import files, private_api, subprocesses
+from mjx_dher.system import files, private_api, signals, subprocesses
 
 MOST_FPS = 50  # frames per second of a file: what a GIF can show
 HOLD_SECONDS = 0.4  # for which an episode's last frame is shown, so that the eye can compare object and goal
@@ -267,14 +267,13 @@ def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     kept = ["-r", str(MOST_FPS)] if fps > MOST_FPS else []
     with files.atomic_write(out) as partial:
         command = [ffmpeg(), "-v", "error", *source, *kept, *FORMATS[out.suffix.lower()], "-y", str(partial)]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdin=pipe, stderr=pipe, start_new_session=True) as process:
             assert process.stdin is not None
-            try:
+            with signals.cleaning(process.kill):  # still running only if a frame could not be drawn
                 with contextlib.suppress(BrokenPipeError):  # ffmpeg has failed; the reason is in its output
                     for frame in itertools.chain([first], frames):
                         process.stdin.write(np.ascontiguousarray(frame).data)
                 _, message = process.communicate()
-            finally:
-                process.kill()  # still running only if a frame could not be drawn
         if process.returncode != 0:
             raise ValueError(f"out: cannot write {out} ({message.decode(errors='replace').strip()})")

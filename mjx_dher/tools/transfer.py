@@ -13,7 +13,6 @@ import itertools
 import json
 import os
 import sys
-import tempfile
 import venv
 import warnings
 from collections.abc import Sequence
@@ -24,7 +23,7 @@ import numpy as np
 
 from mjx_dher.policy.load import load_policy
 from mjx_dher.runs.folder.run_folder import read_spec
-from mjx_dher.system import subprocesses
+from mjx_dher.system import files, subprocesses
 from mjx_dher.system.caches import user_cache
 
 ORIGINALS = {
@@ -89,14 +88,14 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+    with files.temporary_folder("mjx-dher-transfer-") as folder, contextlib.ExitStack() as stack:
         # A folder with this package only, without its neighbours: the other Python has its own NumPy and MuJoCo.
-        (Path(folder) / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
+        (folder / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
         processes = []
         for first, end in itertools.pairwise(bounds):
             arguments = (str(run.resolve()), str(end - first), str(seed + first))
             command = (str(python), "-m", "mjx_dher.tools.transfer", *arguments)
-            processes.append(stack.enter_context(subprocesses.started(command, {"PYTHONPATH": folder})))
+            processes.append(stack.enter_context(subprocesses.started(command, {"PYTHONPATH": str(folder)})))
         outcomes = []
         for process in processes:
             answer = subprocesses.answer(process)

@@ -6,7 +6,8 @@ import contextlib
 import dataclasses
 import functools
 import shutil
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from mjx_dher.system.files import FolderError
 from mjx_dher.trainer import TrainState
 
 NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
+SECONDS_TO_FIRST, SECONDS_BETWEEN = 120.0, 600.0  # checkpoints by the clock
+SHARE = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,6 +172,24 @@ class LaneCheckpoints:
                 shutil.rmtree(path.parent, ignore_errors=True)
         with contextlib.suppress(OSError):  # not empty, or never made
             self.shared.rmdir()
+
+
+class Schedule:
+    """Times of checkpoints: by epochs, and by the clock, by which at most `SHARE` of the time is spent on them."""
+
+    def __init__(self, epochs: int):
+        self._epochs, self._due = epochs, time.monotonic() + SECONDS_TO_FIRST
+
+    def is_due(self, epoch: int) -> bool:
+        """Whether to save after an epoch."""
+        return time.monotonic() >= self._due or (self._epochs > 0 and epoch % self._epochs == 0)
+
+    @contextlib.contextmanager
+    def saving(self) -> Iterator[None]:
+        """Times the block, which saves, and decides when the next one is due by the clock."""
+        began = time.monotonic()
+        yield
+        self._due = time.monotonic() + max(SECONDS_BETWEEN, (time.monotonic() - began) / SHARE)
 
 
 def _names(path: Path) -> list[str]:

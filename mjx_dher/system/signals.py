@@ -1,0 +1,207 @@
+"""Ctrl-C, SIGTERM and SIGHUP. No other module handles them.
+
+Python calls a handler in the main thread, between two instructions: late while a library compiles, and an exception that it
+raises can be lost in a library's callback. So the interpreter writes each signal to a pipe, which a thread reads. The thread
+ends the process at once, unless a block is `held`, which ends in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SECONDS_OF_ONE = 0.5  # in which more signals are the same one: `timeout`, srun and uv run pass on what the group has had
+SECONDS_TO_END = 7.0  # after a signal, for what follows the held blocks
+SECONDS_TO_CLEAN = 1.5
+STOPPING = "stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved"
+
+
+class Held:
+    """A block that looks at `asked` and ends in order; `alive` tells that it does not hang."""
+
+    def __init__(self, report: Callable[[str], None], told: str, patience: float):
+        self.report, self.told, self.patience = report, told, patience
+        self.alive()
+
+    def alive(self) -> None:
+        """Gives the block another `patience` seconds."""
+        self.heard = time.monotonic()
+
+
+class _Signals:
+    """The process's signals. The lock is for the main thread and the one that reads the pipe."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.pipe: tuple[int, int] | None = None
+        self.before: dict[int, Any] = {}  # the handlers that ours have replaced
+        self.asked: int | None = None
+        self.since = 0.0
+        self.blocks = [Held(lambda text: None, "stopped", SECONDS_TO_END)]  # the first is what is not held
+        self.cleaners: dict[object, Callable[[], object]] = {}
+
+    def listen(self, read: int) -> None:
+        """Reads the pipe for as long as the process lives."""
+        while True:
+            select.select([read], [], [], 1.0)
+            self.look()
+
+    def look(self) -> None:
+        """Answers the signals that have come."""
+        with self.lock:
+            for number in self.read():
+                if self.asked is None:
+                    self.asked, self.since = number, time.monotonic()
+                    if len(self.blocks) == 1:
+                        self.end(number)
+                    self.blocks[-1].report(STOPPING)
+                elif time.monotonic() - self.since > SECONDS_OF_ONE:
+                    self.end(number)
+            block = self.blocks[-1]
+            if self.asked is not None and time.monotonic() - max(self.since, block.heard) > block.patience:
+                self.end(self.asked)
+
+    def read(self) -> list[int]:
+        """Numbers of the signals that have come since the last call."""
+        with contextlib.suppress(BlockingIOError):
+            return [number for number in os.read(self.pipe[0], 1024) if number in NUMBERS] if self.pipe else []
+        return []
+
+    def end(self, number: int) -> None:
+        """Ends the process, whatever its other threads are at. Open files are closed as by a kill."""
+        limit = threading.Timer(SECONDS_TO_CLEAN, os._exit, [128 + number])  # a pipe that is full blocks whoever writes
+        limit.daemon = True
+        limit.start()
+        with contextlib.suppress(OSError):
+            os.write(2, f"{self.blocks[-1].told}\n".encode())
+            if os.isatty(1):
+                os.write(1, b"\x1b[?25h")  # a progress bar hides the cursor
+        for clean in (sys.stdout.flush, *reversed(list(self.cleaners.values()))):
+            with contextlib.suppress(Exception):
+                clean()
+        os._exit(128 + number)
+
+    def before_fork(self) -> None:
+        """Keeps signals back until a child has its own handlers."""
+        self.mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
+
+    def in_parent(self) -> None:
+        """Lets signals through again."""
+        signal.pthread_sigmask(signal.SIG_SETMASK, self.mask)
+
+    def in_child(self) -> None:
+        """Gives a forked child the handlers that were there before. It has no thread that reads, and shares the pipe."""
+        if self.before:
+            signal.set_wakeup_fd(-1)
+            for number, handler in self.before.items():
+                signal.signal(number, handler)
+        self.in_parent()
+
+
+_signals = _Signals()
+
+
+def take() -> None:
+    """Handles the process's signals from now on, if this is the main thread. SIGHUP stays ignored under `nohup`."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    if _signals.pipe is None:
+        _signals.pipe = os.pipe()
+        for end in _signals.pipe:
+            os.set_blocking(end, False)
+        os.register_at_fork(before=_signals.before_fork, after_in_parent=_signals.in_parent, after_in_child=_signals.in_child)
+        threading.Thread(target=_signals.listen, args=[_signals.pipe[0]], name="signals", daemon=True).start()
+    signal.set_wakeup_fd(_signals.pipe[1], warn_on_full_buffer=False)
+    for number in NUMBERS:
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            before = signal.signal(number, _wake)
+            _signals.before.setdefault(number, before or signal.SIG_DFL)
+
+
+def take_back() -> None:
+    """Handles the signals again, if this module does, after a library that may have taken them."""
+    if _signals.before:
+        take()
+
+
+def _wake(number: int, frame: object) -> None:
+    """Python writes to the pipe only for signals that have a handler."""
+
+
+@contextlib.contextmanager
+def taken() -> Iterator[None]:
+    """Handles the signals within the block, if nobody has called `take`, and gives them back."""
+    if _signals.before or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pipe = signal.set_wakeup_fd(-1)
+    take()
+    try:
+        yield
+    finally:
+        with _signals.lock:
+            signal.set_wakeup_fd(pipe)
+            for number, handler in _signals.before.items():
+                signal.signal(number, handler)
+            _signals.before.clear()
+            _signals.read()
+            _signals.asked = None
+
+
+def asked() -> int | None:
+    """The signal that asks the process to stop."""
+    _signals.look()
+    return _signals.asked
+
+
+def forget() -> None:
+    """Takes back the request to stop: all that was to be done has been done."""
+    _signals.asked = None
+
+
+def are_asked() -> bool:
+    """Whether a signal asks the process to stop."""
+    return asked() is not None
+
+
+@contextlib.contextmanager
+def held(report: Callable[[str], None], place: object, patience: float = math.inf) -> Iterator[Held]:
+    """Lets the block end in order after a first signal; it must look at `asked`. A second signal ends the process at once.
+
+    Args:
+      report: called with a line when a signal comes.
+      place: what the block does is saved there.
+      patience: seconds after which the process ends, if the block has been asked and does not call `alive`.
+    """
+    block = Held(report, f"stopped at once; what was saved is in {place}", patience)
+    take_back()
+    with _signals.lock:
+        _signals.blocks.append(block)
+    try:
+        yield block
+    finally:
+        with _signals.lock:
+            _signals.look()  # those that came in the block
+            _signals.blocks.remove(block)
+            _signals.blocks[-1].alive()
+
+
+@contextlib.contextmanager
+def cleaning(clean: Callable[[], object]) -> Iterator[None]:
+    """Calls `clean` at the end of the block, and also if a signal ends the process within the block."""
+    key = object()
+    _signals.cleaners[key] = clean
+    try:
+        yield
+    finally:
+        clean()
+        _signals.cleaners.pop(key)
