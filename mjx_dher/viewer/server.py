@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from mjx_dher.system import private_api
@@ -84,15 +85,15 @@ class Viewer:
     def choose(self, label: str) -> None:
         """Plays the policy by this name; one that cannot be played is told in the panel, and the one before goes on."""
         source = self._sources[label]
-        if _place(source) not in self._games:
+        if source.place not in self._games:
             self._panel.say(f"compiling `{source.env}` ...")
         try:
             cast, player = self._prepare(source)
-        except ValueError as error:
+        except Exception as error:  # of any kind, from custom code
             self._name()
             self._panel.say(f"{label} cannot be played: {error}")
             return
-        other_scene = _place(source) != _place(self._cast.source)
+        other_scene = source.place != self._cast.source.place
         self._cast, self.player = cast, player
         self._panel.adopt()
         if other_scene:
@@ -101,9 +102,9 @@ class Viewer:
         self.show(True)
 
     def _prepare(self, source: Source) -> tuple[Cast, Player]:
-        if _place(source) not in self._games:
-            self._games[_place(source)] = make_game(self._make_env(source))
-        game = self._games[_place(source)]
+        if source.place not in self._games:
+            self._games[source.place] = make_game(self._make_env(source))
+        game = self._games[source.place]
         cast = Cast(source, game.env)
         return cast, Player(game, cast.act, cast.value, self._seed)
 
@@ -183,8 +184,6 @@ class Viewer:
             return
         position, center = np.array(cameras[0].pos), np.array(model.stat.center)
         matrix = np.zeros(9)
-        import mujoco
-
         mujoco.mju_quat2Mat(matrix, cameras[0].quat)
         forward = -matrix.reshape(3, 3)[:, 2]
         look_at = position + forward * float(np.dot(center - position, forward))
@@ -192,11 +191,6 @@ class Viewer:
         for camera in (self._server.initial_camera, *(client.camera for client in self._server.get_clients().values())):
             camera.position, camera.look_at = position, look_at
             camera.fov = float(np.radians(cameras[0].fovy[0]))
-
-
-def _place(source: Source) -> tuple[Any, ...]:
-    """Returns what sources that are played in the same environment have in common."""
-    return source.env, source.env_kwargs
 
 
 def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:

@@ -29,6 +29,11 @@ class Source:
     run: RunSpec | None = None
     env_kwargs: tuple[str, ...] = ()  # arguments of the environment, NAME=VALUE each
 
+    @property
+    def place(self) -> tuple[str, tuple[str, ...]]:
+        """The environment and its arguments."""
+        return self.env, self.env_kwargs
+
 
 def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequence[str] = ()) -> Source:
     """Returns the source of a run's policy, which must be there.
@@ -69,11 +74,16 @@ class Cast:
     def __init__(self, source: Source, env: Any):
         self.source, self._env = source, env
         self.value: Value | None = None
-        self.critic = "" if source.folder else "Random actions have no critic."
         self.act: Act = _random(env.action_size)
+        self.critic = "Random actions have no critic."
         self._seen: tuple[int, ...] = ()
         self._critic_seen: Path | None = None
         if source.folder is not None:
+            self.critic = (
+                "No critic: it is in a run's checkpoints, and this run has none (with --keep-end one that has ended has)."
+            )
+            if bundled.is_shipped(source.folder):
+                self.critic = "No critic: the policies of the package come without one."
             self._load()
             self._load_critic()
 
@@ -91,10 +101,9 @@ class Cast:
 
     def about(self) -> str:
         """Returns how far the run has come, as Markdown."""
-        folder = self.source.folder
+        folder, text = self.source.folder, f"`{self.source.env}`"
         if folder is None:
-            return f"{RANDOM} in `{self._env_name}`"
-        text = f"`{self._env_name}`"
+            return f"{RANDOM} in {text}"
         try:
             if results.has_result(folder):
                 result = results.read_result(folder)
@@ -107,10 +116,6 @@ class Cast:
             return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
         except (FolderError, KeyError, IndexError, OSError, ValueError):  # what it plays is whole, and that is what counts
             return text
-
-    @property
-    def _env_name(self) -> str:
-        return self.source.env
 
     def _stamp(self) -> tuple[int, ...]:
         assert self.source.folder is not None
@@ -127,7 +132,7 @@ class Cast:
         try:
             load.check_fits(policy, self._env)
         except ValueError as error:
-            raise ValueError(f"{self.source.label} cannot be played in {self._env_name}: {error}") from None
+            raise ValueError(f"{self.source.label} cannot be played in {self.source.env}: {error}") from None
         self.act, self._seen = policy, stamp
 
     def _load_critic(self) -> None:
@@ -135,25 +140,16 @@ class Cast:
         folder, run = self.source.folder, self.source.run
         assert folder is not None
         assert run is not None
-        if bundled.is_shipped(folder):
-            self.critic = "No critic: the policies of the package come without one."
-            return
         newest = next(iter(run_folder.checkpoints(folder)), None)
-        if newest is None:
-            if self.value is None:
-                self.critic = (
-                    "No critic: it is in a run's checkpoints, and this run has none (with --keep-end one that has ended has)."
-                )
-            return
-        if newest == self._critic_seen:
+        if newest in (None, self._critic_seen):
             return
         self._critic_seen = newest
         try:
             loaded = critic.load(folder, run, self._env)
         except (ValueError, OSError) as error:  # ValueError: kernels that this machine cannot run, too
             self.critic = f"No critic: {error}."
-            return
-        self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
+        else:
+            self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
 
 
 def _random(action_size: int) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
