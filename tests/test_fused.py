@@ -1,7 +1,5 @@
 """The kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
 
-import copy
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,15 +8,13 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import envs
-from mjx_dher.envs import engines
 from mjx_dher.envs.engines.base import Controls, Physics
-from mjx_dher.envs.engines.features import fields
 from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
 from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps
-from mjx_dher.envs.engines.fused.support import has_default, is_read, unsupported
+from mjx_dher.envs.engines.fused.support import unsupported
 from mjx_dher.system.warp_setup import wp
 
 TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
@@ -177,97 +173,68 @@ def test_fields_of_memory_follow_one_another():
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
 
 
-WELDED = """
-<mujoco>{}<worldbody><body name="t" mocap="true"/><body name="b"><joint name="j"/><geom name="g" type="{}" size="1 1 1"
-contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" contype="0" conaffinity="0"/></worldbody>
-<equality><weld body1="t" body2="b" relpose="0 0 0 1 0 0 0"/></equality>
-<contact><pair geom1="g" geom2="o" condim="{}"/></contact></mujoco>
-"""
+def robot(seed):
+    """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random."""
+    rng = np.random.default_rng(seed)
+
+    def numbers(size, low=-1.0, high=1.0):
+        return " ".join(f"{x:.3f}" for x in rng.uniform(low, high, size))
+
+    def some(text):
+        return text if rng.random() < 0.5 else ""
+
+    chain, motors = "", ""
+    for link in range(4):
+        joints = ""
+        for j in range(rng.integers(1, 4)):
+            name, kind = f"j{link}{j}", rng.choice(["hinge", "hinge", "slide"])
+            joints += (
+                f'<joint name="{name}" type="{kind}" axis="{numbers(3)}" pos="{numbers(3, -0.1, 0.1)}"'
+                f' damping="{numbers(1, 0.1, 1)}" armature="{numbers(1, 0.05, 0.1)}"'
+                f" {some(f'stiffness={chr(34)}{numbers(1, 0, 2)}{chr(34)}')}"
+                f" {some(f'range={chr(34)}-0.3 0.3{chr(34)}')} {some(f'actuatorfrcrange={chr(34)}-0.5 0.7{chr(34)}')}/>"
+            )
+            motors += rng.choice(
+                [
+                    f'<position joint="{name}" kp="{numbers(1, 1, 20)}" kv="{numbers(1, 0, 2)}" gear="{numbers(1)}"/>',
+                    f'<motor joint="{name}" gear="{numbers(1, -2, 2)}" forcerange="-0.3 0.4" ctrlrange="-0.5 0.5"/>',
+                    f'<general joint="{name}" gainprm="3" biastype="affine" biasprm="0.1 -2 -1" forcerange="-1 1"/>',
+                ]
+            )
+        chain += f'<body pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}<geom type="box" size="0.05 0.04 0.06"/>'
+    boxes = "".join(
+        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/><geom type="box" size="0.06 0.06 0.06"'
+        f' priority="{rng.integers(2)}" friction="{numbers(1, 0.3, 1)}" condim="{rng.choice([1, 3, 4])}"'
+        f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'
+        for _ in range(2)
+    )
+    return mujoco.MjModel.from_xml_string(
+        f'''<mujoco><option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12"/><worldbody>
+<body name="t" mocap="true"/><geom type="plane" size="2 2 0.1"/>{boxes}<body pos="0 0 0.3">{chain}{"</body>" * 5}</worldbody>
+<actuator>{motors}</actuator></mujoco>'''
+    )
 
 
-def welded(extra="", shape="box", condim=3):
-    return mujoco.MjModel.from_xml_string(WELDED.format(extra, shape, condim))
-
-
-def test_unsupported_features_are_named_with_their_elements():
-    motor = '<actuator><general name="m" joint="j" {}/></actuator>'
-    cases = [
-        (welded(shape="sphere"), ["contacts of sphere and box", "'g'", "'o'"]),
-        (welded(condim=6), ["rolling friction", "'g'"]),
-        (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
-        (welded('<option integrator="implicitfast"/>'), ["integrator"]),
-        (welded('<option cone="elliptic"/>'), ["elliptic"]),
-        (welded('<option solver="CG"/>'), ["solver"]),
-        (welded('<option><flag gravity="disable"/></option>'), ["options disabled"]),
-        (welded('<option density="1.2"/>'), ["medium"]),
-        (welded('<default><joint frictionloss="1"/></default>'), ["friction in joints", "'j'"]),
-        (welded('<default><joint stiffness="1 2"/></default>'), ["springs", "'j'"]),
-        (welded('<default><joint actuatorfrcrange="-1 1"/></default>'), ["limits of joint torques", "'j'"]),
-        (welded('<option noslip_iterations="3"/>'), ["noslip"]),
-        (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints"]),
-        (welded(motor.format('dyntype="filter"')), ["activations", "actuators with a state", "'m'"]),
-        (welded(motor.format('delay="0.006" nsample="4"')), ["delays", "'m'"]),
-        (welded(motor.format('gear="-1"')), ["backwards", "'m'"]),
-        (mujoco.MjModel.from_xml_string("<mujoco/>"), ["exactly one weld"]),
-    ]
-    for model, parts in cases:
-        for part in parts:
-            assert part in " ".join(unsupported(model)), part
-    assert unsupported(welded()) == []
-    assert unsupported(welded('<sensor><jointpos joint="j"/></sensor>')) == []  # nobody reads it
-    for task in ("reach", "push", "slide", "pick_and_place"):
-        assert unsupported(envs.make(task, engine="native").model) == []
-
-
-class Recorded:
-    """A model, or its options, that notes which fields are read."""
-
-    def __init__(self, held, seen, prefix=""):
-        self._held, self._seen, self._prefix = held, seen, prefix
-
-    def __getattr__(self, name):
-        value = getattr(self._held, name)
-        if name in ("opt", "stat"):
-            return Recorded(value, self._seen, f"{name}.")
-        self._seen.add(self._prefix + name)
-        return value
-
-
-def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
-    """A field that a newer MuJoCo adds, too."""
-    seen = set()
-    model = envs.make("slide", engine="native").model
-    recorded = Recorded(model, seen)
-    contacts, dofs = setup.contacts_of(recorded), setup.dofs_of(recorded)
-    setup.bodies_of(recorded)
-    setup.layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs)
-    read = {name for name, _ in fields(model) if is_read(name)}
-    assert read - seen == {"opt.disableflags", "actuator_biastype", "eq_data"}  # which decide whether a model is taken
-    assert seen - read <= {"stat.meaninertia"}  # which follows from the masses
-    model = welded('<actuator><motor name="m" joint="j"/></actuator>')
-    checked = [name for name, _ in fields(model) if has_default(name)]
-    assert len(checked) > 40
-    assert {"jnt_actfrclimited", "geom_surfacevel", "actuator_armature", "pair_solreffriction", "opt.disableactuator"} <= {
-        *checked
-    }
-    for name in checked:
-        if name in ("na", "nflex", "nhistory", "nplugin", "ntendon"):
-            continue  # cannot be set
-        changed = copy.copy(model)
-        holder, field = (changed.opt, name[4:]) if name.startswith("opt.") else (changed, name)
-        if np.ndim(value := getattr(holder, field)):
-            value[...] = np.where(value == 1, 0, 1)
-        else:
-            setattr(holder, field, value + 1)
-        assert unsupported(changed), name
-
-
-def test_an_unsupported_model_is_rejected():
-    with refuses("engine", "warp", "sphere"):
-        engines.make_engine("warp", welded(shape="sphere"), 20, path="fused", allow_cpu=True)
-    with refuses("engine", "warp", "actuator_armature", "native"):
-        model = welded('<actuator><motor name="m" joint="j" armature="1"/></actuator>')
-        engines.make_engine("warp", model, 20, allow_cpu=True)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
+def test_a_timestep_of_a_random_robot_is_mujoco_c_s(seed):
+    model = robot(seed)
+    assert unsupported(model) == []
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    qpos, qvel = np.tile(model.qpos0, (NUM, 1)), 0.3 * rng.standard_normal((NUM, model.nv))
+    qpos[:, 14:] += 0.2 * rng.standard_normal((NUM, model.nq - 14))
+    qpos[:, [0, 1, 7, 8]] += 0.1 * rng.standard_normal((NUM, 4))
+    inputs = np.concatenate([np.tile([0, 0, 0, 1, 0, 0, 0], (NUM, 1)), rng.uniform(-1, 1, (NUM, model.nu))], axis=1)
+    there = in_c(model, qpos, qvel, inputs)
+    here = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]
+    Simulation(model, NUM, substeps=1).advance(
+        (floats(qpos), floats(qvel), floats(np.zeros((NUM, model.nv)))), floats(inputs), tuple(here)
+    )
+    assert there[0].max() > 12
+    assert data.nefc == 0
+    for name, a, b, scale in zip(("qpos", "qvel", "qacc"), here, there[:0:-1], (1e-6, 1e-4, 1e-4)):
+        error = np.quantile(np.abs(a.numpy() - b).max(axis=1), 0.8)
+        assert error < scale * np.abs(b).max(), name
 
 
 def test_most_rows_are_what_all_pairs_can_give_at_once():

@@ -15,7 +15,6 @@ _CURES = {
     "elliptic": 'cone="pyramidal"',
     "noslip": 'noslip_iterations="0"',
     "solver": 'solver="Newton"',
-    "contacts of geoms that no pair lists": 'list the pairs in <contact>, with contype="0" conaffinity="0" on the geoms',
     "nativeccd": '<flag nativeccd="disable"/>',
     "stand_in": "add the geom that it names",
     "friction in joints": 'frictionloss="0"',

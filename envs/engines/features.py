@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 _WORDS = {
-    "opt.integrator": "an integrator other than Euler",
     "opt.cone": "elliptic friction cones",
     "opt.solver": "a solver other than Newton's",
     "opt.enableflags": "options enabled",
@@ -31,7 +30,6 @@ _WORDS = {
     "dof_frictionloss": "friction in joints",
     "dof_dampingpoly": "damping that is not linear",
     "jnt_stiffnesspoly": "springs that are not linear",
-    "jnt_actfrclimited": "limits of joint torques",
     "pair_gap": "contacts with a gap",
     "pair_solreffriction": "contacts with a softness of friction",
 }

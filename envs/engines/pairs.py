@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 
@@ -39,6 +41,47 @@ def meeting(model: mujoco.MjModel) -> np.ndarray:
     return pairs[~planes.all(axis=1)].astype(np.int32)
 
 
+class Pairs(NamedTuple):
+    """Pairs of geoms that can touch, and the numbers of their contacts [n, ...]: MuJoCo's pair_*."""
+
+    geom1: np.ndarray
+    geom2: np.ndarray
+    dim: np.ndarray
+    margin: np.ndarray
+    friction: np.ndarray  # [n, 5]
+    solref: np.ndarray
+    solimp: np.ndarray
+
+
+def all_pairs(model: mujoco.MjModel) -> Pairs:
+    """The pairs that a model lists, and those that meet otherwise, with numbers mixed from their geoms' as in MuJoCo C."""
+    listed = [getattr(model, f"pair_{name}") for name in Pairs._fields]
+    others = meeting(model)
+    if not len(others):
+        return Pairs(*listed)
+    priority = model.geom_priority[others]
+    leads = np.stack([priority[:, 0] > priority[:, 1], priority[:, 1] > priority[:, 0]], axis=1)  # else both count
+    mix = model.geom_solmix[others]
+    share = mix / np.maximum(mix.sum(axis=1, keepdims=True), 1e-15)
+    share[mix.sum(axis=1) < 1e-15] = 0.5
+    share = np.where(leads.any(axis=1, keepdims=True), leads, share)[..., None]
+    solref = model.geom_solref[others]
+    blend = np.where((solref[..., :1] > 0).all(axis=1), (share * solref).sum(axis=1), solref.min(axis=1))
+    led = np.where(leads[:, :1], solref[:, 0], solref[:, 1])
+    counts = np.where(leads.any(axis=1, keepdims=True), leads, True)
+    friction = np.where(counts[..., None], model.geom_friction[others], -np.inf).max(axis=1)
+    mixed = Pairs(
+        others[:, 0],
+        others[:, 1],
+        np.where(counts, model.geom_condim[others], 0).max(axis=1),
+        model.geom_margin[others].sum(axis=1),
+        np.maximum(friction[:, [0, 0, 1, 2, 2]], 1e-5),
+        np.where(leads.any(axis=1, keepdims=True), led, blend),
+        (share * model.geom_solimp[others]).sum(axis=1),
+    )
+    return Pairs(*(np.concatenate(both) for both in zip(listed, mixed)))
+
+
 def most_contacts(model: mujoco.MjModel, geom1: int, geom2: int) -> int:
     """The most contacts that two geoms can have."""
     kind = tuple(sorted((type_of(model, geom1), type_of(model, geom2)), key=_TYPES.index))
@@ -53,11 +96,10 @@ def most(model: mujoco.MjModel) -> tuple[float, float]:
     """The most contacts, and the most rows of constraints, that a simulation can have."""
     if model.nflex:
         return np.inf, np.inf
-    ends_dim = [(*ends, int(max(model.geom_condim[ends]))) for ends in meeting(model)]
-    ends_dim += [(*ends, int(dim)) for *ends, dim in zip(model.pair_geom1, model.pair_geom2, model.pair_dim)]
-    contacts = [most_contacts(model, geom1, geom2) for geom1, geom2, _ in ends_dim]
+    pairs = all_pairs(model)
+    contacts = [most_contacts(model, geom1, geom2) for geom1, geom2 in zip(pairs.geom1, pairs.geom2)]
     elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    rows = [dim if elliptic or dim == 1 else 2 * dim - 2 for *_, dim in ends_dim]
+    rows = [dim if elliptic or dim == 1 else 2 * dim - 2 for dim in pairs.dim.tolist()]
     others = 6 * model.neq + model.nv + model.ntendon  # of equality constraints and friction
     limits = int(np.count_nonzero(model.jnt_limited)) + int(np.count_nonzero(model.tendon_limited))
     return sum(contacts), others + 2 * limits + sum(n * row for n, row in zip(contacts, rows))

@@ -65,8 +65,17 @@ def _at(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
 
 @wp.func
 def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
-    """Sets the first six rows: the target's position less the body's, and the rotation between them."""
+    """Sets the first six rows: the target's position less the body's, and the rotation between them. Without a weld they have
+    no weight.
+    """
     body, target, nv = world.weld_body, world.weld_target, dofs.number
+    if body < 0:
+        for i in range(thread, 6 * nv, threads):
+            memory.jacobian[i] = 0.0
+        for k in range(thread, 6, threads):
+            memory.weight[k] = 0.0
+            memory.residual[k] = 0.0
+        return
     arm = memory.pos[body] - memory.pos[bodies.root[body]]
     q = memory.quat[body]
     inverse = wp.vec4(q[0], -q[1], -q[2], -q[3])

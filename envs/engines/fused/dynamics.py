@@ -70,8 +70,9 @@ def kinematics(
                 wp.vec4(memory.qpos[first + 3], memory.qpos[first + 4], memory.qpos[first + 5], memory.qpos[first + 6])
             )
         elif kind == _MOCAP:
-            pos = wp.vec3(inputs[0], inputs[1], inputs[2])
-            quat = wp.normalize(wp.vec4(inputs[3], inputs[4], inputs[5], inputs[6]))
+            at = 7 * bodies.dof[b]
+            pos = wp.vec3(inputs[at], inputs[at + 1], inputs[at + 2])
+            quat = wp.normalize(wp.vec4(inputs[at + 3], inputs[at + 4], inputs[at + 5], inputs[at + 6]))
         memory.pos[b] = pos
         memory.quat[b] = quat
     sync(threads)
@@ -203,10 +204,12 @@ def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(d
         memory.momentum[i] = momentum
         smooth = _passive(dofs, memory, i)
         smooth -= wp.dot(motion, force)
+        drive = float(0.0)
         for a in range(dofs.actuators):
             if dofs.actuator_dof[a] == i:
-                smooth += _actuation(dofs, a, inputs[7 + a], memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
-        memory.smooth[i] = smooth
+                control = inputs[dofs.first_control + a]
+                drive += _actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+        memory.smooth[i] = smooth + wp.clamp(drive, dofs.drive[i][0], dofs.drive[i][1])
     sync(threads)
 
 
@@ -238,6 +241,21 @@ def _actuation(dofs: Dofs, a: int, control: float, length: float, velocity: floa
     factors = dofs.actuator_force[a]
     force = factors[0] + factors[1] * length + factors[2] * velocity + factors[3] * wp.clamp(control, clip[0], clip[1])
     return wp.clamp(force, clip[2], clip[3])
+
+
+@wp.func
+def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> float:
+    """Minus the derivative of forces by the velocity of a degree of freedom, for the integrator."""
+    all_of_it = dofs.damping[i]
+    if dofs.implicit == 1:
+        for a in range(dofs.actuators):
+            if dofs.actuator_dof[a] == i:
+                clip = dofs.actuator_clip[a]
+                control = inputs[dofs.first_control + a]
+                force = _actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+                if force > clip[2] and force < clip[3]:
+                    all_of_it -= dofs.actuator_force[a][2]
+    return all_of_it
 
 
 @wp.func

@@ -81,12 +81,22 @@ def _constraints(
 
 
 @wp.func
-def _go_on(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, nv: int, warps: int, thread: int, threads: int):
+def _go_on(
+    world: World,
+    bodies: Bodies,
+    dofs: Dofs,
+    memory: Memory,
+    given: wp.array(dtype=float),  # type: ignore[valid-type]
+    nv: int,
+    warps: int,
+    thread: int,
+    threads: int,
+):
     """Advances velocities and places."""
     gather(warps)
     solve(world, memory, nv, thread, threads)
     gather(warps)
-    accelerate(world, dofs, memory, nv, thread, threads)
+    accelerate(world, dofs, memory, given, nv, thread, threads)
     gather(warps)
     integrate(world, bodies, memory, thread, threads)
 
@@ -144,7 +154,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
                 gather(wp.static(warps))
                 collide_cylinders(contacts, memory, thread, threads)
             _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), thread, threads)
-            _go_on(world, bodies, dofs, memory, wp.static(nv), wp.static(warps), thread, threads)
+            _go_on(world, bodies, dofs, memory, given, wp.static(nv), wp.static(warps), thread, threads)
         copy(memory.qpos, qpos[env], thread, threads)
         copy(memory.qvel, qvel[env], thread, threads)
         copy(memory.qacc, guess[env], thread, threads)

@@ -16,7 +16,7 @@ _mat33s, _soft = wp.array(dtype=wp.mat33), wp.array(dtype=Softness)
 
 @wp.struct
 class Bodies:
-    """Bodies [nbody]. A parent comes before its children, and a body's subtree follows it without a gap."""
+    """Bodies with one joint at most. A parent comes before its children, and a body's subtree follows it without a gap."""
 
     number: int
     parent: _ints
@@ -25,7 +25,7 @@ class Bodies:
     moved_by: _ints  # mask of the degrees of freedom that move it
     kind: _ints  # STILL, HINGE, ...
     qpos: _ints  # index of its first coordinate
-    dof: _ints  # index of its first degree of freedom
+    dof: _ints  # index of its first degree of freedom; of a mocap body, its number
     pos: _vec3s  # in the parent's frame
     quat: _quats
     axis: _vec3s  # of the joint, in the body's frame
@@ -45,6 +45,9 @@ class Dofs:
     body: _ints
     armature: _floats
     damping: _floats
+    implicit: int  # 1 for implicitfast: velocities are implicit in the forces of actuators, too, not in damping alone
+    drive: wp.array(dtype=wp.vec2)  # least and most force of all actuators on it
+    first_control: int  # index of the first control, behind the poses of mocap bodies
     stiffness: _floats  # 0 except for joints of one coordinate
     qpos: _ints  # index of the coordinate
     rest: _floats
@@ -92,7 +95,7 @@ class World:
 
     timestep: float
     gravity: wp.vec3
-    weld_body: int
+    weld_body: int  # -1 if there is no weld
     weld_target: int
     weld_soft: Softness
     weld_weight: wp.vec2  # inverse inertia of translation and rotation

@@ -1,12 +1,13 @@
 """Converts a MuJoCo model to the structs of the fused substep."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
+from mjx_dher.envs.engines.pairs import all_pairs
 from mjx_dher.system.warp_setup import wp
 
 CONTACT_KINDS = {
@@ -57,48 +58,71 @@ def _softness(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> 
     return Softness(k, b, least, most, width, middle, max(power, 1.0))
 
 
-def _joints_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+class _Links(NamedTuple):
+    """Bodies of the kernel, which have one joint at most: a body with several joints has massless ones before it."""
+
+    body: np.ndarray  # [n] the model's body
+    joint: np.ndarray  # [n] its joint, or -1
+    first: np.ndarray  # [nbody] the first link of each body
+    last: np.ndarray  # [nbody] the last one, which has the mass and the geoms
+
+
+def links_of(model: mujoco.MjModel) -> _Links:
+    """Returns the links of a model."""
+    number = np.maximum(model.body_jntnum, 1)
+    last = np.cumsum(number) - 1
+    body = np.repeat(np.arange(model.nbody), number)
+    first = last - number + 1
+    joint = np.where(model.body_jntnum[body] > 0, model.body_jntadr[body] + np.arange(len(body)) - first[body], -1)
+    return _Links(body, joint, first, last)
+
+
+def _joints_of(model: mujoco.MjModel, links: _Links, parent: np.ndarray) -> dict[str, np.ndarray]:
     """The fields of `Bodies` that describe joints."""
-    kind, qpos, dof, moved_by = (np.zeros(model.nbody, np.int32) for _ in range(4))
-    axis, anchor, rest = np.zeros((model.nbody, 3)), np.zeros((model.nbody, 3)), np.zeros(model.nbody)
-    for body in range(model.nbody):
-        moved_by[body] = moved_by[model.body_parentid[body]]
+    number = len(links.body)
+    kind, qpos, dof, moved_by = (np.zeros(number, np.int32) for _ in range(4))
+    axis, anchor, rest = np.zeros((number, 3)), np.zeros((number, 3)), np.zeros(number)
+    for link, (body, joint) in enumerate(zip(links.body, links.joint)):
+        moved_by[link] = moved_by[parent[link]]
         if model.body_mocapid[body] >= 0:
-            kind[body] = kinds.MOCAP
-        if model.body_jntnum[body]:
-            joint = model.body_jntadr[body]
-            kind[body] = _JOINTS[int(model.jnt_type[joint])]
-            qpos[body], dof[body] = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-            axis[body], anchor[body], rest[body] = model.jnt_axis[joint], model.jnt_pos[joint], model.qpos0[qpos[body]]
-            for i in range(dof[body], dof[body] + model.body_dofnum[body]):
-                moved_by[body] |= 1 << i
+            kind[link], dof[link] = kinds.MOCAP, model.body_mocapid[body]
+        if joint >= 0:
+            kind[link] = _JOINTS[int(model.jnt_type[joint])]
+            qpos[link], dof[link] = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            axis[link], anchor[link], rest[link] = model.jnt_axis[joint], model.jnt_pos[joint], model.qpos0[qpos[link]]
+            for i in range(dof[link], dof[link] + (6 if kind[link] == kinds.FREE else 1)):
+                moved_by[link] |= 1 << i
     return {"kind": kind, "qpos": qpos, "dof": dof, "moved_by": moved_by, "axis": axis, "anchor": anchor, "rest": rest}
 
 
-def _last_below(model: mujoco.MjModel) -> np.ndarray:
-    """Last descendant [nbody] int32 of each body: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
-    last = np.arange(model.nbody, dtype=np.int32)
-    for body in range(model.nbody - 1, 0, -1):
-        parent = model.body_parentid[body]
-        last[parent] = max(last[parent], last[body])
+def _last_below(parent: np.ndarray) -> np.ndarray:
+    """Last descendant [n] int32 of each link: MuJoCo numbers depth first, so b's subtree is b to last_below[b]."""
+    last = np.arange(len(parent), dtype=np.int32)
+    for link in range(len(parent) - 1, 0, -1):
+        last[parent[link]] = max(last[parent[link]], last[link])
     return last
 
 
 def bodies_of(model: mujoco.MjModel) -> Any:
     """Returns `Bodies` of a model."""
+    links = links_of(model)
+    body, number = links.body, np.arange(len(links.body))
+    begins, ends = links.first[body] == number, links.last[body] == number
+    parent = np.where(begins, links.last[model.body_parentid[body]], number - 1)
+    parent[0] = 0
     return _fill(
         Bodies,
-        number=model.nbody,
-        parent=model.body_parentid,
-        root=model.body_rootid,
-        last=_last_below(model),
-        pos=model.body_pos,
-        quat=model.body_quat,
-        com=model.body_ipos,
-        principal=_matrices(model.body_iquat),
-        mass=model.body_mass,
-        inertia=model.body_inertia,
-        **_joints_of(model),
+        number=len(body),
+        parent=parent,
+        root=links.first[model.body_rootid[body]],
+        last=_last_below(parent),
+        pos=model.body_pos[body] * begins[:, None],
+        quat=np.where(begins[:, None], model.body_quat[body], [1.0, 0.0, 0.0, 0.0]),
+        com=model.body_ipos[body],
+        principal=_matrices(model.body_iquat[body]),
+        mass=model.body_mass[body] * ends,
+        inertia=model.body_inertia[body] * ends[:, None],
+        **_joints_of(model, links, parent),
     )
 
 
@@ -111,12 +135,18 @@ def dofs_of(model: mujoco.MjModel) -> Any:
     driven = model.actuator_trnid[:, 0]
     gear, gain, bias = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
     everything = np.array([-np.inf, np.inf])
+    links = links_of(model)
+    link_of_joint = np.flatnonzero(links.joint >= 0)  # in the order of joints
+    drive = np.where(model.jnt_actfrclimited[joints, None], model.jnt_actfrcrange[joints], everything)
     return _fill(
         Dofs,
         number=model.nv,
-        body=model.dof_bodyid,
+        body=link_of_joint[joints],
         armature=model.dof_armature,
         damping=model.dof_damping,
+        implicit=int(model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+        drive=drive,
+        first_control=7 * model.nmocap,
         stiffness=np.where(scalar, model.jnt_stiffness[joints], 0),
         qpos=qpos,
         rest=model.qpos_spring[qpos],
@@ -133,7 +163,11 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         actuator_clip=np.concatenate(
             [
                 np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, everything),
-                np.where(model.actuator_forcelimited[:, None], model.actuator_forcerange * gear[:, None], everything),
+                np.where(
+                    model.actuator_forcelimited[:, None],
+                    np.sort(model.actuator_forcerange * gear[:, None], axis=1),
+                    everything,
+                ),
             ],
             axis=1,
         ),
@@ -141,17 +175,18 @@ def dofs_of(model: mujoco.MjModel) -> Any:
 
 
 def contacts_of(model: mujoco.MjModel) -> Any:
-    """Returns `Contacts` of a model: the pairs that it lists."""
-    geom1, geom2 = model.pair_geom1.copy(), model.pair_geom2.copy()
+    """Returns `Contacts` of a model: the pairs that it lists, and those that meet by contype and conaffinity."""
+    pairs = all_pairs(model)
+    geom1, geom2 = pairs.geom1.copy(), pairs.geom2.copy()
     swap = model.geom_type[geom1] > model.geom_type[geom2]
     geom1[swap], geom2[swap] = geom2[swap], geom1[swap]
     kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
-    slide = model.pair_friction[:, 0]
+    slide = pairs.friction[:, 0]
     weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
     return _fill(
         Contacts,
-        geom_body=model.geom_bodyid,
+        geom_body=links_of(model).last[model.geom_bodyid],
         geom_pos=model.geom_pos,
         geom_mat=_matrices(model.geom_quat),
         geom_size=model.geom_size,
@@ -162,11 +197,11 @@ def contacts_of(model: mujoco.MjModel) -> Any:
         kind=kind,
         first=np.cumsum(most) - most,
         most=most,
-        margin=model.pair_margin,
-        dim=model.pair_dim,
-        friction=model.pair_friction[:, [0, 1, 2]],
-        soft=[_softness(model, *soft) for soft in zip(model.pair_solref, model.pair_solimp)],
-        weight=weight * np.where(model.pair_dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
+        margin=pairs.margin,
+        dim=pairs.dim,
+        friction=pairs.friction[:, [0, 1, 2]],
+        soft=[_softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
+        weight=weight * np.where(pairs.dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
         slots=int(most.sum()),
         pair=np.repeat(np.arange(len(kind)), most),
         rounds=2,
@@ -181,16 +216,22 @@ def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]
 
 def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     """Returns `World` of a model, with room for up to `most_rows` rows of constraints."""
-    body, target = int(model.eq_obj2id[0]), int(model.eq_obj1id[0])
-    dims = np.asarray(model.pair_dim)[contacts.pair.numpy()]
+    welds = {}
+    if model.neq:
+        body, target = int(model.eq_obj2id[0]), int(model.eq_obj1id[0])
+        welds = {
+            "weld_soft": _softness(model, model.eq_solref[0], model.eq_solimp[0]),
+            "weld_weight": wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
+        }
+    links = links_of(model)
+    dims = contacts.dim.numpy()[contacts.pair.numpy()]
     return _fill(
         World,
         timestep=model.opt.timestep,
         gravity=wp.vec3(*model.opt.gravity),
-        weld_body=body,
-        weld_target=target,
-        weld_soft=_softness(model, model.eq_solref[0], model.eq_solimp[0]),
-        weld_weight=wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
+        weld_body=int(links.last[body]) if welds else -1,
+        weld_target=int(links.last[target]) if welds else -1,
+        **welds,
         rows=min(most_rows, 6 + int(np.count_nonzero(model.jnt_limited)) + int(np.where(dims == 1, 1, 2 * dims - 2).sum())),
         tolerance=model.opt.tolerance,
         iterations=model.opt.iterations,
@@ -201,7 +242,7 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
 
 def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any) -> Any:
     """Returns `Layout` for a model."""
-    nb, nv, rows = model.nbody, model.nv, world.rows
+    nb, nv, rows = len(links_of(model).body), model.nv, world.rows
     lengths = {
         **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
         **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "qvel"), nv),

@@ -5,6 +5,7 @@ other forces: convex and quadratic in pieces, so that Newton's step from a point
 E. Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops on its own.
 """
 
+from mjx_dher.envs.engines.fused.dynamics import damping
 from mjx_dher.envs.engines.fused.linear import direction
 from mjx_dher.envs.engines.fused.model import Dofs, Memory, World
 from mjx_dher.envs.engines.fused.threads import sync, total
@@ -160,11 +161,11 @@ def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
 
 
 @wp.func
-def accelerate(world: World, dofs: Dofs, memory: Memory, nv: int, thread: int, threads: int):
+def accelerate(world: World, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), nv: int, thread: int, threads: int):
     """Advances velocities by all forces, implicitly in damping."""
     sync(threads)
     for i in range(thread, nv, threads):
-        memory.mass[i * nv + i] = memory.mass[i * nv + i] + world.timestep * dofs.damping[i]
+        memory.mass[i * nv + i] = memory.mass[i * nv + i] + world.timestep * damping(dofs, memory, inputs, i)
     sync(threads)
     direction(
         memory.mass,

@@ -8,17 +8,19 @@ import numpy as np
 
 from mjx_dher.envs.engines.features import beyond_defaults, with_names
 from mjx_dher.envs.engines.fused import setup
+from mjx_dher.envs.engines.pairs import all_pairs
 
 # Fields of MjModel that `setup` reads, with restrictions below.
 _READ = re.compile(
     "|".join(
         [
             r"actuator_(biasprm|biastype|ctrllimited|ctrlrange|forcelimited|forcerange|gainprm|gear|trnid)",
-            r"body_(dofnum|inertia|invweight0|ipos|iquat|jntadr|jntnum|mass|mocapid|parentid|pos|quat|rootid)",
-            r"dof_(armature|bodyid|damping|invweight0|jntid)|eq_(data|obj1id|obj2id|solimp|solref)",
-            r"geom_(bodyid|pos|quat|rbound|size|type)|nbody|nq|nu|nv|qpos0|qpos_spring",
-            r"jnt_(axis|dofadr|limited|margin|pos|qposadr|range|solimp|solref|stiffness|type)",
-            r"opt\.(disableflags|gravity|impratio|iterations|ls_iterations|timestep|tolerance)",
+            r"body_(inertia|invweight0|ipos|iquat|jntadr|jntnum|mass|mocapid|parentid|pos|quat|rootid)",
+            r"dof_(armature|damping|invweight0|jntid)|eq_(data|obj1id|obj2id|objtype|solimp|solref|type)",
+            r"geom_(bodyid|conaffinity|condim|contype|friction|margin|pos|priority|quat|rbound|size|solimp|solmix|solref|type)",
+            r"nbody|nq|nu|nv|qpos0|qpos_spring",
+            r"jnt_(actfrclimited|actfrcrange|axis|dofadr|limited|margin|pos|qposadr|range|solimp|solref|stiffness|type)",
+            r"opt\.(disableflags|gravity|impratio|integrator|iterations|ls_iterations|timestep|tolerance)",
             r"pair_(dim|friction|geom1|geom2|margin|solimp|solref)",
         ]
     )
@@ -33,12 +35,11 @@ _WITHOUT_EFFECT = re.compile(
             r"n(?!tendon$|flex$|plugin$|history$|a$)[a-zA-Z0-9]+(_\w+)?",
             # What follows from other fields, or is empty without tendons, flexes and plugins.
             r"(ten|tendon|wrap|flex\w*|plugin|efm0|efmC|tree)_.*|plugin",
-            r"[BDM]_\w+|map\w+|dof_(M0|Madr|length|parentid|simplenum|treeid)|jnt_(bodyid|actuatorid)|pair_signature",
-            r"body_(bvh\w+|conaffinity|contype|dofadr|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
+            r"[BDM]_\w+|map\w+|dof_(M0|Madr|bodyid|length|parentid|simplenum|treeid)|jnt_(bodyid|actuatorid)|pair_signature",
+            r"body_(bvh\w+|conaffinity|contype|dofadr|dofnum|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
             r"geom_(aabb|sameframe|dataid)|actuator_(acc0|ctrladr|ctrlnum|ctrlspec|outadr|outnum|length0|lengthrange|historyadr)",
-            # What belongs to a feature that is left out, or to contacts of geoms that no pair lists.
-            r"dof_sol(imp|ref)|jnt_actfrcrange|opt\.(o_\w+|noslip_tolerance|wind)",
-            r"geom_(contype|conaffinity|condim|friction|gap|margin|priority|solimp|solmix|solref)",
+            # What belongs to a feature that is left out.
+            r"dof_sol(imp|ref)|opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
             r"opt\.(jacobian|ls_tolerance|magnetic|sleep_tolerance|sdf_\w+|ccd_\w+)",
         ]
     )
@@ -73,40 +74,40 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
         ("jnt", "springs of free joints"): (model.jnt_stiffness != 0) & ~scalar,
         ("jnt", "limits of free joints"): (model.jnt_limited != 0) & ~scalar,
-        ("body", "bodies with several joints"): model.body_jntnum > 1,
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
-        ("actuator", "actuators that pull backwards"): model.actuator_gear[:, 0] <= 0,
         ("actuator", "actuators of free or ball joints"): on_joint & ~np.isin(driven, (_HINGE, _SLIDE)),
     }
     for (kind, what), which in features.items():
         if which.any():
             yield with_names(what, model, kind, np.flatnonzero(which))
+    if model.opt.integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        yield "an integrator other than Euler and implicitfast"
     if model.opt.disableflags & ~_KNOWN_FLAGS:
         yield "options disabled"
-    if model.nv > 31:
-        yield "more than 31 degrees of freedom"
-    if not _has_plain_weld(model):
-        yield "equality constraints other than exactly one weld of a mocap body"
+    if not 0 < model.nv <= 31:
+        yield "no degrees of freedom, or more than 31"
+    plain = [_is_plain_weld(model, index) for index in range(model.neq)]
+    if plain not in ([], [True]):
+        yield with_names("equality constraints other than one weld of a mocap body", model, "eq", range(model.neq))
 
 
-def _has_plain_weld(model: mujoco.MjModel) -> bool:
-    """Whether the only equality constraint welds the only mocap body to another body with the same frame."""
-    if model.neq != 1 or model.nmocap != 1:
+def _is_plain_weld(model: mujoco.MjModel, index: int) -> bool:
+    """Whether an equality constraint welds a mocap body to another body with the same frame."""
+    if model.eq_type[index] != mujoco.mjtEq.mjEQ_WELD or model.eq_objtype[index] != mujoco.mjtObj.mjOBJ_BODY:
         return False
-    bodies = model.eq_objtype[0] == mujoco.mjtObj.mjOBJ_BODY and model.body_mocapid[model.eq_obj1id[0]] == 0
-    return bool(bodies and np.allclose(model.eq_data[0, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1]))
+    same_frame = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
+    return bool(same_frame and model.body_mocapid[model.eq_obj1id[index]] >= 0)
 
 
 def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
-    if np.any(model.geom_contype) and np.any(model.geom_conaffinity):
-        yield with_names("contacts of geoms that no pair lists", model, "geom", np.flatnonzero(model.geom_contype))
-    for index, ends in enumerate(zip(model.pair_geom1, model.pair_geom2)):
+    pairs = all_pairs(model)
+    for *ends, dim in zip(pairs.geom1, pairs.geom2, pairs.dim):
         kind, what = setup.pair_types(model, *ends), None
         if kind not in setup.CONTACT_KINDS:
             what = f"contacts of {kind[0].lower()} and {kind[1].lower()}"
         elif kind == ("CYLINDER", "BOX") and not model.opt.disableflags & _OLDER_CCD:
             what = "contacts of cylinders and boxes without nativeccd=disable"
-        elif model.pair_dim[index] > 4:
+        elif dim > 4:
             what = "contacts with rolling friction"
         if what:
             yield with_names(what, model, "geom", ends)
