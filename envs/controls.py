@@ -17,6 +17,7 @@ from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.kinematics import Place, names_of, to_quat
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
+from mjx_dher.validation import check_number
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_NONE)
@@ -29,7 +30,7 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
       ValueError: no name fits a pattern; the message lists the names.
     """
     chosen: set[int] = set()
-    for pattern in patterns.split():
+    for pattern in str(patterns).split() or [""]:
         fitting = {i for names in columns for i, name in enumerate(names) if name and fnmatch.fnmatchcase(name, pattern)}
         if not fitting:
             check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
@@ -63,6 +64,7 @@ class Actuators(Control):
         self.names = names
 
     def bind(self, model: mujoco.MjModel) -> Self:
+        check_number("scale of control", self.scale, "(0, inf)", float)
         bound = copy.copy(self)
         own, joints = [""] * model.nu, [""] * model.nu  # names of actuators of this kind, and of their joints
         for i in filter(lambda i: self._suits(model, i), range(model.nu)):
@@ -85,6 +87,7 @@ class Actuators(Control):
     def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
         pass
 
+    scale = 1.0
     indices: list[int]
     low: np.ndarray  # [size]
     high: np.ndarray  # [size]
@@ -147,6 +150,8 @@ class Mocap(Control):
         self.body, self.scale, self.turn = body, scale, turn
 
     def bind(self, model: mujoco.MjModel) -> Self:
+        check_number("scale of control", self.scale, "(0, inf)", float)
+        check_number("turn of control", self.turn, "[0, inf)", float)
         bound = copy.copy(self)
         mocap = {name: i for i, name in enumerate(names_of(model, "body")) if model.body_mocapid[i] >= 0}
         check_name("mocap body", self.body, mocap)

@@ -18,6 +18,7 @@ import numpy as np
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import State
 from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.starts import Range
 from mjx_dher.envs.task import MujocoTask, Position
 from mjx_dher.types import Array, EnvSpec, PRNGKey
 
@@ -96,7 +97,7 @@ class FetchEnv(MujocoTask):
         self._object = None
         if has_object:
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
-            self._object = (self._object_qpos.start, self._object_qvel.start, *self.task.object_bounds)
+            self._object = Range(self._object_qpos.start, self._object_qvel.start, *self.task.object_bounds)
             # After the physics blew up, the object is next to the gripper, as near as a reset would put it.
             x, y, _ = self.task.initial_grip_pos
             qpos[self._object_qpos] = x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0

@@ -17,6 +17,7 @@ from mjx_dher.envs.controls import pick
 from mjx_dher.envs.engines import Physics
 from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
 from mjx_dher.types import Array, PRNGKey
+from mjx_dher.validation import check_number
 
 Mark = tuple[int, np.ndarray, np.ndarray]  # body (-1: a ball), its position [3], m, and orientation [4] (w, x, y, z)
 Bounds = Sequence[float]
@@ -34,7 +35,8 @@ class Goal:
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
-        raise NotImplementedError
+        check_number("threshold of the goal", self.threshold, "(0, inf)", float)
+        return copy.copy(self)
 
     def achieved(self, physics: Physics) -> Array:
         """The goal [G] that a state achieves."""
@@ -67,9 +69,9 @@ class Position(Goal):
         self.of, self.low, self.high, self.threshold = of, low, high, threshold
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        bound = copy.copy(self)
+        bound = super().bind(model)
         bound.place = Place(model, self.of)
-        bound.low, bound.high = box(f"goal {bound.place.name}", 3, self.low, self.high)
+        bound.low, bound.high = box(f"goal {bound.place.name}", 3, (self.low, self.high))
         return bound
 
     def achieved(self, physics: Physics) -> Array:
@@ -97,8 +99,13 @@ class Rotation(Goal):
         self.of, self.axis, self.threshold = of, axis, threshold
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        bound = copy.copy(self)
+        bound = super().bind(model)
         bound.place = Place(model, self.of)
+        if self.axis is not None:
+            axis, _ = box("axis of the goal", 3, (self.axis, self.axis))
+            if not axis.any():
+                raise ValueError(f"axis of the goal must have a length; got {self.axis}")
+            bound.axis = axis / np.linalg.norm(axis)
         return bound
 
     def achieved(self, physics: Physics) -> Array:
@@ -109,8 +116,7 @@ class Rotation(Goal):
             quat = jax.random.normal(key, (4,), jnp.float32)
         else:
             half = jax.random.uniform(key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
-            axis = np.divide(self.axis, np.linalg.norm(self.axis), dtype=np.float32, casting="same_kind")
-            quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+            quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * np.asarray(self.axis)])
         return quat_to_matrix(quat)[:, :2].T.ravel()
 
     @staticmethod
@@ -144,7 +150,7 @@ class Pose(Goal):
         self.threshold = threshold
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        bound = copy.copy(self)
+        bound = super().bind(model)
         bound.position, bound.rotation = self.position.bind(model), self.rotation.bind(model)
         bound.place, bound.low, bound.high = bound.position.place, bound.position.low, bound.position.high
         return bound
@@ -178,7 +184,7 @@ class Joints(Goal):
         self.names, self.low, self.high, self.threshold = names, low, high, threshold
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        bound = copy.copy(self)
+        bound = super().bind(model)
         names = [name if model.jnt_type[i] in (HINGE, SLIDE) else "" for i, name in enumerate(names_of(model, "joint"))]
         bound.joints = pick("joint of the goal", self.names, names)
         bound.qpos, bound.size = model.jnt_qposadr[bound.joints], len(bound.joints)
@@ -188,7 +194,7 @@ class Joints(Goal):
             raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range: give low and high")
         limits[:, unlimited] = [[-np.inf], [np.inf]]
         low, high = limits if self.low is None or self.high is None else (self.low, self.high)
-        bound.low, bound.high = box("goal", bound.size, low, high)
+        bound.low, bound.high = box("goal", bound.size, (low, high))
         for i in np.flatnonzero((bound.low < limits[0] - 1e-6) | (bound.high > limits[1] + 1e-6))[:1]:
             raise ValueError(
                 f"goal: joint {names[bound.joints[i]]!r} reaches {limits[0, i]:g} to {limits[1, i]:g}; the goals go from"
@@ -222,12 +228,16 @@ class Joints(Goal):
     qpos: np.ndarray
 
 
-def box(what: str, size: int, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Converts bounds to float32 [size] each. Raises ValueError if they are no finite numbers with low <= high."""
-    ends = np.asarray(low, np.float32), np.asarray(high, np.float32)
-    if any(end.shape != (size,) for end in ends) or not np.all(np.isfinite(ends)) or np.any(ends[0] > ends[1]):
-        raise ValueError(f"{what}: low and high must be {size} finite numbers each, low <= high; got {low} and {high}")
-    return ends
+def box(what: str, size: int, ends: Any) -> np.ndarray:
+    """Converts bounds, low and high, to float32 [2, size]. Raises ValueError if they are no finite numbers, low <= high."""
+    try:
+        with np.errstate(over="ignore"):
+            low, high = array = np.array(ends, np.float32).reshape(2, size)
+    except (TypeError, ValueError):
+        low, high = array = np.full((2, size), np.nan)
+    if not np.isfinite(array).all() or np.any(low > high):
+        raise ValueError(f"{what}: low and high must be {size} finite numbers each, low <= high; got {ends}")
+    return array
 
 
 def _ghost(place: Place, pos: np.ndarray, columns: np.ndarray) -> Mark:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 
@@ -13,41 +11,54 @@ from mjx_dher.envs.kinematics import Place, names_of
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 
-Term = Callable[[Physics], Array]  # one entry
-
-_AT = ("qpos", "qvel")
-_OF = {"rot": lambda place, p: place.rotation(p.qpos), "vel": lambda place, p: place.motion(p.qpos, p.qvel)[0]}
-_OF["angvel"] = lambda place, p: place.motion(p.qpos, p.qvel)[1]
-_OF |= {kind: lambda place, p: place.position(p.qpos) for kind in ("site", "body")}
+KINDS = ("site", "body", "rot", "vel", "angvel", "qpos", "qvel")
 
 
-def term(model: mujoco.MjModel, text: str) -> Term:
-    """Looks up one entry of an observation, or a difference "A - B" of two.
+class Entry:
+    """One entry, or a difference "A - B" of entries. It maps physics to numbers [size].
 
     Raises:
-      ValueError: the kind, or the site, body or joint, does not exist; or A and B have different sizes.
+      ValueError: the kind, or the site, body or joint, does not exist; or the sizes of a difference are not equal.
     """
-    if " - " in text:
-        first, second = (term(model, part) for part in text.split(" - ", 1))
-        return lambda physics: _minus(text, first(physics), second(physics))
-    kind, _, name = text.strip().partition(":")
-    check_name(f"kind of observation {text!r}", kind, (*_OF, *_AT))
-    if kind in _OF:
-        place = Place(model, text.strip() if kind in ("site", "body") else name)
-        return lambda physics: _OF[kind](place, physics)
-    index = np.concatenate([_entries(model, joint, kind) for joint in pick("joint", name, names_of(model, "joint"))])
-    return lambda physics: getattr(physics, kind)[index]
+
+    def __init__(self, model: mujoco.MjModel, text: str):
+        if not isinstance(text, str):
+            raise ValueError(f"an observation must be a name, such as 'qpos:*'; got {text!r}")
+        self._parts = [_Part(model, part.strip()) for part in text.split(" - ")]
+        sizes = [part.size for part in self._parts]
+        if len(set(sizes)) > 1:
+            raise ValueError(f"observation {text!r} must subtract as many numbers as there are; the sizes are {sizes}")
+        self.size = sizes[0]
+
+    def __call__(self, physics: Physics) -> Array:
+        value, *others = [part(physics) for part in self._parts]
+        for other in others:
+            value = value - other
+        return value
 
 
-def _minus(text: str, first: Array, second: Array) -> Array:
-    if first.shape != second.shape:
-        raise ValueError(f"observation {text!r} subtracts {second.shape[0]} numbers from {first.shape[0]}")
-    return first - second
+class _Part:
+    def __init__(self, model: mujoco.MjModel, text: str):
+        self.kind, _, name = text.partition(":")
+        check_name(f"kind of observation {text!r}", self.kind, KINDS)
+        if self.kind in ("qpos", "qvel"):
+            joints = pick("joint", name, names_of(model, "joint"))
+            self.index = np.concatenate([_indices(model, joint, self.kind) for joint in joints])
+            self.size = len(self.index)
+        else:
+            self.place = Place(model, text if self.kind in ("site", "body") else name)
+            self.size = 6 if self.kind == "rot" else 3
+
+    def __call__(self, physics: Physics) -> Array:
+        if self.kind in ("qpos", "qvel"):
+            return getattr(physics, self.kind)[self.index]
+        if self.kind in ("vel", "angvel"):
+            return self.place.motion(physics.qpos, physics.qvel)[self.kind == "angvel"]
+        return self.place.rotation(physics.qpos) if self.kind == "rot" else self.place.position(physics.qpos)
 
 
-def _entries(model: mujoco.MjModel, joint: int, kind: str) -> np.ndarray:
+def _indices(model: mujoco.MjModel, joint: int, kind: str) -> np.ndarray:
     """Indices of a joint in qpos or qvel."""
     entry = model.joint(joint)
-    return (entry.qposadr if kind == "qpos" else entry.dofadr)[0] + np.arange(
-        len(entry.qpos0 if kind == "qpos" else entry.damping)
-    )
+    start, size = (entry.qposadr, len(entry.qpos0)) if kind == "qpos" else (entry.dofadr, len(entry.damping))
+    return start[0] + np.arange(size)

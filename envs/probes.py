@@ -11,6 +11,7 @@ from mjx_dher.envs.goals import Goal
 from mjx_dher.envs.kinematics import HINGE, SLIDE, Place
 
 _SECONDS = 1.0  # of simulation, at most
+_OVERLAP = 0.02  # m
 _ATTEMPTS, _ITERATIONS = 5, 40
 _BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
@@ -21,6 +22,14 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
     Raises:
       ValueError: the simulation diverges; the message names the joint.
     """
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    for contact in data.contact:
+        if contact.dist < -_OVERLAP:
+            names = [model.geom(geom).name or model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
+            warnings.warn(f"{names[0]!r} and {names[1]!r} overlap by {-contact.dist:.2g} m at the start", stacklevel=2)
+            break
     rng = np.random.default_rng(0)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, 0.0).T
     inputs = {"held at the start": ctrl, "under random inputs": rng.uniform(low, high)}

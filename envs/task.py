@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ import numpy as np
 
 from mjx_dher.envs import probes
 from mjx_dher.envs.base import GoalEnv, State
-from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque, rest_ctrl
+from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque
 from mjx_dher.envs.engines import Controls, Physics, make_engine
-from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation, box
-from mjx_dher.envs.kinematics import FREE, HINGE, SLIDE, Place, names_of
-from mjx_dher.envs.observations import term
-from mjx_dher.lookup import check_name
+from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation
+from mjx_dher.envs.kinematics import Place
+from mjx_dher.envs.observations import Entry
+from mjx_dher.envs.starts import Start
 from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
 from mjx_dher.validation import check_count, check_number
 
@@ -43,22 +43,6 @@ __all__ = [
 ]
 
 
-@dataclasses.dataclass(frozen=True)
-class Start:
-    """Starts of episodes.
-
-    Args:
-      keyframe: name of a keyframe of the model; None for the model's default configuration.
-      ranges: low and high, by the name of a free body ([3] m each, a position) or of a hinge or slide (rad or m). A start is
-        uniform between them.
-      settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
-    """
-
-    keyframe: str | None = None
-    ranges: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
-    settle: int = 0
-
-
 class MujocoTask(GoalEnv):
     """A goal-conditioned task from a model and a few declarations. Every method may be overridden.
 
@@ -77,7 +61,7 @@ class MujocoTask(GoalEnv):
     control: Control | Sequence[Control] = JointPosition()
     goal: Goal
     observations: Sequence[str] = ("qpos:*", "qvel:*")
-    start = Start()
+    start: Start = Start()
     hz: float = 25.0  # actions per second
     episode_length: int = 50
     max_speed: float = 1000.0  # rad/s or m/s; beyond it the physics has blown up
@@ -106,24 +90,33 @@ class MujocoTask(GoalEnv):
 
     def load(self) -> mujoco.MjModel:
         """Compiles the model."""
-        return load_model(type(self))
+        return load_model(type(self), getattr(self, "model", None))
 
     def bind(self) -> None:
         """Looks up the declared names in the model, and tries the model out."""
-        declared = type(self).control
-        self.parts = [part.bind(self.model) for part in (declared if isinstance(declared, Sequence) else (declared,))]
+        declared = self.control if isinstance(self.control, Sequence) else (self.control,)
+        self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
         self.action_size = sum(part.size for part in self.parts)
-        self.goal = type(self).goal.bind(self.model)
+        moved = [label for part in self.parts for label in part.labels]
+        if len(set(moved)) < max(1, len(moved)):
+            raise ValueError(f"control must move something, and nothing twice; got {moved}")
+        self.goal = _checked("goal", getattr(self, "goal", None), Goal).bind(self.model)
         self.goal_size = self.goal.size
         self.goal_distance: DistanceFn = self.goal.distance
-        self._bind_start()
-        texts = (self.observations,) if isinstance(self.observations, str) else self.observations
-        self._terms = {text: term(self.model, text) for text in texts}
-        ends = np.cumsum([0, *(jax.eval_shape(part, self._rest).shape[0] for part in self._terms.values())]).tolist()
-        self.layout = {text: slice(*ends) for text, *ends in zip(self._terms, ends, ends[1:])}  # of the observation
+        self.start = _checked("start", self.start, Start).bind(self.model)
+        self._rest, self._hold = self.start.physics, self.start.hold
+        self._object = next((each for each in self.start.drawn if len(each.low) == 3), None)
+        texts = (self.observations,) if isinstance(self.observations, str) else tuple(self.observations)
+        if not texts or len(set(texts)) < len(texts):
+            raise ValueError(f"observations must be one or more different names; got {texts}")
+        self._entries = [Entry(self.model, text) for text in texts]
+        ends = np.cumsum([0, *(entry.size for entry in self._entries)]).tolist()
+        self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
         self.observation_size = ends[-1]
-        probes.check_stable(self.model, np.asarray(self._rest.qpos), self._rest_ctrl, self.dt * self.episode_length)
-        probes.check_reachable(self.model, np.asarray(self._rest.qpos), self.goal)
+        check_number("max_speed", self.max_speed, "(0, inf)", float)
+        rest = np.asarray(self._rest.qpos)
+        probes.check_stable(self.model, rest, np.asarray(self._hold.ctrl), self.dt * self.episode_length)
+        probes.check_reachable(self.model, rest, self.goal)
 
     @property
     def spec(self) -> EnvSpec:
@@ -196,7 +189,7 @@ class MujocoTask(GoalEnv):
     def with_object(self, state: State, position: Array) -> State:
         """Returns the state with the first free body in the ranges of the start at `position`, [3] m, at rest."""
         assert self._object is not None
-        at, dof, _, _ = self._object
+        at, dof, *_ = self._object
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
         qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)
         physics = dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel))
@@ -218,14 +211,11 @@ class MujocoTask(GoalEnv):
 
     def start_physics(self, key: PRNGKey) -> Physics:
         """Draws the physics of a start."""
-        qpos = jnp.asarray(self._rest.qpos)
-        for number, (index, _, low, high) in enumerate(self._ranges):
-            drawn = jax.random.uniform(jax.random.fold_in(key, number), low.shape, jnp.float32, low, high)
-            qpos = qpos.at[index : index + low.shape[0]].set(drawn)
-        physics = dataclasses.replace(self._rest, qpos=qpos)
+        physics: Physics = dataclasses.replace(jax.tree.map(jnp.asarray, self._rest), qpos=self.start.draw(key))
         if not self.start.settle:
             return physics
-        return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, self._hold), physics)
+        hold = jax.tree.map(jnp.asarray, self._hold)
+        return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, hold), physics)
 
     def sample_goal(self, key: PRNGKey) -> Array:
         """Draws a goal [G]."""
@@ -233,7 +223,7 @@ class MujocoTask(GoalEnv):
 
     def controls(self, physics: Physics, action: Array) -> Controls:
         """The engine's inputs for an action [A] in [-1, 1]. Inputs that no control has are those of the start."""
-        controls, begin = self._hold, 0
+        controls, begin = jax.tree.map(jnp.asarray, self._hold), 0
         for part in self.parts:
             controls = part.apply(physics, action[begin : begin + part.size], controls)
             begin += part.size
@@ -249,7 +239,7 @@ class MujocoTask(GoalEnv):
 
     def observe(self, physics: Physics) -> Array:
         """The observation [D]; `layout` has the slices of its parts."""
-        return jnp.concatenate([part(physics) for part in self._terms.values()])
+        return jnp.concatenate([entry(physics) for entry in self._entries])
 
     def achieved(self, physics: Physics) -> Array:
         """The goal [G] that a state achieves."""
@@ -268,49 +258,13 @@ class MujocoTask(GoalEnv):
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
         return self.reached(achieved_goal, desired_goal).astype(jnp.float32)
 
-    def _bind_start(self) -> None:
-        """Sets the start's physics, the inputs that hold it, and the ranges [first index in qpos and in qvel, low, high]."""
-        model, start = self.model, self.start
-        data = mujoco.MjData(model)
-        if start.keyframe is not None:
-            check_name("keyframe", start.keyframe, names_of(model, "key"))
-            mujoco.mj_resetDataKeyframe(model, data, model.key(start.keyframe).id)
-        self._ranges: list[tuple[int, int, np.ndarray, np.ndarray]] = []
-        places = start_places(model)
-        for name, ends in start.ranges.items():
-            check_name("name in the ranges of start", name, places)
-            index, dof, size = places[name]
-            low, high = box(f"start: {name}", size, *map(np.atleast_1d, ends))
-            self._ranges.append((index, dof, low, high))
-            data.qpos[index : index + size] = 0.5 * (low + high)
-        self._object = next((each for each in self._ranges if each[2].shape == (3,)), None)
-        self._rest_ctrl = data.ctrl if data.ctrl.any() else rest_ctrl(model, data.qpos)
-        # NumPy arrays become constants of the programs that use them, on any device.
-        arrays: Any = (np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act))
-        self._rest = Physics(*arrays)
-        mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1).astype(np.float32)
-        self._hold = Controls(ctrl=jnp.asarray(self._rest_ctrl, jnp.float32), mocap=jnp.asarray(mocap))
 
-
-def start_places(model: mujoco.MjModel) -> dict[str, tuple[int, int, int]]:
-    """First index in qpos and in qvel, and number of coordinates, of free bodies (3) and of hinges and slides (1) by name."""
-    places = {}
-    for i in range(model.njnt):
-        kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
-        if kind == FREE:
-            places[model.body(int(model.jnt_bodyid[i])).name] = (*at, 3)
-        elif kind in (HINGE, SLIDE):
-            places[model.joint(i).name] = (*at, 1)
-    return places
-
-
-def load_model(task: type) -> mujoco.MjModel:
-    """Compiles the MJCF of a task class.
+def load_model(task: type, model: Any) -> mujoco.MjModel:
+    """Compiles the MJCF of a task class; a path is relative to the file of the class.
 
     Raises:
       ValueError: there is no such file, or MuJoCo rejects it.
     """
-    model = getattr(task, "model", None)
     try:
         if isinstance(model, mujoco.MjModel):
             return copy.copy(model)
@@ -327,7 +281,7 @@ def load_model(task: type) -> mujoco.MjModel:
 
 def _folder(task: type) -> Path:
     """Folder of the file that declares the model of a task class; the current one if there is no file, as in a notebook."""
-    owner = next(base for base in task.__mro__ if "model" in vars(base))
+    owner = next((base for base in task.__mro__ if "model" in vars(base)), task)
     try:
         return Path(inspect.getfile(owner)).parent
     except (TypeError, OSError):
@@ -342,6 +296,13 @@ def substeps_of(hz: float, timestep: float) -> int:
         nearest = sorted({round(1 / (n * timestep), 4) for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})
         raise ValueError(f"hz must make a whole number of the model's timesteps of {timestep:g} s; got {hz}, near {nearest}")
     return substeps
+
+
+def _checked(field: str, value: Any, kind: type) -> Any:
+    """Returns `value`, or raises ValueError if it is of another kind."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{field} must be a {kind.__name__} object; got {value!r}")
+    return value
 
 
 def _plain(value: Any) -> Any:

@@ -63,7 +63,9 @@ def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = Fa
         _check_import_path(field, value)
         return
     rest = ", or module:attribute" if custom else ""
-    raise ValueError(f"{field} must be one of {', '.join(allowed)}{rest}; got {value!r}{_hint(str(value), allowed)}")
+    raise ValueError(
+        f"{field} must be one of {', '.join(allowed) or '(there is none)'}{rest}; got {value!r}{_hint(str(value), allowed)}"
+    )
 
 
 def is_import_path(name: str) -> bool:

@@ -1,6 +1,8 @@
 """Tasks from an MJCF (`envs.task`): kinematics, controls, goals, observations and starts, by values computed by hand."""
 
+import copy
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +151,7 @@ def test_observations():
         "angvel:box": [6, 7, 8],
         "qpos:a c": [0.3, 0.5],
         "qvel:?": [0, 1, 2],
+        "qpos:a - qpos:b - qpos:c": [0.3 + 0.2 - 0.5],
     }
     env = make(observations=tuple(parts), control=task.Torque())
     observed = jax.jit(env.observe)(START)
@@ -288,6 +291,17 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
         ({"start": task.Start("bend")}, ("keyframe", "bend", "bent")),
         ({"start": task.Start(ranges={"bx": (0, 1)})}, ("bx", "box", "a")),
         ({"start": task.Start(ranges={"box": (0, 1)})}, ("box", 3)),
+        ({"start": task.Start(ranges={"a": (0, 3)})}, ("a", 2, "(0, 3)")),
+        ({"start": task.Start(ranges={"a": 3})}, ("a", 3)),
+        ({"start": task.Start(settle=-1)}, ("settle", -1)),
+        ({"start": task.Start}, ("start", "Start")),
+        ({"goal": task.Rotation("tip", axis=(0, 0, 0))}, ("axis", "(0, 0, 0)")),
+        ({"goal": task.Rotation("tip", threshold=0)}, ("threshold", 0)),
+        ({"control": (task.JointDelta("b"), task.JointPosition("b"))}, ("control", "b")),
+        ({"control": task.JointDelta("b", scale=np.nan)}, ("scale", "nan")),
+        ({"control": ()}, ("control",)),
+        ({"observations": ("qpos:a", "qpos:a")}, ("observations", "qpos:a")),
+        ({"max_speed": 0}, ("max_speed", 0)),
         ({"hz": 30}, ("hz", 30, "0.01")),
         ({"model": "no_such.xml"}, ("Declared", "no_such.xml")),
         ({"model": MACHINE.replace('armature="1"', "")}, ("unstable", "a")),
@@ -296,6 +310,17 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
 def test_a_declaration_that_does_not_fit_the_model_is_rejected_before_training(declared, parts):
     with refuses(*parts):
         make(**declared)
+
+
+def test_objects_that_overlap_at_the_start_are_reported():
+    with pytest.warns(UserWarning, match=r"'two' and 'box' overlap by 0.12 m"):
+        make(start=task.Start(ranges={"box": ((1, 0, 0), (1, 0, 0))}))
+
+
+def test_a_pickle_is_the_same_task():
+    env = Settled(engine="native")
+    for copied in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        np.testing.assert_array_equal(jax.jit(copied.observe)(START), jax.jit(env.observe)(START))
 
 
 def test_an_action_of_another_size_is_rejected():

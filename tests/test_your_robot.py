@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import my_arm
 import numpy as np
 import pytest
-from conftest import EXAMPLES, ROOT, names
+from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli
 
@@ -27,7 +27,7 @@ def test_the_page_shows_the_example():
 def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
     """From `check` to ONNX; and a robot's loop gives the action that the policy gives in simulation."""
     monkeypatch.chdir(tmp_path)
-    (script,) = re.findall(r"```bash\n(.*?)```", PAGE, re.S)
+    script = "".join(re.findall(r"```bash\n(.*?)```", PAGE, re.S))
     for line in script.replace("\\\n", "").splitlines():
         command = line.removeprefix("python train.py ").split()
         if command[0] not in ("view", "render"):
@@ -46,15 +46,10 @@ def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["Reach", "Push"])
 def test_engines_agree_on_the_arm(name):
-    """Ten steps from one start under one action. An engine that cannot run the arm names what it lacks."""
+    """Ten steps from one start under random actions; warp by the path graph."""
     results = {}
     for engine, options in {"native": {}, "jax": {}, "warp": {"allow_cpu": True}}.items():
-        try:
-            env = getattr(my_arm, name)(engine=engine, **options)
-        except ValueError as error:
-            assert engine == "warp"
-            names(str(error), "warp", "integrator")
-            continue
+        env = getattr(my_arm, name)(engine=engine, **options)
         state, step = env.reset(jax.random.key(0)), jax.jit(env.step)
         for action in 0.5 * jax.random.normal(jax.random.key(1), (10, env.action_size)):
             state = step(state, action)

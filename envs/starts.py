@@ -1,0 +1,93 @@
+"""Starts of episodes."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.envs.controls import rest_ctrl
+from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.goals import box
+from mjx_dher.envs.kinematics import FREE, HINGE, SLIDE, names_of
+from mjx_dher.lookup import check_name
+from mjx_dher.types import Array, PRNGKey
+from mjx_dher.validation import check_number
+
+
+class Range(NamedTuple):
+    """Where a free body or a joint starts."""
+
+    qpos: int  # first index in qpos
+    qvel: int  # first index in qvel
+    low: np.ndarray  # [3] of a free body, [1] of a joint
+    high: np.ndarray
+
+
+class Start:
+    """A configuration, parts of which are drawn at each reset.
+
+    Args:
+      keyframe: name of a keyframe of the model; None for the model's default configuration.
+      ranges: low and high, by the name of a free body ([3] m each, a position) or of a hinge or slide (rad or m). A start is
+        uniform between them.
+      settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
+    """
+
+    def __init__(self, keyframe: str | None = None, ranges: Mapping[str, tuple[Any, Any]] | None = None, settle: int = 0):
+        self.keyframe, self.ranges, self.settle = keyframe, dict(ranges or {}), settle
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
+        bound = copy.copy(self)
+        check_number("settle of start", self.settle, "[0, 1000]")
+        data = mujoco.MjData(model)
+        if self.keyframe is not None:
+            check_name("keyframe", self.keyframe, names_of(model, "key"))
+            mujoco.mj_resetDataKeyframe(model, data, model.key(self.keyframe).id)
+        bound.drawn = []
+        places = _places(model)
+        for name, ends in self.ranges.items():
+            check_name("name in the ranges of start", name, places)
+            at, dof, low, high = places[name]
+            drawn = Range(at, dof, *box(f"start: {name}", len(low), ends))
+            if np.any(drawn.low < low) or np.any(drawn.high > high):
+                raise ValueError(f"start: joint {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
+            bound.drawn.append(drawn)
+            data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
+        ctrl = data.ctrl if data.ctrl.any() else rest_ctrl(model, data.qpos)
+        mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
+        # NumPy arrays become constants of the programs that use them, on any device.
+        arrays: Any = [np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act, ctrl, mocap)]
+        bound.physics, bound.hold = Physics(*arrays[:4]), Controls(*arrays[4:])
+        return bound
+
+    def draw(self, key: PRNGKey) -> Array:
+        """Draws the configuration [nq] of a start."""
+        qpos = jnp.asarray(self.physics.qpos)
+        for number, (at, _, low, high) in enumerate(self.drawn):
+            part = jax.random.uniform(jax.random.fold_in(key, number), low.shape, jnp.float32, low, high)
+            qpos = qpos.at[at : at + len(low)].set(part)
+        return qpos
+
+    physics: Physics  # the start, with the middle of each range
+    hold: Controls  # inputs that hold it
+    drawn: list[Range]
+
+
+def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
+    """First index in qpos and in qvel, and limits, of free bodies (3 numbers) and of hinges and slides (1) by name."""
+    places = {}
+    for i in range(model.njnt):
+        kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
+        if kind == FREE:
+            places[model.body(int(model.jnt_bodyid[i])).name] = (*at, np.full(3, -np.inf), np.full(3, np.inf))
+        elif kind in (HINGE, SLIDE):
+            low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] else np.array([[-np.inf], [np.inf]])
+            places[model.joint(i).name] = (*at, low - 1e-6, high + 1e-6)
+    return places
