@@ -23,6 +23,7 @@ from mjx_dher.runs.folder.run_folder import (
     CHECKPOINTS,
     MANIFEST,
     SCHEMA,
+    checked,
     checkpoints,
     checkpoints_to_resume,
     epoch_of,
@@ -148,8 +149,9 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
         try:
-            failed = _check_lines(path, lines)
-            manifest, arrays = _load(path, template)
+            with checked(path):
+                failed = _check_lines(path, lines)
+                manifest, arrays = _load(path, template)
             state = _place(arrays, template)
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
         except FolderError as error:

@@ -1,116 +1,85 @@
-"""Types and ranges of what a run's files hold. Every reader of these files calls the checks here, and none checks anew."""
+"""Types and ranges of what a run's files hold. Whoever reads one of these files checks it here."""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from typing import Any
 
-from mjx_dher.lookup import check_name
-from mjx_dher.runs.folder import fingerprint
-from mjx_dher.validation import check_devices, check_number
+from mjx_dher.validation import check_number
 
-# Statuses in result.json.
-FINISHED = "finished"
-FAILED = "failed"
+# A form is a type, a pattern of texts, (kind, interval) of a number, [form] of a list's entries, or the forms of a dict by key,
+# where "*" stands for all keys, and a key that ends in "?" may be missing.
+Form = Any
 
-_SHARES = (
-    *("success_rate", "reset_success_rate", "train_success_rate", "success_low", "success_high"),
-    *("relabelled_share", "no_goal_share", "bad_rewards", "bad_success"),
-)
-_COUNTS = ("epoch", "epochs", "env_steps", "updates", "episodes")
-_AMOUNTS = ("wall_seconds", "discarded_episodes", "steps_per_second", "updates_per_second", "memory_bytes")
-_MAY_BE_NAN = ("relabelled_share", "steps_per_second", "updates_per_second", "memory_bytes")
-_LARGEST = 9 * 10**18
+FINISHED, FAILED = "finished", "failed"  # statuses in result.json
+_DIGEST = "[0-9a-f]{10}"
+_COUNT, _LANES = (int, "[0, 9000000000000000000]"), (int, "[1, 1000000]")
+_SHARE, _AMOUNT = (float, "[0, 1]"), (float, "[0, inf]")
 
-
-def check_config(content: Mapping[str, Any]) -> None:
-    """Raises ValueError, TypeError or KeyError for an entry of config.json that is missing or invalid.
-
-    `run_folder.to_spec` checks the settings themselves, and `Options` the options.
-    """
-    kinds = {"config": dict, "hparams": dict, "physics": str, "env_kwargs": list, "sources": dict, "digest": str}
-    for name, kind in kinds.items():
-        _check_kind(name, content[name], kind)
-    _check_kind("config.hidden_sizes", content["config"]["hidden_sizes"], list)
-    for group in ("sources", "versions"):
-        _check_kind(group, content.get(group, {}), dict)
-        for name, text in content.get(group, {}).items():
-            _check_kind(f"{group}.{name}", text, str)
-    _check_kind("earlier", content.get("earlier", []), list)
-    _check_digest("digest", content["digest"])
-    for digest in content.get("earlier", ()):
-        _check_digest("earlier", digest)
-    for flag in content.get("jax_flags", {}):
-        check_name("jax_flags", flag, fingerprint.JAX_FLAGS)
-    check_devices(content.get("devices", 1))
-    check_number("lanes", content.get("lanes", 1), "[1, 1000000]")
-
-
-def check_result(content: Mapping[str, Any]) -> None:
-    """Raises ValueError, TypeError or KeyError for an entry of result.json that is missing or invalid."""
-    check_name("status", content["status"], (FINISHED, FAILED))
-    _check_digest("digest", content["digest"])
-    _check_kind("reason", content["reason"], str)
-    check_number("lanes", content["lanes"], "[1, 1000000]")
-    needed = ["epochs", "env_steps", "wall_seconds"]
-    if content["status"] == FINISHED:
-        needed += ["episodes", "success_rate", "success_low", "success_high", "reset_success_rate"]
-        if content["return_mean"] is not None:
-            check_number("return_mean", content["return_mean"], "(-inf, inf)", float)
-    for name in needed:
-        _check_metric(name, content[name])
+IDENTITY: Form = {"sources": {"*": str}}  # `fingerprint.identity`
+CONFIG: Form = {
+    "config": {"hidden_sizes": list},
+    "hparams": dict,
+    "physics": str,
+    "env_kwargs": list,
+    "sources": {"*": str},
+    "digest": _DIGEST,
+    "earlier?": [_DIGEST],
+    "jax_flags?": dict,
+    "lanes?": _LANES,
+    "versions?": {"*": str},
+}
+RESULT: Form = {
+    "status": f"{FINISHED}|{FAILED}",
+    "reason": str,
+    "digest": _DIGEST,
+    "lanes": _LANES,
+    "epochs": _COUNT,
+    "env_steps": _COUNT,
+    "wall_seconds": _AMOUNT,
+}
+_RATES: Form = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate"), _SHARE)
+RESULT_FINISHED: Form = {**RESULT, **_RATES, "episodes": _COUNT, "return_mean?": (float, "(-inf, inf)")}
+ROW: Form = {  # of metrics.csv; other metrics of learners can be any number
+    **dict.fromkeys(("epoch", "env_steps", "updates"), _COUNT),
+    "wall_seconds": _AMOUNT,
+    "success_rate": _SHARE,
+    **dict.fromkeys(("reset_success_rate?", "train_success_rate?", "relabelled_share?", "no_goal_share?"), _SHARE),
+    **dict.fromkeys(("bad_rewards?", "bad_success?"), _SHARE),
+    **dict.fromkeys(("discarded_episodes?", "steps_per_second?", "updates_per_second?", "memory_bytes?"), _AMOUNT),
+}
+MANIFEST: Form = {
+    "epoch": _COUNT,
+    "wall_seconds": _AMOUNT,
+    "runs": [IDENTITY],
+    "failed": {"*": list},
+    "leaves": [list],
+    "files": {"*": str},
+}
 
 
-def check_row(row: Mapping[str, Any]) -> None:
-    """Raises ValueError for a value in a line of metrics.csv that is invalid. A custom learner's metrics can be any number."""
-    for name, value in row.items():
-        if name not in _MAY_BE_NAN or not math.isnan(value):
-            _check_metric(name, value)
+def check(content: Any, form: Form, name: str = "content") -> None:
+    """Raises ValueError, TypeError or KeyError, which name the entry, for content that does not have a form."""
+    if isinstance(form, type):
+        if not isinstance(content, form):
+            raise TypeError(f"{name} must be a {form.__name__}")
+    elif isinstance(form, str):
+        if not isinstance(content, str) or not re.fullmatch(form, content):
+            raise ValueError(f"{name} must be like {form}; got {content!r}")
+    elif isinstance(form, tuple):
+        check_number(name, content, form[1], form[0])
+    elif isinstance(form, list):
+        check(content, list, name)
+        for entry in content:
+            check(entry, form[0], name)
+    else:
+        check(content, dict, name)
+        _check_entries(content, form, "" if name == "content" else f"{name}.")
 
 
-def check_manifest(content: Mapping[str, Any]) -> None:
-    """Raises ValueError, TypeError or KeyError for an entry of a checkpoint's manifest that is missing or invalid."""
-    _check_metric("epoch", content["epoch"])
-    _check_metric("wall_seconds", content["wall_seconds"])
-    for run in content["runs"]:
-        check_identity(run)
-    for lane, (epoch, reason) in content["failed"].items():
-        check_number("failed", int(lane), "[0, 1000000]")
-        _check_metric("epoch", epoch)
-        _check_kind("failed", reason, str)
-    for name, shape, dtype in content["leaves"]:
-        for text in (name, dtype):
-            _check_kind("leaves", text, str)
-        for size in shape:
-            check_number(name, size, f"[0, {_LARGEST}]")
-    for name, digest in content["files"].items():
-        _check_kind(f"files.{name}", digest, str)
-
-
-def check_identity(content: Any) -> None:
-    """Raises ValueError, TypeError or KeyError unless `content` may be a `fingerprint.identity`."""
-    _check_kind("settings", content, dict)
-    _check_kind("settings.sources", content["sources"], dict)
-    for name, text in content["sources"].items():
-        _check_kind(f"settings.sources.{name}", text, str)
-
-
-def _check_digest(name: str, digest: Any) -> None:
-    if not isinstance(digest, str) or not re.fullmatch("[0-9a-f]{10}", digest):
-        raise ValueError(f"{name} must be ten hexadecimal digits; got {digest!r}")
-
-
-def _check_metric(name: str, value: Any) -> None:
-    if name in _COUNTS:
-        check_number(name, value, f"[0, {_LARGEST}]")
-    elif name in _SHARES:
-        check_number(name, value, "[0, 1]", float)
-    elif name in _AMOUNTS:
-        check_number(name, value, "[0, inf]", float)
-
-
-def _check_kind(name: str, value: Any, kind: type) -> None:
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} must be a {kind.__name__}")
+def _check_entries(content: Mapping[str, Any], forms: Mapping[str, Form], prefix: str) -> None:
+    for key, form in forms.items():
+        for field in content if key == "*" else (key.removesuffix("?"),):
+            if field in content or not key.endswith("?"):
+                check(content[field], form, f"{prefix}{field}")

@@ -26,7 +26,8 @@ def read_result(folder: Path) -> dict[str, Any]:
     path = folder / run_folder.RESULT_FILE
     with run_folder.checked(path):
         content = {"reason": "", **files.read_json(path)}
-        contents.check_result(content)
+        numbers = {name: value for name, value in content.items() if value is not None}
+        contents.check(numbers, contents.RESULT_FINISHED if content["status"] == FINISHED else contents.RESULT)
     return content
 
 

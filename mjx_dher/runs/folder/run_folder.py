@@ -170,7 +170,9 @@ def read_config_file(file: Path) -> dict[str, Any]:
     """
     content = read_versioned(file, SCHEMA)
     with checked(file, "does not describe a run"):
-        contents.check_config(content)
+        contents.check(content, contents.CONFIG)
+        for flag in content.get("jax_flags", ()):
+            lookup.check_name("jax_flags", flag, fingerprint.JAX_FLAGS)
     return content
 
 
@@ -271,7 +273,7 @@ def read_manifest(checkpoint: Path) -> dict[str, Any]:
     if content.pop("sha256", None) != fingerprint.sha256_of(content):
         raise FolderError(f"{checkpoint} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
     with checked(file):
-        contents.check_manifest(content)
+        contents.check(content, contents.MANIFEST)
     return content
 
 
@@ -292,7 +294,7 @@ def policy_settings(arrays: Mapping[str, Any]) -> dict[str, Any]:
     if "settings" not in arrays:
         raise ValueError("it has no settings, which the policies of runs have")
     settings = json.loads(arrays["settings"].tobytes())
-    contents.check_identity(settings)
+    contents.check(settings, contents.IDENTITY, "settings")
     return dict(settings)
 
 
