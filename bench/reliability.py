@@ -29,6 +29,7 @@ import reliability_calls
 import reliability_machines
 import reliability_pairs
 import reliability_power
+import reliability_splices
 from timing import print_table
 
 from mjx_dher import Config, HParams, envs, make_train
@@ -41,8 +42,9 @@ SHAPES = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_
 SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
+BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS}
 PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages")
-PARTS += (*reliability_machines.PARTS,)
+PARTS += (*BESIDE,)
 
 
 class Failure(Exception):
@@ -296,9 +298,9 @@ def calls(args, folder):
     return f"{tried} wrong calls of the command line", "each a sentence and status 2; nothing written, no traceback"
 
 
-def machines(args, folder):
-    """Disks and containers."""
-    tried, outcome, faults = reliability_machines.PARTS[folder.name](folder)
+def beside(args, folder):
+    """Splices, disks and containers."""
+    tried, outcome, faults = BESIDE[folder.name](folder)
     expect_none(faults)
     return tried, outcome
 
@@ -322,7 +324,7 @@ def main() -> int:
     args = parser.parse_args()
     parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
     by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls, "messages": messages}
-    by_itself |= dict.fromkeys(reliability_machines.PARTS, machines)
+    by_itself |= dict.fromkeys(BESIDE, beside)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
         runs = Runs(args.env, folder) if set(args.parts) - set(by_itself) else None

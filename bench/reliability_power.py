@@ -68,7 +68,7 @@ def run_cut(folder, right, rng, disk_rng):
     disk, store, after = folder / "disk", folder / "store", folder / "after"
     process = start_recorded(disk, store, *TRAIN, "--out", disk / "run")
     cut(process, (disk / "run" / "metrics.csv").exists, rng)
-    done = loggers.whole_epochs(disk / "run")
+    done = len(loggers.read_rows(disk / "run" / run_folder.METRICS_FILE))
     power_recorder.rebuild(disk, store, after, disk_rng)
     run = after / "run"
     if (run / run_folder.RESULT_FILE).exists():
