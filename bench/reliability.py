@@ -1,11 +1,11 @@
-"""What survives? Kills, stops, a full disk, damage, power cuts, other programs, edits and wrong calls, of the real command.
+"""What survives? Kills, signals, a full disk, damage, power cuts, other programs, edits and wrong calls, of the real command.
 
-    python bench/reliability.py [--parts kills stops ...] [--kills 200] [--stops 20] [--flips 200] [--pairs 100] [--power 50]
+    python bench/reliability.py [--parts kills signals ...] [--kills 200] [--signals 50] [--flips 200] [--pairs 100]
 
 Every state that is restored is compared, by the SHA-256 of all its leaves, with that of a run that nothing happened to, and
 every run, or sweep, that ends with what it would have left undisturbed. A line a part; exits with 1 where something is not
 right to the bit, more than one interval between checkpoints was lost, or a refusal was not an error with a name.
-docs/reliability.md has the results. `--workers` of `pairs` and `power` run at a time.
+docs/reliability.md has the results. `--workers` of `pairs`, `power` and `signals` run at a time.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ import reliability_calls
 import reliability_machines
 import reliability_pairs
 import reliability_power
+import reliability_signals
 import reliability_splices
 from timing import print_table
 
@@ -43,7 +44,7 @@ SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
 BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS}
-PARTS = ("kills", "stops", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages")
+PARTS = ("kills", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages", "signals")
 PARTS += (*BESIDE,)
 
 
@@ -136,34 +137,6 @@ def kills(runs, count, rng):
         lines = (out / "metrics.csv").read_text().splitlines()
         lost.append(max(0, len(lines) - 1 - runs.check(out)))
     return f"{count} SIGKILLs, {inside} of them inside a save; {ended} runs had ended", f"at most {max(lost)} epochs lost"
-
-
-def stops(runs, count, rng):
-    """SIGTERM and SIGINT at random moments."""
-    out, seconds = runs.folder / "stops", []
-    for number in range(count):
-        process = runs.start(out)
-        before = len(run_folder.checkpoints(out)) and runs.check(out)
-        while process.poll() is None and not (out / "metrics.csv").exists():
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 6))
-        sent = signal.SIGTERM if number % 2 else signal.SIGINT
-        process.send_signal(sent)
-        started = time.monotonic()
-        stdout, stderr = process.communicate()
-        seconds.append(time.monotonic() - started)
-        if process.returncode == 0:
-            shutil.rmtree(out)
-            continue
-        if "compiling" not in stdout:  # it had not begun
-            expect(process.returncode in (128 + sent, -sent) and "Traceback" not in stderr, f"{process.returncode}: {stderr}")
-            runs.check(out)
-            continue
-        expect(process.returncode == 128 + sent, f"exit status {process.returncode}: {stdout}{stderr}")
-        expect(f"saved {run_folder.checkpoints(out)[0]}" in stdout, f"it does not say where: {stdout}")
-        lines = len((out / "metrics.csv").read_text().splitlines()) - 1
-        expect(runs.check(out) == lines >= before, "what was done is not what was saved")
-    return f"{count} SIGTERMs and SIGINTs", f"nothing lost; {max(seconds):.1f} s at most to save and end"
 
 
 def saved(runs, name):
@@ -314,16 +287,23 @@ def messages(args, folder):
     return f"{args.messages} hostile messages to each of {ports} ports", "nothing ended or blocked; a browser still served"
 
 
+def signals(args, folder):
+    """Signals to each of four commands."""
+    outcome, faults = reliability_signals.signals(folder, args.signals, args.seed, args.workers)
+    expect_none(faults)
+    return f"{args.signals} SIGINTs, SIGTERMs and SIGHUPs at random moments of each command", outcome
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
-    numbers = {"kills": 200, "stops": 20, "flips": 200, "pairs": 100, "power": 50, "messages": 200, "workers": 1, "seed": 0}
+    numbers = {"kills": 200, "flips": 200, "pairs": 100, "power": 50, "messages": 200, "signals": 50, "workers": 1, "seed": 0}
     for name, number in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=number)
     parser.add_argument("--env", default="reach")
     args = parser.parse_args()
-    parts = {"kills": kills, "stops": stops, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
-    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls, "messages": messages}
+    parts = {"kills": kills, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
+    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls, "messages": messages, "signals": signals}
     by_itself |= dict.fromkeys(BESIDE, beside)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:

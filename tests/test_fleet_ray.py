@@ -1,6 +1,7 @@
 """The real command on a real cluster of Ray: nodes are processes of this machine."""
 
 import importlib
+import os
 import shutil
 import signal
 import socket
@@ -72,15 +73,19 @@ def test_without_a_storage_the_task_is_trained_again(bench, tmp_path):
     assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
 
 
-def test_a_signal_ends_a_fleet_in_order_and_the_same_command_goes_on(bench, tmp_path):
+@pytest.mark.parametrize(
+    ("send", "number"), [(os.kill, signal.SIGTERM), (os.killpg, signal.SIGTERM), (os.killpg, signal.SIGHUP)]
+)
+def test_a_signal_ends_a_fleet_in_order_and_the_same_command_goes_on(bench, tmp_path, send, number):
+    """Also one to the group of processes: Ray's are in others."""
     flags = [*bench.LONG, 40 * bench.STEPS_PER_EPOCH, "--seeds", 1, "--ray", "local", "--ray-cpus", 1]
-    driver = bench.sweep(tmp_path / "sweep", *flags)
+    driver = bench.sweep(tmp_path / "sweep", *flags, start_new_session=True)
     log = tmp_path / "sweep.log"
     deadline = time.monotonic() + 180
     while "train on 1 hosts" not in log.read_text() and time.monotonic() < deadline:
         time.sleep(0.2)
-    driver.send_signal(signal.SIGTERM)
-    assert driver.wait(120) == 128 + signal.SIGTERM
+    send(driver.pid, number)
+    assert driver.wait(120) == 128 + number
     assert "stopping when this epoch has ended" in log.read_text()
     assert list((tmp_path / "sweep" / "unfinished").glob("fleet-*/*/chunk.json"))
     bench.finished(bench.sweep(tmp_path / "sweep", *flags))

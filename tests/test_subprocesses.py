@@ -1,6 +1,9 @@
 import os
+import signal
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -42,6 +45,43 @@ def test_a_program_is_killed_at_the_end_of_its_block():
         raise RuntimeError
     assert process.poll() is not None
     assert time.monotonic() - start < 30
+
+
+CHILD = "import subprocess, sys, time; subprocess.Popen([sys.executable, '-S', '-c', 'import time; time.sleep(60)']); {then}"
+
+
+@pytest.mark.parametrize("then", ["time.sleep(60)", "sys.exit()"])
+def test_a_program_that_is_killed_leaves_no_programs_of_its_own(then):
+    with subprocesses.started([sys.executable, "-S", "-c", CHILD.format(then=then)]) as process:
+        group = process.pid
+        time.sleep(0.3)
+    ends = time.monotonic() + 10
+    while any(_group_of(path) == group for path in Path("/proc").glob("[0-9]*")):
+        assert time.monotonic() < ends
+        time.sleep(0.05)
+
+
+def _group_of(path):
+    """Its process group, if it has not ended."""
+    try:
+        state, _, group = (path / "stat").read_text().rpartition(")")[2].split()[:3]
+    except OSError:
+        return None
+    return int(group) if state != "Z" else None
+
+
+def test_sessions_of_children_are_killed_whole():
+    """As Ray's node, whose workers have groups of their own."""
+    inner = "import os, time; os.setpgid(0, 0); time.sleep(60)"
+    code = f"import subprocess, sys, time; print(subprocess.Popen([sys.executable, '-S', '-c', {inner!r}]).pid); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-S", "-u", "-c", code], stdout=subprocess.PIPE, start_new_session=True) as process:
+        inner = Path("/proc", process.stdout.readline().decode().strip())
+        subprocesses.kill_sessions()
+        ends = time.monotonic() + 10
+        while _group_of(inner) is not None:
+            assert time.monotonic() < ends
+            time.sleep(0.05)
+        assert process.wait(10) == -signal.SIGKILL
 
 
 def test_a_program_whose_output_nobody_reads_goes_on():

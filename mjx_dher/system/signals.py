@@ -8,6 +8,7 @@ ends the process at once, unless a block is `held`, which ends in order.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import math
 import os
 import select
@@ -42,7 +43,7 @@ class _Signals:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.pipe: tuple[int, int] | None = None
+        self.pipe: tuple[int, ...] | None = None
         self.before: dict[int, Any] = {}  # the handlers that ours have replaced
         self.asked: int | None = None
         self.since = 0.0
@@ -115,9 +116,11 @@ def take() -> None:
     if threading.current_thread() is not threading.main_thread():
         return
     if _signals.pipe is None:
-        _signals.pipe = os.pipe()
-        for end in _signals.pipe:
-            os.set_blocking(end, False)
+        ends = os.pipe()
+        _signals.pipe = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)  # not in place of a closed stdout
+        for end, own in zip(ends, _signals.pipe):
+            os.close(end)
+            os.set_blocking(own, False)
         os.register_at_fork(before=_signals.before_fork, after_in_parent=_signals.in_parent, after_in_child=_signals.in_child)
         threading.Thread(target=_signals.listen, args=[_signals.pipe[0]], name="signals", daemon=True).start()
     signal.set_wakeup_fd(_signals.pipe[1], warn_on_full_buffer=False)
