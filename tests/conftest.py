@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib.metadata
 import os
 import re
 import socket
@@ -45,11 +46,12 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
         with contextlib.suppress(FileNotFoundError):  # another run was quicker
             if _is_of_no_use(_entry):
                 _entry.unlink()
-# Compiling takes most of the tests' time, and less than half of it without what makes programs fast.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_use_fusion_emitters=false",
-)
+# Compiling takes most of the tests' time, and less than half of it without what makes programs fast. An unknown flag would end
+# the process: jaxlib 0.11 has no fusion emitters to turn off.
+_FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    _FLAGS += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", _FLAGS)
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES), str(ROOT / "docs")]
 
 
