@@ -128,7 +128,7 @@ def test_what_is_half_a_priority_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             priorities.make(wrong)
-    ring = testing.methods.ring_of(testing.trial.random_episodes(ENV))
+    ring = testing.trial.Trial(ENV).ring
     with pytest.raises(ValueError, match=r"weights \[E\] .*\[32\]; got .*\[2\]"):
         priorities.renew(Priority(renew=lambda ring, context: jnp.ones(2)), ring, CONTEXT)
     nan = priorities.renew(Priority(renew=lambda ring, context: jnp.full(32, jnp.nan)), ring, CONTEXT)
@@ -158,33 +158,29 @@ def test_a_score_of_the_wrong_kind_is_refused():
 
 
 def test_trials_name_what_is_wrong():
-    episodes = testing.trial.random_episodes(ENV)
+    trial = testing.trial.Trial(ENV)
     for wrong, message in (
         (lambda key, obs, ring, context: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
         (lambda key, obs, ring, context: jnp.full((16, 2), jnp.nan), "no goal is finite"),
         (lambda key, obs, ring, context: 1 / 0, "ZeroDivisionError"),
     ):
         with pytest.raises(ComponentError, match=message):
-            testing.check_generator(wrong, ENV, None, episodes)
+            testing.check_generator(wrong, trial)
     with pytest.raises(ComponentError, match="with_goal"):
         testing.check_generator(corner, WithoutGoals())
-    assert "100% of the goals" in testing.check_generator(corner, ENV, None, episodes)
+    assert "100% of the goals" in testing.check_generator(corner, trial)
     with pytest.raises(ComponentError, match="negative"):
-        testing.check_priority(Priority(renew=lambda ring, context: -ring.priority - 1.0), ENV, None, episodes)
+        testing.check_priority(Priority(renew=lambda ring, context: -ring.priority - 1.0), trial)
     with pytest.raises(ComponentError, match="indices"):
-        testing.check_priority(
-            Priority(choose=lambda key, sample, batch, number, context: 99 + jnp.arange(number)), ENV, None, episodes
-        )
+        testing.check_priority(Priority(choose=lambda key, sample, batch, number, context: 99 + jnp.arange(number)), trial)
     with pytest.raises(ComponentError, match="negative"):
-        testing.check_metric(LearnedMetric(lambda episode, context: -jnp.ones(11)), ENV, episodes)
+        testing.check_metric(LearnedMetric(lambda episode, context: -jnp.ones(11)), trial)
 
 
 def test_built_in_parts_pass_their_trials():
-    episodes = testing.trial.random_episodes(ENV)
-    assert "chosen" in testing.check_priority("td_error", ENV, None, episodes)
-    assert "goals of the past never" in testing.check_sampler(
-        samplers.make("weighted", metric="time_to_goal"), ENV, None, episodes
-    )
+    trial = testing.trial.Trial(ENV)
+    assert "chosen" in testing.check_priority("td_error", trial)
+    assert "goals of the past never" in testing.check_sampler(samplers.make("weighted", metric="time_to_goal"), trial)
 
 
 def test_a_task_that_changes_more_than_the_goal_is_named():

@@ -10,6 +10,7 @@ In a test:
 
 from mjx_dher.testing.components import (
     check_components,
+    check_generator,
     check_kernel,
     check_metric,
     check_normalization,
@@ -18,7 +19,6 @@ from mjx_dher.testing.components import (
 )
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.methods import check_generator
 from mjx_dher.testing.trial import ComponentError
 
 __all__ = [

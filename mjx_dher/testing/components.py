@@ -1,4 +1,10 @@
-"""Checks of custom samplers, metrics, kernels, normalizations and priorities, on random episodes."""
+"""Checks of custom samplers, metrics, kernels, normalizations, priorities and goal generators, on random episodes.
+
+Each takes what the command line or a program takes in the component's place, and an environment. Further arguments are the
+run's numbers (None: the defaults) and an untrained learner whose values the component may read (None: `ddpg`); a `Trial` in
+place of the environment brings its own. Each returns a line on what it saw, and raises ComponentError, which names the first
+violation.
+"""
 
 from __future__ import annotations
 
@@ -11,94 +17,73 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import check, components, learners, priorities, samplers
+from mjx_dher import check, components, learners, priorities, replay, samplers, trainer
 from mjx_dher.components import reads
 from mjx_dher.config import HParams
-from mjx_dher.contract import env_spec
+from mjx_dher.contract import check_with_goal, env_spec
+from mjx_dher.contrib import generators
+from mjx_dher.contrib.generators import GenerateFn, Generator
 from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
 from mjx_dher.lookup import is_import_path
-from mjx_dher.priorities import Priority, PriorityFn
+from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, PriorityFn
+from mjx_dher.relabel import relabel
+from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, Sampler
 from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
-from mjx_dher.testing.methods import as_arrays, check_choice, check_generator, trial_context
-from mjx_dher.testing.trial import TOLERANCE, attempt, compiled, expect, expect_range, expect_same, random_episodes, run
-from mjx_dher.types import Env, Episode
+from mjx_dher.testing.trial import EPISODES, Trial, attempt, compiled, expect, expect_range, expect_same, run, trial_of
+from mjx_dher.types import Env, GoalObs, PRNGKey
+
+NUMBER = 8  # transitions that a priority is asked to choose
+BATCHES = 8  # of candidates that it chooses from, one after another
 
 
 def check_components(env: Env, spec: RunSpec, with_env: bool = True) -> Iterator[str]:
-    """Checks the custom components of a run; yields a line for each that passes.
-
-    Args:
-      env: the environment.
-      spec: the run.
-      with_env: whether to check a custom environment, too.
-
-    Raises:
-      ComponentError: names the component, and the first violation.
-    """
+    """Checks the custom components of a run, among them the environment if `with_env`; yields a line for each that passes."""
     custom = custom_components(spec)
     if "env" in custom and with_env:
         check_env(env)
         yield f"env {spec.env}: as it should be, in random episodes"
     if not custom.keys() - {"env"}:
         return
-    episodes = random_episodes(env)
     learner = attempt("learner", learners.make, spec.learner, spec.config, env_spec(env), spec.networks)
+    trial = Trial(env, spec.hparams, learner)
     if "metric" in custom:
-        yield check_metric(spec.metric, env, episodes, learner)
+        yield check_metric(spec.metric, trial)
     if "weight_kernel" in custom:
         yield check_kernel(spec.weight_kernel)
     if "weight_normalization" in custom:
         yield check_normalization(spec.weight_normalization)
     read = [field for field in ("metric", "weight_kernel", "weight_normalization") if reads(vars(spec), field)]
     if custom.keys() & {"sampler", *read}:
-        yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), env, spec.hparams, episodes, learner)}"
+        yield f"{spec.sampler}: {check_sampler(samplers.make(*spec.sampler_choice), trial)}"
     if "priority" in custom:
-        yield check_priority(spec.priority, env, spec.hparams, episodes, learner)
+        yield check_priority(spec.priority, trial)
     if "generator" in custom:
-        yield check_generator(spec.generator, env, spec.hparams, episodes, learner)
+        yield check_generator(spec.generator, trial)
     if is_import_path(spec.learner) or is_import_path(spec.networks):
-        check_learner(spec.learner, env, spec.config, spec.hparams, spec.networks, episodes)
+        check_learner(spec.learner, trial, spec.config, networks=spec.networks)
         yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
 
 
 def check_sampler(
-    sampler: str | Sampler | LogWeightsFn,
-    env: Env,
-    hparams: HParams | None = None,
-    episodes: Episode | None = None,
-    learner: Learner | None = None,
+    sampler: str | Sampler | LogWeightsFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
 ) -> str:
-    """Asks a sampler for the log weights of every step of random episodes.
+    """Checks the log weights of every step of random episodes.
 
     They must be floats [T+1], below +inf and not NaN, not all -inf at every step, and the same under `jax.vmap` as alone and in
     a second call.
-
-    Args:
-      sampler: what `samplers.make` takes.
-      env: the environment.
-      hparams: numbers; None for the defaults.
-      episodes: to ask about; None for random ones.
-      learner: untrained learner whose values a score may read; None for `ddpg`.
-
-    Returns:
-      A line: at how many of the steps it offers no goal, and whether it offers goals of the past.
-
-    Raises:
-      ComponentError: names the first violation.
     """
-    made, hparams = attempt("sampler", samplers.make, sampler), hparams or HParams()
-    episodes = episodes or random_episodes(env)
-    steps = jnp.arange(env.episode_length)
-    score = jnp.zeros((episodes.action.shape[0], env.episode_length + 1))
+    made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, learner)
+    episodes, numbers = trial.episodes, trainer.as_arrays(trial.hparams)
+    steps, score = jnp.arange(episodes.action.shape[1]), jnp.zeros(episodes.achieved_goal.shape[:2])
     if made.score is not None:
-        score = attempt("sampler: score", samplers.score_episodes, made, episodes, trial_context(env, hparams, learner))
+        score = attempt("sampler: score", samplers.score_episodes, made, episodes, trial.context)
 
     def of_step(achieved: Any, desired: Any, score: Any, step: Any) -> Any:
-        return samplers.weigh(made, achieved, desired, step, as_arrays(hparams), score)
+        return samplers.weigh(made, achieved, desired, step, numbers, score)
 
     of_episode = jax.vmap(of_step, in_axes=(None, None, None, 0))
     asked = episodes.achieved_goal, episodes.desired_goal, score
@@ -116,8 +101,7 @@ def _check_log_weights(values: NDArray, alone: NDArray) -> str:
     weights = _weights(values)
     offers = (values > -np.inf).any(axis=-1)
     expect(offers.any(), "sampler: it offers no goal at any step: all log weights are -inf")
-    same = np.allclose(weights[0, -1], _weights(alone), rtol=TOLERANCE, atol=TOLERANCE)
-    expect(same, "sampler: log weights under jax.vmap must be those alone; they depend on other episodes or steps")
+    expect_same("sampler, alone and under jax.vmap,", _weights(alone), weights[0, -1])
     num_steps = values.shape[1]
     past = np.tril(np.ones((num_steps, num_steps + 1), bool))
     missing = f"no goal at {1 - offers.mean():.0%} of the steps, which keep their own; " if not offers.all() else ""
@@ -130,40 +114,24 @@ def _weights(log_weights: NDArray) -> NDArray:
     return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 
 
-def check_metric(
-    metric: str | MetricFn | LearnedMetric, env: Env, episodes: Episode | None = None, learner: Learner | None = None
-) -> str:
-    """Asks a metric for the distances of random episodes' goals: [T+1], finite, not negative and not all alike.
-
-    Returns:
-      A line: their range.
-
-    Raises:
-      ComponentError: names the first violation.
-    """
-    made = attempt("metric", samplers.make_metric, metric)
-    episodes = episodes or random_episodes(env)
+def check_metric(metric: str | MetricFn | LearnedMetric, env: Env | Trial, learner: Learner | None = None) -> str:
+    """Checks the distances of random episodes' goals: [T+1], finite, not negative and not all alike."""
+    made, trial = attempt("metric", samplers.make_metric, metric), trial_of(env, None, learner)
     if isinstance(made, LearnedMetric):
-        sampler, context = samplers.make("closest", metric=made), trial_context(env, learner=learner)
-        distances = np.asarray(attempt("metric", samplers.score_episodes, sampler, episodes, context))
+        sampler = samplers.make("closest", metric=made)
+        distances = np.asarray(attempt("metric", samplers.score_episodes, sampler, trial.episodes, trial.context))
     else:
         compute = jax.vmap(functools.partial(samplers.measure, made))
-        distances = np.asarray(run("metric", compute, episodes.achieved_goal, episodes.desired_goal))
+        distances = np.asarray(run("metric", compute, trial.episodes.achieved_goal, trial.episodes.desired_goal))
     text = expect_range("metric: distances", distances)
     expect(distances.min() < distances.max(), f"metric: it tells no goals apart: all distances are {distances.min():.3g}")
     return f"metric as it should be: distances {text}"
 
 
 def check_kernel(kernel: str | KernelFn) -> str:
-    """Asks a kernel for the log weights of relative distances from 0 to 3, at temperatures of 0.3, 1 and 3.
+    """Checks the log weights of relative distances from 0 to 3, at temperatures of 0.3, 1 and 3.
 
     They must be as many as the distances, below +inf and not NaN, not all -inf, and not all alike.
-
-    Returns:
-      A line: the weights at some distances.
-
-    Raises:
-      ComponentError: names the first violation.
     """
     made = attempt("weight_kernel", components.load, "weight_kernel", kernel, "relative", "temperature")
     relative = jnp.linspace(0.0, 3.0, 31)
@@ -183,16 +151,10 @@ def check_kernel(kernel: str | KernelFn) -> str:
 
 
 def check_normalization(normalization: str | NormalizationFn) -> str:
-    """Asks a normalization for the relative distances of 20 candidates among 30 distances, at scales of 0.01, 0.05 and 1.
+    """Checks the relative distances of 20 candidates among 30 distances, at scales of 0.01, 0.05 and 1.
 
     They must be as many floats as there are distances, not NaN, and finite for candidates: those whose distances are 0.01 to
     0.2, which it must tell apart, or all 0.1, or all 0, and a single candidate.
-
-    Returns:
-      A line: their range for distances of 0.01 to 0.2.
-
-    Raises:
-      ComponentError: names the first violation.
     """
     field = "weight_normalization"
     made = attempt(field, components.load, field, normalization, "distance", "candidates", "scale")
@@ -217,36 +179,83 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
 
 
 def check_priority(
-    priority: str | Priority | PriorityFn,
-    env: Env,
-    hparams: HParams | None = None,
-    episodes: Episode | None = None,
-    learner: Learner | None = None,
+    priority: str | Priority | PriorityFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
 ) -> str:
-    """Asks a priority for the weights of random episodes, and for renewed weights and transitions if it has a say in them.
+    """Checks the weights of random episodes, and renewed weights and chosen transitions if the priority has a say in them.
 
-    Weights must be scalars, finite and not negative.
-
-    Returns:
-      A line: the range of the weights.
-
-    Raises:
-      ComponentError: names the first violation.
+    Weights must be scalars, finite and not negative. Indices must be those of candidates, and depend on these.
     """
-    made, hparams = attempt("priority", priorities.make, priority), hparams or HParams()
-    episodes = episodes or random_episodes(env)
-    more = check_choice(made, env, hparams, episodes, learner) if isinstance(made, Priority) else []
-    of_episode = priorities.whole(made).weigh
-    if of_episode is None:
-        return f"priority as it should be: {'; '.join(more)}"
-    context = trial_context(env, hparams, learner)
+    made, trial = priorities.whole(attempt("priority", priorities.make, priority)), trial_of(env, hparams, learner)
+    if made.uses_values and trial.learner is not None:
+        attempt("priority", learners.check_values, trial.learner)
+    context, lines = trial.context, []
+    if (of_episode := made.weigh) is not None:
 
-    def weigh(episode: Any) -> Any:
-        return check.array("priority: weight []", of_episode(episode, context), (), jnp.number)
+        def weigh(episode: Any) -> Any:
+            return check.array("priority: weight []", of_episode(episode, context), (), jnp.number)
 
-    weights = np.asarray(run("priority", jax.vmap(weigh), episodes))
-    text = expect_range("priority: weights", weights)
-    alone = attempt("priority, alone,", jax.jit(weigh), jax.tree.map(lambda x: x[0], episodes))
-    expect_same("priority, alone and under jax.vmap,", alone, weights[0])
-    none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
-    return f"priority as it should be: {'; '.join([f'weights {text}{none}', *more])}"
+        weights = np.asarray(run("priority", jax.vmap(weigh), trial.episodes))
+        alone = attempt("priority, alone,", jax.jit(weigh), jax.tree.map(lambda x: x[0], trial.episodes))
+        text = expect_range("priority: weights", weights)
+        expect_same("priority, alone and under jax.vmap,", alone, weights[0])
+        none = ": while none is above 0, episodes are drawn uniformly" if weights.max() == 0 else ""
+        lines.append(f"weights {text}{none}")
+    if (renew := made.renew) is not None:
+        weights = np.asarray(run("priority: renew", lambda ring: renew(ring, context), trial.ring))
+        attempt("priority: renew", jax.eval_shape, lambda ring: priorities.renew(made, ring, context), trial.ring)
+        lines.append(f"renewed weights {expect_range('priority: weights', weights[:EPISODES])}")
+    if made.choose is not None:
+        _check_picks(made.choose, trial)
+        lines.append(f"{NUMBER} of {CANDIDATES * NUMBER} transitions chosen")
+    return f"priority as it should be: {'; '.join(lines)}"
+
+
+def _check_picks(choose: ChooseFn, trial: Trial) -> None:
+    """Checks the indices that `choose` gives of the candidates of several batches."""
+    ring, context = trial.ring, trial.context
+
+    def pick(key: PRNGKey) -> jax.Array:
+        sample_key, goal_key, choose_key = jax.random.split(key, 3)
+        sample = replay.sample(ring, sample_key, CANDIDATES * NUMBER)
+        batch = relabel(sample, samplers.future, context, goal_key).batch
+        indices = choose(choose_key, sample, batch, NUMBER, context)
+        return check.array("priority: indices [B] of choose", indices, (NUMBER,), jnp.integer)
+
+    keys = jax.random.split(jax.random.key(3), BATCHES)
+    program = compiled("priority: choose", pick, keys[0])
+    picked = np.stack([program(key) for key in keys])
+    outside = picked[(picked < 0) | (picked >= CANDIDATES * NUMBER)]
+    expect(not outside.size, f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {outside[:1]}")
+    same = (picked == picked[:, :1]).all()
+    expect(not same, f"priority: choose must give different transitions; all {NUMBER} are one, in each of {BATCHES} batches")
+    first = (picked == CANDIDATES * np.arange(NUMBER)).all()
+    expect(not first, f"priority: choose keeps the first of each {CANDIDATES} candidates, whatever they are; it must choose")
+
+
+def check_generator(
+    generator: str | Generator | GenerateFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
+) -> str:
+    """Checks the goals of random resets, with an empty ring and with random episodes in it.
+
+    They must be floats [N, G], the same for the same key, and finite for some reset once there are episodes. The environment
+    must have `with_goal`.
+    """
+    made, trial = attempt("generator", generators.make, generator), trial_of(env, hparams, learner)
+    attempt("generator", check_with_goal, trial.env)
+    if made.uses_values and trial.learner is not None:
+        attempt("generator", learners.check_values, trial.learner)
+    context, first = trial.context, jax.jit(jax.vmap(trial.env.reset))(jax.random.split(jax.random.key(1), EPISODES))
+
+    def ask(obs: GoalObs, ring: ReplayState) -> jax.Array:
+        goals = made(jax.random.key(2), obs, ring, context)
+        return check.array("generator: goals [N, G]", goals, obs["desired_goal"].shape)
+
+    program = compiled("generator", ask, first.obs, trial.ring)
+    program(first.obs, trial.empty_ring)
+    goals, own = np.asarray(program(first.obs, trial.ring)), np.asarray(first.obs["desired_goal"])
+    finite = np.isfinite(goals).all(axis=-1)
+    expect(finite.any(), "generator: no goal is finite, so every episode would be played for the reset's own")
+    set_goals: Any = jax.vmap(trial.env.with_goal)  # type: ignore[attr-defined]
+    attempt("env: with_goal", jax.jit(set_goals), first, jnp.asarray(np.where(finite[:, None], goals, own)))
+    other = np.mean(finite & (goals != own).any(axis=-1))
+    return f"generator as it should be: {other:.0%} of the goals are not those of the reset"

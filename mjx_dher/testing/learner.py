@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher import check, context, learners, replay
+from mjx_dher import check, context, learners, replay, trainer
 from mjx_dher.config import Config, HParams
 from mjx_dher.contract import env_spec
 from mjx_dher.learners import Learner, LearnerFn
@@ -15,20 +15,18 @@ from mjx_dher.networks import NetworksFn
 from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
 from mjx_dher.samplers import future
-from mjx_dher.testing.methods import as_arrays
-from mjx_dher.testing.trial import EPISODES, TOLERANCE, attempt, expect, expect_finite, random_episodes, run
-from mjx_dher.types import Env, Episode, PyTree
+from mjx_dher.testing.trial import EPISODES, TOLERANCE, Trial, attempt, expect, expect_finite, run, trial_of
+from mjx_dher.types import Env, EnvSpec, Episode, PyTree
 
 BATCH = 8
 
 
 def check_learner(
     learner: str | LearnerFn,
-    env: Env,
+    env: Env | Trial,
     config: Config | None = None,
     hparams: HParams | None = None,
     networks: str | NetworksFn = "mlp",
-    episodes: Episode | None = None,
 ) -> None:
     """Makes a learner, lets it act, explore and learn from one batch, and checks the results.
 
@@ -36,37 +34,34 @@ def check_learner(
     - `act` and `explore` give finite actions [N, A] in [-1, 1]; `act` takes any leading axes.
     - `value`, if present, gives one finite number for each action, for any leading axes.
     - `update`, `update_target` and `update_normalizers` keep the state's structure, shapes and types, as `lax.scan` needs, and
-      numbers finite; `update` changes it.
+      numbers finite; `update` changes it. `act`, `explore` and `update` give the same in a second call.
     - Metrics of `update` and `summary` are dicts of scalars, with names that nothing else is logged by.
     - `update_normalizers` ignores observations that are not valid.
     - `export` gives a `policy.Policy` that acts as `act` does, or None.
 
     Args:
       learner: what `learners.make` takes.
-      env: the environment.
+      env: the environment, or a `Trial`.
       config: sizes; None for the defaults.
       hparams: numbers; None for the defaults.
       networks: what `networks.make` takes.
-      episodes: to learn from; None for random ones.
 
     Raises:
       ComponentError: names the first violation.
     """
-    config, hparams = config or Config(), hparams or HParams()
-    episodes = episodes or random_episodes(env)
-    spec = attempt("env", env_spec, env)
-    made: Learner = attempt("learner", learners.make, learner, config, spec, networks)
-    numbers = as_arrays(hparams)
+    trial = trial_of(env, hparams, None)
+    hparams, episodes, spec = trial.hparams, trial.episodes, env_spec(trial.env)
+    made: Learner = attempt("learner", learners.make, learner, config or Config(), spec, networks)
+    numbers = trainer.as_arrays(hparams)
     state = attempt("learner.init", jax.jit(made.init), jax.random.key(0))
     expect_finite("the state that learner.init gives", state)
-    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), EPISODES, spec.ends), episodes)
-    sample = replay.sample(ring, jax.random.key(1), BATCH)
-    batch = relabel(sample, future, context.of_env(env, numbers), jax.random.key(4)).batch
+    sample = replay.sample(trial.ring, jax.random.key(1), BATCH)
+    batch = relabel(sample, future, context.of_env(trial.env, numbers), jax.random.key(4)).batch
     valid = jnp.arange(EPISODES) > 0
     hide = lambda x: x.at[0].set(jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x  # noqa: E731
     played = jax.tree.map(hide, episodes.observation), batch.desired_goal, numbers, valid
     state = _step("update_normalizers", jax.jit(made.update_normalizers), state, *played)
-    obs = _check_acting(made, state, episodes, env, numbers)
+    obs = _check_acting(made, state, episodes, spec, numbers)
     updated, metrics = learners.check_update(state, run("learner.update", made.update, state, batch, numbers))
     expect_finite("the state that learner.update gives", updated)
     same = all(bool(jnp.array_equal(a, b)) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(updated)))
@@ -84,7 +79,7 @@ def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> N
     if policy is not None:
         what = f"learner.export must give a policy.Policy or None; it gives a {type(policy).__name__}"
         expect(isinstance(policy, Policy), what)
-        theirs, ours = attempt("the policy of learner.export", policy, obs), made.act(state, obs, as_arrays(hparams))
+        theirs, ours = attempt("the policy of learner.export", policy, obs), made.act(state, obs, trainer.as_arrays(hparams))
         same = theirs.shape == ours.shape and bool(jnp.allclose(theirs, ours, atol=TOLERANCE))
         expect(same, "the policy of learner.export must act as learner.act does; it does not")
 
@@ -97,18 +92,18 @@ def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
     return after
 
 
-def _check_acting(made: Learner, state: Any, episodes: Episode, env: Env, hparams: HParams) -> PyTree:
+def _check_acting(made: Learner, state: Any, episodes: Episode, spec: EnvSpec, hparams: HParams) -> PyTree:
     """Checks actions and values for the first observations of the episodes; returns these."""
     start: Any = {"observation": episodes.observation, "achieved_goal": episodes.achieved_goal}
     obs = {**jax.tree.map(lambda x: x[:, 0], start), "desired_goal": episodes.desired_goal}
-    noise = attempt("learner.noise", made.noise, jax.random.key(2), env.episode_length, EPISODES, hparams)
-    learners.check_noise(noise, env.episode_length, EPISODES)
+    noise = attempt("learner.noise", made.noise, jax.random.key(2), spec.episode_length, EPISODES, hparams)
+    learners.check_noise(noise, spec.episode_length, EPISODES)
     explored = run("learner.explore", made.explore, state, obs, jax.tree.map(lambda x: x[0], noise), hparams)
-    _check_actions("explore", explored, (EPISODES, env.action_size))
+    _check_actions("explore", explored, (EPISODES, spec.action_size))
     action = run("learner.act", made.act, state, obs, hparams)
-    _check_actions("act", action, (EPISODES, env.action_size))
+    _check_actions("act", action, (EPISODES, spec.action_size))
     one = attempt("learner.act on one observation [D]", made.act, state, jax.tree.map(lambda x: x[0], obs), hparams)
-    _check_actions("act on one observation [D]", one, (env.action_size,))
+    _check_actions("act on one observation [D]", one, (spec.action_size,))
     alone = jnp.allclose(one, action[0], atol=TOLERANCE)
     expect(alone, "learner.act of a batch must be that of each of its observations; it depends on the others")
     if hasattr(made, "value"):

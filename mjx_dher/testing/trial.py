@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import traceback
@@ -14,11 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher.contract import check_env_parts
+from mjx_dher import learners, replay, trainer
+from mjx_dher.config import Config, HParams
+from mjx_dher.context import Context, of_env
+from mjx_dher.contract import check_env_parts, env_spec
+from mjx_dher.learners import Learner
+from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Env, Episode
 
-EPISODES = 16
+EPISODES = 16  # random ones
 TOLERANCE = 1e-3
 # Folders of code that is not the user's.
 _OURS = os.path.dirname(os.path.dirname(__file__)) + os.sep
@@ -60,8 +66,8 @@ def compiled(what: str, function: Callable[..., Any], *args: Any, tolerance: flo
     program = attempt(what, traces[0].compile)
     # Two traces are compared as programs, because most are the same, and compiling takes longest.
     other = program if traces[0].as_text() == traces[1].as_text() else attempt(what, traces[1].compile)
-    results = (attempt(what, again, *args) for again in (program, other))
-    expect_same(f"{what}, called twice with the same arguments,", *results, tolerance)
+    first, second = (attempt(what, again, *args) for again in (program, other))
+    expect_same(f"{what}, called twice with the same arguments,", first, second, tolerance)
     return lambda *args: attempt(what, program, *args)
 
 
@@ -80,6 +86,43 @@ def expect_same(what: str, result: Any, expected: Any, tolerance: float = TOLERA
             name = jax.tree_util.keystr(path, simple=True, separator=": ")
             difference = f"{name or 'it'} differs by {np.nanmax(np.abs(a - b)):.3g}"
             raise ComponentError(f"{what} must give the same result; {difference}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """What components are tried on: random episodes of an environment, in the middle of a run of an untrained learner."""
+
+    env: Env
+    hparams: HParams = HParams()  # noqa: RUF009 - a tuple
+    learner: Learner | None = None  # whose values may be read; None for `ddpg`
+
+    @functools.cached_property
+    def episodes(self) -> Episode:
+        """16 episodes; leaves lead with [16]."""
+        return random_episodes(self.env)
+
+    @functools.cached_property
+    def context(self) -> Context:
+        """What methods may look at."""
+        made = self.learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_spec(self.env))
+        numbers = trainer.as_arrays(self.hparams)
+        values = learners.values_of(made, made.init(jax.random.key(0)), numbers) if hasattr(made, "value") else None
+        return of_env(self.env, numbers, progress=jnp.float32(0.5), values=values)
+
+    @functools.cached_property
+    def empty_ring(self) -> ReplayState:
+        """A ring with room for twice as many episodes."""
+        return replay.init(jax.tree.map(lambda x: x[0], self.episodes), 2 * EPISODES, env_spec(self.env).ends)
+
+    @functools.cached_property
+    def ring(self) -> ReplayState:
+        """A ring that holds the episodes, half of its rows empty."""
+        return replay.add(self.empty_ring, self.episodes)
+
+
+def trial_of(env: Env | Trial, hparams: HParams | None, learner: Learner | None) -> Trial:
+    """A trial in an environment, or the one that is given in its place."""
+    return env if isinstance(env, Trial) else Trial(env, hparams or HParams(), learner)
 
 
 def random_episodes(env: Env, seed: int = 0) -> Episode:
