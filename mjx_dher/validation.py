@@ -20,6 +20,18 @@ def check_devices(devices: Any) -> None:
             raise ValueError(f"devices must be an integer in [1, {_MAX_DEVICES}], or all; got {devices!r}")
 
 
+def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[str, int]:
+    """Returns the host, without brackets, and the port of an address.
+
+    Raises:
+      ValueError: the address is invalid; the message has its `name` and what is `allowed`.
+    """
+    host, _, port = value.rpartition(":")
+    if not host or "/" in host or not (port.isascii() and port.isdecimal()) or not 0 < int(port[:6]) < 1 << 16:
+        raise ValueError(f"{name} must be {allowed}; got {value!r}")
+    return host.strip("[]"), int(port)
+
+
 def check_parts(config: Config, episode_length: int, parts: int) -> None:
     """Refuses sizes that cannot be divided among the devices that share one run.
 

@@ -91,6 +91,10 @@ def test_processes_that_cannot_be_joined_are_rejected(tmp_path, capsys, monkeypa
     ):
         assert main(arguments) == 2
         assert field in capsys.readouterr().err
+    for address in ("", "127.0.0.1", ":9876", "127.0.0.1:x", "127.0.0.1:99999"):  # JAX would take the last for 34463
+        monkeypatch.setenv("JAX_COORDINATOR_ADDRESS", address)
+        assert main(["train", "--distributed", *out]) == 2
+        assert "JAX_COORDINATOR_ADDRESS" in capsys.readouterr().err
     monkeypatch.setenv("JAX_NUM_PROCESSES", "nan")
     assert main(["train", "--distributed", *out]) == 2
     assert "JAX_NUM_PROCESSES" in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_the_missing_extra_is_named(monkeypatch):
 def test_addresses_are_those_for_a_browser_here():
     assert address.address("127.0.0.1", 80) == "http://127.0.0.1:80"
     assert address.address("0.0.0.0", 80) == "http://127.0.0.1:80"
-    assert address.address("::1", 80) == "http://[::1]:80"
+    assert address.address("::1", 80) == address.address("::", 80) == "http://[::1]:80"
 
 
 def test_only_a_browser_with_a_screen_is_opened(monkeypatch):

@@ -107,8 +107,8 @@ def _view(args: ViewArgs, console: Console) -> int:
     with server.Viewer([*given, *others], maker, args.page.host, port, args.seed) as viewer:
         console.print(f"{given[0].label} is at play: {viewer.address} (Ctrl-C ends it)")
         if not address.is_loopback(args.page.host):
-            place = "any address of this machine" if address.is_everywhere(args.page.host) else args.page.host
-            console.print(f"whoever can reach {place} can see the page, and move things in it")
+            place = "all addresses of this machine" if address.is_everywhere(args.page.host) else args.page.host
+            console.print(f"it listens on {place}, without a password: whoever connects can see and use the page")
         if args.page.open and not address.open_browser(viewer.address):
             console.print("there is no browser here that could be opened: open that address in one")
         sys.stdout.flush()

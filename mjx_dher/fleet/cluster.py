@@ -17,6 +17,7 @@ from mjx_dher.fleet.chunks import Chunk, Task
 from mjx_dher.fleet.options import LOCAL
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.system import files, signals, subprocesses
+from mjx_dher.validation import host_and_port
 
 RETRIES = 5  # of a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # for the head of a cluster
@@ -114,9 +115,8 @@ def _check_answers(address: str) -> None:
     where = [] if address == "auto" else ["--address", address]
     failure = None
     if where:
-        host, _, port = address.rpartition(":")
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=SECONDS_TO_ANSWER).close()
+            socket.create_connection(host_and_port("ray", address), timeout=SECONDS_TO_ANSWER).close()
         except OSError as error:
             failure = error.strerror or str(error)
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check", *where]

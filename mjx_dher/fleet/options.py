@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from mjx_dher import lookup
-from mjx_dher.validation import check_count
+from mjx_dher.validation import check_count, host_and_port
 
 LOCAL = "local"
 
@@ -32,10 +32,8 @@ class FleetOptions:
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} needs --ray local, auto or HOST:PORT; got {getattr(self, name)} without it")
             return
-        host, _, port = self.ray.rpartition(":")
-        is_address = bool(host) and "://" not in self.ray and port.isdecimal() and 0 < int(port) < 65536
-        if self.ray not in (LOCAL, "auto") and not is_address:
-            raise ValueError(f"ray must be local, auto (this machine's cluster), or HOST:PORT of a head; got {self.ray!r}")
+        if self.ray not in (LOCAL, "auto"):
+            host_and_port("ray", self.ray, "local, auto (this machine's cluster), or HOST:PORT of a head")
         for name in ("ray_cpus", "ray_chunk"):
             if getattr(self, name) is not None:
                 check_count(name, getattr(self, name))

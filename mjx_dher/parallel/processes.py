@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from mjx_dher.system import signals
+from mjx_dher.validation import host_and_port
 
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 TIMEOUTS = {"initialization_timeout": 60, "heartbeat_timeout_seconds": 30, "shutdown_timeout_seconds": 30}
@@ -46,8 +47,9 @@ def connect() -> None:
 
 def _bind_address() -> str | None:
     """Address that the coordinator listens at: the named one if it is an IP address of this machine; None leaves it to JAX."""
-    address = os.environ.get(VARIABLES[0], "")
-    host = address.rpartition(":")[0].strip("[]")
+    if VARIABLES[0] not in os.environ:
+        return None
+    host, _ = host_and_port(VARIABLES[0], address := os.environ[VARIABLES[0]])
     with contextlib.suppress(OSError, ValueError):
         family = socket.AF_INET6 if ipaddress.ip_address(host).version == 6 else socket.AF_INET
         socket.create_server((host, 0), family=family).close()

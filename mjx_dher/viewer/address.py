@@ -62,8 +62,9 @@ def is_everywhere(host: str) -> bool:
 
 def address(host: str, port: int) -> str:
     """Returns the page's address for a browser on this machine."""
-    name = "127.0.0.1" if is_everywhere(host) else f"[{host}]" if ":" in host else host
-    return f"http://{name}:{port}"
+    if is_everywhere(host):
+        host = "::1" if ":" in host else "127.0.0.1"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def open_browser(url: str) -> bool:
