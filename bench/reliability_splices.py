@@ -16,7 +16,7 @@ FILES = ("config.json", "policy.npz", "result.json", "metrics.csv")
 def splices(folder):
     """Every file, line of metrics.csv, checkpoint and file of a checkpoint of one run, in place of another's."""
     runs = make(folder)
-    tried, faults = 0, []
+    tried, rejected, faults = 0, 0, []
     for kind in ("stopped", "whole"):
         for theirs in ("seed", "sampler", "length"):
             for name, splice in foreign(runs[theirs][kind]):
@@ -26,11 +26,13 @@ def splices(folder):
                     shutil.copytree(runs["mine"][kind], copy)
                     splice(copy)
                     tried += 1
-                    if fault := fault_of(command, kind, copy, runs):
+                    status, fault = outcome_of(command, kind, copy, runs)
+                    rejected += status == 2
+                    if fault:
                         faults.append(f"{command}, {name} of another {theirs} in a run that is {kind}: {fault}")
     return (
         f"{tried} splices of files, lines and checkpoints of another run",
-        "each rejected by name, or without effect on what the command reads",
+        f"{rejected} rejected by name; {tried - rejected} without effect on what the command reads",
         faults,
     )
 
@@ -98,8 +100,8 @@ def put_checkpoint(copy, path):
     shutil.copytree(path, newest.with_name(path.name))
 
 
-def fault_of(command, kind, copy, runs):
-    """What is wrong with what a command made of a copy; empty if nothing is."""
+def outcome_of(command, kind, copy, runs):
+    """The status of a command on a copy, and what is wrong with what it made of it; empty if nothing is."""
     right, before = runs["right"], everything(copy)
     more = {"eval": ["--episodes", "4"], "plot": ["--formats", "svg"], "report": [], "resume": ["--no-curve"]}[command]
     if command == "resume" and kind == "whole":
@@ -107,16 +109,17 @@ def fault_of(command, kind, copy, runs):
     status, text = call(command, copy, *more)
     if status == 2 and "error: " in text:
         written = [name for name in differing(before, everything(copy)) if not name.endswith(".lock")]
-        return f"rejected, and changed: {written[:3]}" if written else ""
+        return status, f"rejected, and changed: {written[:3]}" if written else ""
     if status:
-        return f"traceback: status {status}: {text[-300:]}"
+        return status, f"traceback: status {status}: {text[-300:]}"
     if command == "resume":
         wanted = {name: value for name, value in right[kind].items() if name in ("metrics", "policy", "result")}
-        return "" if same(lambda path: {x: of_run(path)[x] for x in wanted}, copy, wanted) else "silent: another end"
+        is_right = same(lambda path: {x: of_run(path)[x] for x in wanted}, copy, wanted)
+        return status, "" if is_right else "silent: another end"
     if command == "eval":
         seen = text.replace(str(copy), ""), right["eval"][kind].replace(str(runs["mine"][kind]), "")
-        return "" if seen[0] == seen[1] else f"silent: another evaluation: {text[-200:]}"
-    return "" if rows(copy / "metrics.csv") == right["rows"][kind] else "silent: the curve of another run"
+        return status, "" if seen[0] == seen[1] else f"silent: another evaluation: {text[-200:]}"
+    return status, "" if rows(copy / "metrics.csv") == right["rows"][kind] else "silent: the curve of another run"
 
 
 PARTS = {"splices": splices}

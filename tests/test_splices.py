@@ -108,6 +108,16 @@ def test_a_missing_line_is_named(stopped, capsys):
     is_rejected(capsys, "plot", stopped, naming=["metrics.csv", "epoch", 3])
 
 
+def test_metrics_that_would_block_or_fill_memory_do_neither(stopped):
+    path = stopped / "metrics.csv"
+    os.truncate(path, 50 << 30)  # zeros after the last line, as after a power cut
+    assert len(results.read_metrics(stopped)) == 4
+    path.unlink()
+    os.mkfifo(path)
+    with refuses("metrics.csv", error=FolderError):
+        results.read_metrics(stopped)
+
+
 @pytest.mark.parametrize(
     ("file", "path", "value"),
     [

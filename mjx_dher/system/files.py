@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
+import itertools
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 LARGEST_JSON = 8 << 20  # bytes
+LONGEST_LINE = 100_000  # bytes; the module csv reads fields of 131,072
 PARTIAL = ".partial"  # ending of a file that is being written; what has this name is deleted first
 LOCK = ".lock"  # name of the file in a folder by which it is locked
 _MARKER = f"{LOCK}.soft"  # the same, on a file system without locks
@@ -86,6 +88,21 @@ def read_json(file: Path) -> Any:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise FolderError(f"{file} cannot be read ({error})") from error
+
+
+def whole_lines(file: Path) -> list[str]:
+    """Lines of a text file, up to the first without an end in `LONGEST_LINE` bytes; none if there is no file.
+
+    Raises:
+      FolderError: it is a folder or a FIFO.
+    """
+    if file.exists() and not file.is_file():
+        raise FolderError(f"{file} is not a file")  # reading a FIFO would block
+    lines: list[bytes] = []
+    with contextlib.suppress(FileNotFoundError), file.open("rb") as stream:
+        read = iter(lambda: stream.readline(LONGEST_LINE), b"")
+        lines = [*itertools.takewhile(lambda line: line.endswith(b"\n"), read)]
+    return [line.decode(errors="replace") for line in lines]
 
 
 @contextlib.contextmanager

@@ -81,8 +81,7 @@ class JsonlSink:
     """
 
     def __init__(self, path: Path, epochs: int = 0):
-        lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) if epochs and path.exists() else []
-        whole = list(itertools.takewhile(lambda line: line.endswith("}\n"), lines))[:epochs]
+        whole = files.whole_lines(path)[:epochs]
         missing = read_rows(path.with_name(METRICS_FILE))[len(whole) : epochs] if epochs else []
         files.write(path, "".join([*whole, *map(_to_json, missing)]).encode())
         self._file = path.open("a", encoding="utf-8")
@@ -124,14 +123,10 @@ def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str
 
 def _whole_lines(path: Path) -> list[str]:
     """Head of metrics.csv, and its lines up to the first that is truncated."""
-    if not path.exists():
-        return []
-    with run_folder.checked(path):
-        head, *lines = path.read_bytes().decode(errors="replace").splitlines(keepends=True) or [""]
+    head, *lines = files.whole_lines(path) or [""]
     if not head.startswith(",".join(FIRST_COLUMNS) + ","):
         return []
-    columns = head.count(",")
-    return [head, *itertools.takewhile(lambda line: line.endswith("\n") and line.count(",") == columns, lines)]
+    return [head, *itertools.takewhile(lambda line: line.count(",") == head.count(","), lines)]
 
 
 def _to_number(name: str, text: str) -> int | float:

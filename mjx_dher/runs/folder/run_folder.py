@@ -266,15 +266,12 @@ def check_same(path: Path, spec: RunSpec) -> None:
 
 def read_manifest(checkpoint: Path) -> dict[str, Any]:
     """Reads the manifest of a checkpoint. Raises FolderError if it is missing or damaged."""
-    file = checkpoint / MANIFEST
-    if not file.exists():
-        raise FolderError(f"{checkpoint} is damaged: it has no {MANIFEST}")
-    content = read_versioned(file, SCHEMA)
-    if content.pop("sha256", None) != fingerprint.sha256_of(content):
-        raise FolderError(f"{checkpoint} is damaged: {MANIFEST} is not as it was written (SHA-256 differs)")
-    with checked(file):
+    with checked(checkpoint):
+        content = read_versioned(checkpoint / MANIFEST, SCHEMA)
+        if content.pop("sha256", None) != fingerprint.sha256_of(content):
+            raise ValueError(f"{MANIFEST} is not as it was written: SHA-256 differs")
         contents.check(content, contents.MANIFEST)
-    return content
+        return content
 
 
 def save_policy(path: Path, policy: Any, run: Mapping[str, Any]) -> None:
