@@ -42,7 +42,7 @@ class Control:
     """Base class: maps `size` numbers of an action, in [-1, 1], to the inputs of an engine."""
 
     size: int
-    labels: list[str]  # [size] what each number of the action moves
+    moved: list[str]  # names of the actuators or the mocap body that it moves
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Returns a copy for `model`. Raises ValueError for a name that the model lacks."""
@@ -58,10 +58,11 @@ class Actuators(Control):
 
     Args:
       names: names of actuators or of their joints, separated by spaces; "*" and "?" stand for any characters.
+      together: whether one number of the action moves all of them, as the fingers of a gripper.
     """
 
-    def __init__(self, names: str = "*"):
-        self.names = names
+    def __init__(self, names: str = "*", together: bool = False):
+        self.names, self.together = names, together
 
     def bind(self, model: mujoco.MjModel) -> Self:
         check_number("scale of control", self.scale, "(0, inf)", float)
@@ -71,8 +72,8 @@ class Actuators(Control):
             own[i] = model.actuator(i).name
             joints[i] = model.joint(joint).name if (joint := _joint(model, i)) >= 0 else ""
         bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
-        bound.labels = [own[i] or joints[i] for i in bound.indices]
-        bound.size = len(bound.indices)
+        bound.moved = [own[i] or joints[i] for i in bound.indices]
+        bound.size = 1 if self.together else len(bound.indices)
         bound.low, bound.high = np.array([_range(model, i) for i in bound.indices], np.float32).T
         bound._bind_joints(model, [_joint(model, i) for i in bound.indices])
         return bound
@@ -89,8 +90,8 @@ class Actuators(Control):
 
     scale = 1.0
     indices: list[int]
-    low: np.ndarray  # [size]
-    high: np.ndarray  # [size]
+    low: np.ndarray  # [number of actuators]
+    high: np.ndarray
 
 
 class JointPosition(Actuators):
@@ -104,12 +105,12 @@ class JointDelta(JointPosition):
     """Position servos, moved relative to the present joint positions: 1 stands for `scale` (rad, or m for a slide).
 
     Args:
-      names: as for `Actuators`.
+      names, together: as for `Actuators`.
       scale: distance of the servo's target from the joint's position for an action of 1.
     """
 
-    def __init__(self, names: str = "*", scale: float = 0.1):
-        super().__init__(names)
+    def __init__(self, names: str = "*", scale: float = 0.1, together: bool = False):
+        super().__init__(names, together)
         self.scale = scale
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
@@ -165,7 +166,7 @@ class Mocap(Control):
             raise ValueError(f"mocap body {self.body!r} must be welded to one body; the model welds {len(pulled)} to it")
         bound.place = Place(model, f"body:{model.body(pulled.pop()).name}")
         bound.size = 6 if self.turn else 3
-        bound.labels = [f"{self.body} {axis}" for axis in ("x", "y", "z", "turn x", "turn y", "turn z")[: bound.size]]
+        bound.moved = [self.body]
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:

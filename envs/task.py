@@ -97,7 +97,7 @@ class MujocoTask(GoalEnv):
         declared = self.control if isinstance(self.control, Sequence) else (self.control,)
         self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
         self.action_size = sum(part.size for part in self.parts)
-        moved = [label for part in self.parts for label in part.labels]
+        moved = [name for part in self.parts for name in part.moved]
         if len(set(moved)) < max(1, len(moved)):
             raise ValueError(f"control must move something, and nothing twice; got {moved}")
         self.goal = _checked("goal", getattr(self, "goal", None), Goal).bind(self.model)

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import my_arm
 import numpy as np
 import pytest
+import seven_joints
 from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli
+from mjx_dher.envs.kinematics import Place
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text()
 
@@ -56,3 +58,12 @@ def test_engines_agree_on_the_arm(name):
         results[engine] = state.obs["observation"]
     for observation in results.values():
         np.testing.assert_allclose(observation, results["native"], atol=1e-3)
+
+
+@pytest.mark.parametrize(("name", "size"), [("Reach", 7), ("Push", 7), ("Pick", 8)])
+def test_the_arm_of_seven_joints_has_the_published_sizes(name, size):
+    """At zero angles the flange is 88 mm in front of the base, and 333 + 316 + 384 - 107 mm high."""
+    env = getattr(seven_joints, name)(engine="native")
+    assert env.action_size == size
+    hand = Place(env.model, "body:hand").position(jnp.zeros(env.model.nq))
+    np.testing.assert_allclose(hand, [0.088, 0, 0.926], atol=1e-6)
