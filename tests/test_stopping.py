@@ -107,9 +107,17 @@ with {block}:
     assert seconds < 10
 
 
-def test_a_full_pipe_does_not_keep_a_program():
-    """Nobody reads what it prints."""
-    code = "signals.take(); import threading; threading.Timer(1, os.kill, [os.getpid(), 15]).start(); print('x' * 1_000_000)"
+@pytest.mark.parametrize("block", ["signals.held(print, 'here')", "signals.cleaning(list)"])
+def test_a_full_pipe_does_not_keep_a_program(block):
+    """Nobody reads what it prints. A held block waits for the second signal."""
+    code = f"""
+import threading
+signals.take()
+for seconds in (0.2, 0.9):
+    threading.Timer(seconds, os.kill, [os.getpid(), {signal.SIGTERM:d}]).start()
+with {block}:
+    print("x" * 1_000_000)
+"""
     with subprocess.Popen([sys.executable, "-S", "-c", PROGRAM + code], cwd=ROOT, stdout=subprocess.PIPE) as process:
         assert process.wait(20) == 143
 

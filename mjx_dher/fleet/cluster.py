@@ -76,6 +76,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
     with contextlib.ExitStack() as stack:
         if address == LOCAL:
             private = stack.enter_context(files.temporary_folder("ray-"))
+            stack.enter_context(signals.cleaning(subprocesses.kill_sessions))
             place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}
             # Ray then listens on 127.0.0.1 alone, and only processes with this token can call it.
@@ -86,7 +87,6 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
         import ray
 
         stack.callback(ray.shutdown)
-        stack.enter_context(signals.cleaning(subprocesses.kill_sessions))
         try:
             with _sessions_of_their_own():
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)

@@ -64,7 +64,9 @@ class _Signals:
                     self.asked, self.since = number, time.monotonic()
                     if len(self.blocks) == 1:
                         self.end(number)
-                    self.blocks[-1].report(STOPPING)
+                    report = threading.Thread(target=self.blocks[-1].report, args=[STOPPING], daemon=True)
+                    report.start()
+                    report.join(SECONDS_OF_ONE)  # a pipe that is full blocks whoever writes
                 elif time.monotonic() - self.since > SECONDS_OF_ONE:
                     self.end(number)
             block = self.blocks[-1]
@@ -79,7 +81,7 @@ class _Signals:
 
     def end(self, number: int) -> None:
         """Ends the process, whatever its other threads are at. Open files are closed as by a kill."""
-        limit = threading.Timer(SECONDS_TO_CLEAN, os._exit, [128 + number])  # a pipe that is full blocks whoever writes
+        limit = threading.Timer(SECONDS_TO_CLEAN, os._exit, [128 + number])
         limit.daemon = True
         limit.start()
         with contextlib.suppress(OSError):
