@@ -230,7 +230,7 @@ def test_a_full_disk_leaves_the_earlier_ones_as_they_were(program, copy, monkeyp
 
 def disk_with(free, files=10**6, block=4096):
     """`os.statvfs` of a disk with so many bytes and files left."""
-    return lambda path: SimpleNamespace(f_frsize=block, f_bavail=free // block, f_files=10**6, f_favail=files)
+    return lambda path: SimpleNamespace(f_frsize=block, f_blocks=10**9, f_bavail=free // block, f_files=10**6, f_favail=files)
 
 
 @pytest.mark.parametrize("disk", [disk_with(40_000), disk_with(10**9, files=3), disk_with(10**6, block=1 << 20)])

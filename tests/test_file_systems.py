@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import warnings
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +77,7 @@ def no_locks(request, monkeypatch):
 OTHER = """
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from mjx_dher.system import files
 with files.lock(Path(sys.argv[1])):
     print(flush=True)
@@ -169,3 +171,11 @@ def test_arrays_of_every_kind_come_back_to_the_bit_and_zeros_take_no_space(tmp_p
     read = checkpoint._read_arrays(tmp_path / "x", [str(array.dtype) for array in arrays])
     assert [(x.dtype, x.shape, x.tobytes()) for x in read] == [(x.dtype, x.shape, x.tobytes()) for x in arrays]
     assert sum(path.stat().st_blocks * 512 for path in tmp_path.rglob("*.npy")) < 4 << 20  # of 22 MB
+
+
+@pytest.mark.parametrize("size", [0, 4096])
+def test_a_file_system_that_tells_no_size_is_not_full(size, tmp_path, monkeypatch):
+    """An unlimited tmpfs, some of FUSE."""
+    nothing = SimpleNamespace(f_frsize=size, f_blocks=0, f_bavail=0, f_files=0, f_favail=0)
+    monkeypatch.setattr(os, "statvfs", lambda path: nothing)
+    assert files.lack_of_space(tmp_path / "a", [10**9]) is None

@@ -269,9 +269,9 @@ def lack_of_space(folder: Path, sizes: Sequence[int]) -> str | None:
     """Reason why files of these sizes, in bytes, do not fit on the disk of a folder, made or not; None if they do."""
     folder = folder.absolute()
     disk = os.statvfs(next(path for path in (folder, *folder.parents) if path.is_dir()))
-    block = min(disk.f_frsize, _LARGEST_BLOCK)
+    block = min(disk.f_frsize or 1, _LARGEST_BLOCK)
     needed, free = sum(-(-size // block) * block for size in sizes), disk.f_bavail * disk.f_frsize
-    if needed > free:
+    if needed > free and disk.f_blocks:  # else the file system does not tell its size, or has no limit
         return f"{memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free"
     if disk.f_files and len(sizes) > disk.f_favail:
         return f"{len(sizes)} files, and the disk can have {disk.f_favail} more"
