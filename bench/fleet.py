@@ -29,6 +29,8 @@ import ray
 from ray.cluster_utils import Cluster
 from timing import print_table
 
+from mjx_dher.system.limits import usable_cores
+
 ROOT = Path(__file__).resolve().parent.parent
 STORE = 80 << 20  # bytes of a node's object store
 TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")  # columns that no two runs have alike
@@ -158,7 +160,7 @@ def kills(rounds, seeds, seed, epochs=12):
 
 def overhead(seconds):
     """Times of the same sweep, plain and by Ray, with one task at a time of at least so many seconds."""
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     with tempfile.TemporaryDirectory() as folder:
 
         def timed(name, epochs, *flags):

@@ -41,7 +41,7 @@ class Guarded:
     def __init__(self, stream: Any):
         self.error: OSError | None = None
         self._closed = stream is None  # before this program began
-        self._stream = open(os.devnull, "w") if self._closed else stream  # noqa: SIM115
+        self._stream = open(os.devnull, "w", encoding="utf-8") if self._closed else stream  # noqa: SIM115
 
     def write(self, text: str) -> int:
         """Writes `text`, or drops it."""
