@@ -26,6 +26,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import reliability_calls
+import reliability_hostile
 import reliability_machines
 import reliability_pairs
 import reliability_power
@@ -43,7 +44,7 @@ SHAPES = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_
 SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
-BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS}
+BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS, **reliability_hostile.PARTS}
 PARTS = ("kills", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages", "signals")
 PARTS += (*BESIDE,)
 

@@ -23,7 +23,7 @@ def list_envs() -> tuple[str, ...]:
     return tuple(sorted(COMPONENTS["env"]))
 
 
-def make(name: str, engine: str = "auto", **overrides: Any) -> GoalEnv:
+def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
     """Makes an environment.
 
     Args:

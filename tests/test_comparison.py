@@ -96,6 +96,12 @@ def test_numbers_are_in_rising_order():
     assert [g.label for g in groups] == ["future, her_k 2", "future, her_k 4", "future, her_k 16"]
 
 
+def test_a_setting_that_some_runs_lack_comes_first():
+    cells = [cell("future", i, c, demonstrations=name) for name in ("b.npz", None, "a.npz") for i, c in enumerate(SLOW)]
+    (groups,) = comparison.groups(cells).values()
+    assert [group.others["demonstrations"] for group in groups] == [None, "a.npz", "b.npz"]
+
+
 def test_environments_are_compared_apart():
     found = comparison.groups([*CELLS, *(cell("future", i, c, env="slide") for i, c in enumerate(SLOW))])
     assert {env: [g.label for g in groups] for env, groups in found.items()} == {

@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -83,18 +84,19 @@ def open_closed() -> None:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[Guarded]:
-    """Guards sys.stdout. A character that it cannot encode is escaped, as on standard error."""
+    """Guards sys.stdout. A character that it cannot encode is escaped, as on standard error, and as in warnings."""
     open_closed()
-    before = sys.stdout
+    before, form = sys.stdout, warnings.formatwarning
     if isinstance(before, io.TextIOWrapper):
         before.reconfigure(errors="backslashreplace")
     stream = Guarded(before)
     sys.stdout = stream
+    warnings.formatwarning = lambda *about, **options: printable(form(*about, **options))
     try:
         yield stream
     finally:
         stream.flush()
-        sys.stdout = before
+        sys.stdout, warnings.formatwarning = before, form
 
 
 def status(stream: Guarded, ended: int, trains: bool) -> int:

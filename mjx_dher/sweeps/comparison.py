@@ -58,8 +58,11 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     exact = [_label(alike[0], own, lambda name, value: f"{name} {value!r}") for own, alike in by_setting.values()]
     labels = [label if labels.count(label) == 1 else digits for label, digits in zip(labels, exact)]
     result = [_group(env, label, own, _once_a_seed(alike)) for label, (own, alike) in zip(labels, by_setting.values())]
-    # Numbers in rising order; names of one setting are all strings.
-    return sorted(result, key=lambda group: (order.get(group.sampler, len(order)), list(group.others.values())))
+
+    def place(group: Group) -> Any:  # numbers in rising order, after None; names of one setting are all strings
+        return order.get(group.sampler, len(order)), [(value is not None, value) for value in group.others.values()]
+
+    return sorted(result, key=place)
 
 
 def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any], str]) -> str:
