@@ -1,5 +1,6 @@
 """`python train.py --help`, or `python -m mjx_dher --help`"""
 
+import signal
 import sys
 
 from mjx_dher.system import signals
@@ -8,6 +9,8 @@ from mjx_dher.system import signals
 def main() -> int:
     """Runs the command line. The signals come first: what it imports takes seconds, and much of it is written in C."""
     signals.take()
+    # The thread that reads them gets Ctrl-C. Programs that libraries start, as glfw does, inherit the mask, and keep quiet.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     from mjx_dher import cli
 
     return cli.main()

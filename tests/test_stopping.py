@@ -122,6 +122,19 @@ with {block}:
         assert process.wait(20) == 143
 
 
+def test_programs_that_a_library_has_started_end_silently():
+    """As glfw does when it is imported; one that would complain that nobody reads."""
+    code = """
+import subprocess
+signals.take()
+inner = "import time; time.sleep(0.5); print(1, flush=True)"
+with subprocess.Popen([sys.executable, "-S", "-c", inner], stdout=subprocess.PIPE):
+    send(signal.SIGTERM)
+    time.sleep(60)
+"""
+    assert program(code)[:3] == (143, "", "stopped\n")
+
+
 def test_nohup_keeps_a_program(tmp_path):
     code = "signals.take(); send(signal.SIGHUP); time.sleep(0.2); print('here')"
     assert program(code, "nohup")[:2] == (0, "here\n")

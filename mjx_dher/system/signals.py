@@ -52,6 +52,7 @@ class _Signals:
 
     def listen(self, read: int) -> None:
         """Reads the pipe for as long as the process lives."""
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
         while True:
             select.select([read], [], [], 1.0)
             self.look()
@@ -88,7 +89,7 @@ class _Signals:
             os.write(2, f"{self.blocks[-1].told}\n".encode())
             if os.isatty(1):
                 os.write(1, b"\x1b[?25h")  # a progress bar hides the cursor
-        for clean in (sys.stdout.flush, *reversed(list(self.cleaners.values()))):
+        for clean in (sys.stdout.flush, *reversed(list(self.cleaners.values())), _kill_children):
             with contextlib.suppress(Exception):
                 clean()
         os._exit(128 + number)
@@ -108,6 +109,22 @@ class _Signals:
             for number, handler in self.before.items():
                 signal.signal(number, handler)
         self.in_parent()
+
+
+def children() -> list[int]:
+    """Programs that this one has started, and that have not ended. Needs Linux."""
+    found: list[int] = []
+    for thread in os.listdir("/proc/self/task"):
+        with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/children", encoding="ascii") as file:
+            found += map(int, file.read().split())
+    return found
+
+
+def _kill_children() -> None:
+    """Kills the programs that libraries have started, but none with a session of its own, such as a browser."""
+    for pid in children():
+        if os.getsid(pid) == os.getsid(0):
+            os.kill(pid, signal.SIGKILL)
 
 
 _signals = _Signals()

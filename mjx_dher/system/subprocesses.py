@@ -54,11 +54,9 @@ def kill(process: subprocess.Popen[Any]) -> None:
 
 
 def kill_sessions() -> None:
-    """Kills the processes, of whatever parent, in sessions that children of the main thread lead. Needs Linux."""
-    own = os.getpid()
+    """Kills the processes, of whatever parent, in sessions that programs of this one lead. Needs Linux."""
     with contextlib.suppress(OSError):
-        children = {int(pid) for pid in Path(f"/proc/{own}/task/{own}/children").read_text("ascii").split()}
-        leaders = [pid for pid in children if os.getsid(pid) == pid]  # they first: they start the others
+        leaders = [pid for pid in signals.children() if os.getsid(pid) == pid]  # they first: they start the others
         for pid in (*leaders, *(int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())):
             with contextlib.suppress(OSError):  # it has just ended
                 if os.getsid(pid) in leaders:
