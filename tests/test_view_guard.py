@@ -113,6 +113,8 @@ def changed(message, **fields):
 
 def test_no_message_of_one_browser_disturbs_another(viewer, hostile):
     """Messages of every kind in one connection; then those of the panel are still obeyed, within their bounds."""
+    from websockets.exceptions import ConnectionClosed
+
     camera, drag, encode = hostile.CAMERA, hostile.DRAG, hostile.encode
     bad = [
         *(changed(drag, position=position) for position in ([math.nan, 0, 0], [1e39, 0, 0], [1, 2], [[1, 2, 3]], "xyz", None)),
@@ -150,6 +152,8 @@ def test_no_message_of_one_browser_disturbs_another(viewer, hostile):
                 await asyncio.sleep(0)
             async with hostile.browser(viewer.port) as stranger:  # which sends too much
                 await stranger.send(b"x" * (1 << 20))
+            with pytest.raises(ConnectionClosed):
+                await send_many(hostile, viewer.port)
             assert await watcher.sees_more()
             await until(lambda: viewer.player.speed == 4.0)
             assert not viewer.player.is_own
@@ -159,6 +163,13 @@ def test_no_message_of_one_browser_disturbs_another(viewer, hostile):
             assert viewer._server.gui._current_file_upload_states == {}
 
     asyncio.run(attack())
+
+
+async def send_many(hostile, port):
+    async with hostile.browser(port) as stranger:
+        for _ in range(50_000):
+            await stranger.send(b"")
+            await asyncio.sleep(0)
 
 
 async def until(condition):

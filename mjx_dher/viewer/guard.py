@@ -26,7 +26,8 @@ from mjx_dher.viewer import address
 CLIENTS = 16  # browsers at a time
 WAITING = 64  # connections that are no browsers yet
 MESSAGE_BYTES = 1 << 14  # the page's own have less than 300
-BYTES_PER_SECOND, BURST_BYTES = 100_000, 500_000  # of a client; the page sends up to 25,000 a second
+BYTES_PER_SECOND, BURST_BYTES = 100_000, 500_000  # of a client
+MESSAGE_COST = 500  # bytes that a message counts for beside its own; the page sends up to 100 messages a second
 UNSENT_BYTES = 16 << 20  # of a client that sends and does not read
 SECONDS_TO_READ = 20.0  # for a client that does not read
 HEADERS = {
@@ -194,6 +195,7 @@ class Connection(ServerConnection):
     async def recv(self, decode: bool | None = None) -> Any:
         while True:
             raw = await super().recv(decode)
+            self._credit -= MESSAGE_COST
             with contextlib.suppress(msgspec.MsgspecError, TypeError):  # TypeError: a frame of text
                 message = _decode(raw)  # type: ignore[arg-type]
                 if self._is_allowed(message):
