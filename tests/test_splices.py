@@ -230,7 +230,7 @@ print(sorted(before.items()))
         [sys.executable, "-c", code], cwd=ROOT, env={**os.environ, **changed}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    found = {**changed, "JAX_ENABLE_X64": 1, "JAX_THREEFRY_PARTITIONABLE": 0, "JAX_RANDOM_SEED_OFFSET": 3}
+    found = {**changed, "JAX_ENABLE_X64": 1, "JAX_THREEFRY_PARTITIONABLE": 0, "JAX_RANDOM_SEED_OFFSET": "3"}
     del found["JAX_DEFAULT_PRNG_IMPL"]
     assert done.stdout.strip() == str(sorted(found.items()))
 

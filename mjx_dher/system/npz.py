@@ -11,6 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+_DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, MemoryError, NotImplementedError, OverflowError),
+    *(RuntimeError, SyntaxError),  # RuntimeError: it asks for a password
+)
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -60,9 +64,7 @@ def read(
                     if member.read(1):  # also compares the checksum
                         raise ValueError(f"{name} is longer than its header says")
             return arrays
-    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, MemoryError) as error:
-        raise ValueError(str(error)) from error
-    except (NotImplementedError, OverflowError, RuntimeError, SyntaxError) as error:  # RuntimeError: it asks for a password
+    except _DAMAGED as error:
         raise ValueError(str(error)) from error
 
 

@@ -27,7 +27,7 @@ JAX_FLAGS: dict[str, Any] = {
     "JAX_DEFAULT_PRNG_IMPL": "threefry2x32",
     "JAX_RANDOM_SEED_OFFSET": 0,
 }
-_WORDS = {**dict.fromkeys(("y", "yes", "t", "true", "on"), 1), **dict.fromkeys(("n", "no", "f", "false", "off"), 0)}
+_WORDS = {**dict.fromkeys(("y", "yes", "t", "true", "on", "1"), 1), **dict.fromkeys(("n", "no", "f", "false", "off", "0"), 0)}
 # Every version has written these settings, and a digest always includes them. It includes any other setting only if it
 # differs from its default, so that a new setting changes no digest and no trial's name.
 ALWAYS = frozenset(
@@ -100,16 +100,11 @@ def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
 
 def jax_flags() -> dict[str, Any]:
     """Those of `JAX_FLAGS` that differ from JAX's defaults: as JAX has them or, before it is imported, will read them."""
-    flags: dict[str, Any] = {}
+    config, flags = getattr(sys.modules.get("jax"), "config", None), {}
     for name, default in JAX_FLAGS.items():
-        config = getattr(sys.modules.get("jax"), "config", None)
-        value = os.environ.get(name) if config is None else getattr(config, name.lower(), default)
+        value = os.environ.get(name) if config is None else getattr(config, name.lower(), None)
         word = str(default if value is None else value)
-        if isinstance(default, int):
-            word = word.lower()
-            flags[name] = int(word) if word.isdecimal() else _WORDS.get(word, word)
-        else:
-            flags[name] = word
+        flags[name] = _WORDS.get(word.lower(), word) if isinstance(default, int) else word
     return {name: value for name, value in flags.items() if value != JAX_FLAGS[name]}
 
 

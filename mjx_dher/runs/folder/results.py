@@ -87,9 +87,9 @@ def result_problem(folder: Path, with_policy: bool = True) -> str | None:
     if len(rows) != epochs:
         return f"{folder / run_folder.METRICS_FILE} has whole lines of {len(rows)} of {epochs} epochs"
     digest = content["digest"]
-    last = {run_folder.RESULT_FILE: result, run_folder.METRICS_FILE: rows[-1] if rows else {loggers.DIGEST: digest}}
-    for name, values in last.items():
-        if (other := values.get(loggers.DIGEST)) != digest:
+    last = {run_folder.RESULT_FILE: result["digest"], run_folder.METRICS_FILE: rows[-1].get(loggers.DIGEST) if rows else digest}
+    for name, other in last.items():
+        if other != digest:
             return f"{folder / name} is of a run with other settings: its digest is {other}, that of config.json {digest}"
     return None
 
