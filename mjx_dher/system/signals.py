@@ -113,11 +113,11 @@ class _Signals:
 
 def children() -> list[int]:
     """Programs that this one has started, and that have not ended. Needs Linux."""
-    found: list[int] = []
+    pids: list[int] = []
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/children", encoding="ascii") as file:
-            found += map(int, file.read().split())
-    return found
+            pids += map(int, file.read().split())
+    return pids
 
 
 def _kill_children() -> None:
