@@ -12,6 +12,8 @@ from conftest import EXAMPLES, ROOT
 
 from mjx_dher import cli
 from mjx_dher.envs.kinematics import Place
+from mjx_dher.runs.folder import fingerprint
+from mjx_dher.spec import RunSpec
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text()
 
@@ -67,3 +69,15 @@ def test_the_arm_of_seven_joints_has_the_published_sizes(name, size):
     assert env.action_size == size
     hand = Place(env.model, "body:hand").position(jnp.zeros(env.model.nq))
     np.testing.assert_allclose(hand, [0.088, 0, 0.926], atol=1e-6)
+
+
+def test_an_edited_mjcf_changes_the_identity_of_a_run(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "robot_of_test.py").write_text('model = "robot.xml"')
+    digests = []
+    for files in ({"robot.xml": "a"}, {"robot.xml": "b"}, {"other.xml": "c"}):
+        for name, content in files.items():
+            (tmp_path / name).write_text(content)
+        fingerprint._source.cache_clear()
+        digests.append(fingerprint.sources(RunSpec(env="robot_of_test:Reach"))["env"])
+    assert digests[0] != digests[1] == digests[2]

@@ -22,7 +22,7 @@ class Reach(MujocoTask):
 class Push(Reach):
     """Pushes the box on the floor, with the fingers as they are."""
 
-    start = Start("home", ranges={"box": ((0.4, -0.15, 0.02), (0.6, 0.15, 0.02))})
+    start = Start("low", ranges={"box": ((0.4, -0.15, 0.02), (0.6, 0.15, 0.02))})
     goal = Position("body:box", low=(0.4, -0.15, 0.02), high=(0.6, 0.15, 0.02))
     observations = (*ARM, *BOX)
 

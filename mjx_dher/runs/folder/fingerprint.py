@@ -68,7 +68,8 @@ def text(value: Any) -> str:
 def sources(spec: RunSpec) -> dict[str, str]:
     """Name and digest of the files of custom components and of demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
-    Files that a component imports are not included. Each file is read once in a process, as its module is.
+    MJCFs beside a component that it names are included, and files that it imports are not. Each file is read once in a process,
+    as its module is.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
     if spec.demonstrations is not None:
@@ -79,7 +80,12 @@ def sources(spec: RunSpec) -> dict[str, str]:
 @functools.cache
 def _source(import_path: str) -> str | None:
     file = lookup.module_file(import_path)
-    return None if file is None else _name_and_digest(file, [file])
+    if file is None:
+        return None
+    code = file.read_bytes()
+    return _name_and_digest(
+        file, [file, *(model for model in sorted(file.parent.glob("*.xml")) if model.name.encode() in code)]
+    )
 
 
 @functools.cache
