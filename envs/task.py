@@ -169,11 +169,12 @@ class MujocoTask(GoalEnv):
     def step(self, state: State, action: Array) -> State:
         """Applies an action [A] for one step.
 
-        If the physics blows up, the state goes back to the start, and `failed` stays True until `reset`.
+        If the physics blows up or the action is not finite, the state goes back to the start, and `failed` stays True until
+        `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         physics = self.advance(state.physics, action)
-        sound = self.is_sound(physics)
+        sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C takes an input that is NaN as 0
         physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._rest)
         failed = state.failed | ~sound
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])

@@ -264,8 +264,9 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
     env = make(start=task.Start("bent"), control=task.Torque())
     first = jax.jit(env.reset)(jax.random.key(0))
     step = jax.jit(env.step)
-    for broken in (first.physics.qvel.at[0].set(jnp.nan), first.physics.qvel.at[2].set(1e30)):
-        state = step(dataclasses.replace(first, physics=first.physics.replace(qvel=broken)), jnp.zeros(1))
+    still = first.physics.qvel
+    for qvel, action in ((still.at[0].set(jnp.nan), 0.0), (still.at[2].set(1e30), 0.0), (still, jnp.nan)):
+        state = step(dataclasses.replace(first, physics=first.physics.replace(qvel=qvel)), jnp.array([action]))
         assert (bool(state.failed), float(state.success)) == (True, 0.0)
         np.testing.assert_array_equal(state.physics.qpos, first.physics.qpos)
         state = step(state, jnp.zeros(1))
