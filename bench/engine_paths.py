@@ -1,4 +1,4 @@
-"""Both paths of the engine warp beside native, on the models of tests/test_any_model.py and on the guide's arm.
+"""Both paths of the engine warp beside native, on the models of tests/engine_models.py and on the guide's arm.
 
     PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu]
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import mujoco
 import numpy as np
-import test_any_model
+from engine_models import MODELS, SUBSTEPS, play, start
 from timing import print_table
 
 from mjx_dher.envs.engines import make_engine
@@ -26,20 +26,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--allow-cpu", action="store_true")
     args = parser.parse_args()
-    models = {name: mujoco.MjModel.from_xml_string(xml) for name, xml in test_any_model.MODELS.items()}
+    models = {name: mujoco.MjModel.from_xml_string(xml) for name, xml in MODELS.items()}
     models["guide's arm"] = mujoco.MjModel.from_xml_path(str(ARM))
     rows = []
     for name, model in models.items():
-        first, controls = test_any_model.start(model, (64,))
+        first, controls = start(model, (64,))
         seen = {}
         for path in ("native", "fused", "graph"):
             options = {} if path == "native" else {"path": path, "allow_cpu": args.allow_cpu}
             try:
-                engine = make_engine("native" if path == "native" else "warp", model, test_any_model.SUBSTEPS, **options)
+                engine = make_engine("native" if path == "native" else "warp", model, SUBSTEPS, **options)
             except ValueError:
                 continue  # the kernel leaves out a feature
-            play = jax.jit(jax.vmap(lambda *given, engine=engine: test_any_model.play(engine, *given)))
-            seen[path] = np.asarray(play(first, controls).qpos)
+            played = jax.jit(jax.vmap(lambda *given, engine=engine: play(engine, *given)))
+            seen[path] = np.asarray(played(first, controls).qpos)
             engine.check()
         native = seen.pop("native")
         for path, qpos in seen.items():
