@@ -173,6 +173,12 @@ def test_fields_of_memory_follow_one_another():
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
 
 
+SHAPES = (
+    *('<geom type="box" size="0.05 0.04 0.06"/>', '<geom type="sphere" size="0.06"/>'),
+    *('<geom type="capsule" size="0.06 0.05"/>', '<geom type="capsule" size="0.06 0.05" euler="90 10 0"/>'),
+)
+
+
 def robot(seed):
     """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random."""
     rng = np.random.default_rng(seed)
@@ -201,9 +207,9 @@ def robot(seed):
                     f'<general joint="{name}" gainprm="3" biastype="affine" biasprm="0.1 -2 -1" forcerange="-1 1"/>',
                 ]
             )
-        chain += f'<body pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}<geom type="box" size="0.05 0.04 0.06"/>'
+        chain += f'<body pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
     boxes = "".join(
-        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/><geom type="box" size="0.06 0.06 0.06"'
+        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/>{rng.choice(SHAPES)[:-2]}'
         f' priority="{rng.integers(2)}" friction="{numbers(1, 0.3, 1)}" condim="{rng.choice([1, 3, 4])}"'
         f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'
         for _ in range(2)
@@ -224,6 +230,7 @@ def test_a_timestep_of_a_random_robot_is_mujoco_c_s(seed):
     qpos, qvel = np.tile(model.qpos0, (NUM, 1)), 0.3 * rng.standard_normal((NUM, model.nv))
     qpos[:, 14:] += 0.2 * rng.standard_normal((NUM, model.nq - 14))
     qpos[:, [0, 1, 7, 8]] += 0.1 * rng.standard_normal((NUM, 4))
+    qpos[:, [*range(3, 7), *range(10, 14)]] += 0.02 * rng.standard_normal((NUM, 8))  # no parallel capsules
     inputs = np.concatenate([np.tile([0, 0, 0, 1, 0, 0, 0], (NUM, 1)), rng.uniform(-1, 1, (NUM, model.nu))], axis=1)
     there = in_c(model, qpos, qvel, inputs)
     here = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]

@@ -21,6 +21,11 @@ contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" conty
 <contact><pair geom1="g" geom2="o" condim="{}"/></contact></mujoco>
 """
 
+OFF_CENTRE = """
+<mujoco><option integrator="implicitfast"/><worldbody><body><freejoint name="f"/><geom type="box" size="1 1 1" pos="1 0 0"/>
+</body></worldbody></mujoco>
+"""
+
 
 def welded(extra="", shape="box", condim=3):
     return mujoco.MjModel.from_xml_string(WELDED.format(extra, shape, condim))
@@ -29,7 +34,8 @@ def welded(extra="", shape="box", condim=3):
 def test_unsupported_features_are_named_with_their_elements():
     motor = '<actuator><general name="m" joint="j" {}/></actuator>'
     cases = [
-        (welded(shape="sphere"), ["contacts of sphere and box", "'g'", "'o'"]),
+        (welded(shape="ellipsoid"), ["contacts of ellipsoid and box", "'g'", "'o'"]),
+        (mujoco.MjModel.from_xml_string(OFF_CENTRE), ["free bodies", "implicitfast", "'f'"]),
         (welded(condim=6), ["rolling friction", "'g'"]),
         (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
         (welded('<option integrator="RK4"/>'), ["integrator"]),
@@ -107,8 +113,8 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
 
 
 def test_an_unsupported_model_is_rejected():
-    with refuses("engine", "warp", "sphere"):
-        engines.make_engine("warp", welded(shape="sphere"), 20, path="fused", allow_cpu=True)
+    with refuses("engine", "warp", "ellipsoid"):
+        engines.make_engine("warp", welded(shape="ellipsoid"), 20, path="fused", allow_cpu=True)
     with refuses("engine", "warp", "actuator_armature", "native"):
         model = welded('<actuator><motor name="m" joint="j" armature="1"/></actuator>')
         engines.make_engine("warp", model, 20, allow_cpu=True)

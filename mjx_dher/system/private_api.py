@@ -64,7 +64,7 @@ def shift_reference_acceleration(data: Any, shift: Any) -> Any:
 def mujoco_warp_shapes() -> SimpleNamespace:
     """Returns the functions of MuJoCo Warp's kernels that find the contacts of two shapes.
 
-    Private: both, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be imported
+    Private: all, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be imported
       without what the packages around it import.
     Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows. To import
       the packages takes 3.4 s, the module alone 0.3 s.
@@ -84,7 +84,8 @@ def mujoco_warp_shapes() -> SimpleNamespace:
         if bare:  # so that others import the packages whole
             for name in [name for name in sys.modules if f"{name}.".startswith("mujoco.mjx.")]:
                 del sys.modules[name]
-    return SimpleNamespace(box_box=core.box_box, plane_cylinder=core.plane_cylinder)
+    used = ("box_box", "plane_cylinder", "plane_sphere", "sphere_sphere", "sphere_capsule", "sphere_box")
+    return SimpleNamespace(**{name: getattr(core, name) for name in (*used, "capsule_capsule", "capsule_box")})
 
 
 @contextlib.contextmanager

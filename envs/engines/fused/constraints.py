@@ -4,7 +4,7 @@ A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' 
 D = imp / ((1 - imp) times its inverse inertia) has it: https://mujoco.readthedocs.io/en/3.17.0/computation/index.html.
 """
 
-from mjx_dher.envs.engines.fused.contacts import tangent
+from mjx_dher.envs.engines.fused.contacts import tangent, tangent_of
 from mjx_dher.envs.engines.fused.dynamics import times
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, Softness, World
 from mjx_dher.envs.engines.fused.threads import sync
@@ -178,8 +178,11 @@ def limit(
 
 
 @wp.func
-def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
-    """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent."""
+def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsules: bool, thread: int, threads: int):
+    """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent.
+
+    `capsules` says whether there may be some on planes.
+    """
     nv = dofs.number
     for c in range(memory.counts[0]):
         s = memory.touching[c]
@@ -189,6 +192,8 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, thread
         normal = memory.normal[s]
         friction = contacts.friction[pair]
         first = tangent(normal)
+        if capsules:
+            first = tangent_of(contacts, memory, pair, normal)
         second = friction[1] * wp.cross(normal, first)
         first = friction[0] * first
         turning = friction[2] * normal

@@ -1,13 +1,13 @@
 """Contacts of a substep: a thread for each pair of geoms."""
 
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
-from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, Contacts, Memory
+from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CAPSULE, PLANE_CYLINDER, Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import wp
 
-_BOX_BOX, _CYLINDER_BOX, _PLANE_BOX, _PLANE_CYLINDER = (
-    wp.constant(kind) for kind in (BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER)
+_BOX_BOX, _CYLINDER_BOX, _PLANE_BOX, _PLANE_CYLINDER, _PLANE_CAPSULE = (
+    wp.constant(kind) for kind in (BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, PLANE_CAPSULE)
 )
 _TILT = wp.constant(1e-3)  # rad
 _APART = wp.constant(1e-3)  # least distance of two contacts, relative to the smaller shape
@@ -49,8 +49,8 @@ def collide_boxes(contacts: Contacts, memory: Memory, thread: int, threads: int)
     for p in range(thread, contacts.pairs, threads):
         if contacts.kind[p] == _BOX_BOX:
             geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
-            pos1, mat1, size1 = _geom(contacts, memory, geom1)
-            pos2, mat2, size2 = _geom(contacts, memory, geom2)
+            pos1, mat1, size1 = geom_of(contacts, memory, geom1)
+            pos2, mat2, size2 = geom_of(contacts, memory, geom2)
             margin = contacts.margin[p]
             if _near(pos1, contacts.geom_reach[geom1] + margin, pos2, mat2, size2) and _near(
                 pos2, contacts.geom_reach[geom2] + margin, pos1, mat1, size1
@@ -83,8 +83,8 @@ def collide_cylinders(contacts: Contacts, memory: Memory, thread: int, threads: 
 def _meet(contacts: Contacts, memory: Memory, p: int, round: int, direction: int):
     """Sets a slot of a cylinder and a box: the first, or one with both tilted in a direction."""
     geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
-    pos1, mat1, size1 = _geom(contacts, memory, geom1)
-    pos2, mat2, size2 = _geom(contacts, memory, geom2)
+    pos1, mat1, size1 = geom_of(contacts, memory, geom1)
+    pos2, mat2, size2 = geom_of(contacts, memory, geom2)
     margin = contacts.margin[p]
     first = contacts.first[p]
     near = bool(True)
@@ -144,6 +144,18 @@ def tangent(normal: wp.vec3) -> wp.vec3:
 
 
 @wp.func
+def tangent_of(contacts: Contacts, memory: Memory, pair: int, normal: wp.vec3) -> wp.vec3:
+    """First tangent of a contact: of a plane and a capsule, as in MuJoCo C, along the capsule unless it stands."""
+    if contacts.kind[pair] == _PLANE_CAPSULE:
+        mat = _mat(contacts, memory, contacts.geom2[pair])
+        axis = wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
+        along = axis - wp.dot(axis, normal) * normal
+        if wp.length(along) > 1.0e-6:
+            return wp.normalize(along)
+    return tangent(normal)
+
+
+@wp.func
 def _mat(contacts: Contacts, memory: Memory, geom: int) -> wp.mat33:
     return memory.mat[contacts.geom_body[geom]] * contacts.geom_mat[geom]
 
@@ -155,7 +167,7 @@ def _pos(contacts: Contacts, memory: Memory, geom: int) -> wp.vec3:
 
 
 @wp.func
-def _geom(contacts: Contacts, memory: Memory, geom: int):
+def geom_of(contacts: Contacts, memory: Memory, geom: int):
     """Position, axes and size of a geom."""
     return _pos(contacts, memory, geom), _mat(contacts, memory, geom), contacts.geom_size[geom]
 

@@ -7,7 +7,19 @@ from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch,
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
 from mjx_dher.envs.engines.fused.memory import carve, copy
-from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, Bodies, Contacts, Dofs, Layout, Memory, World
+from mjx_dher.envs.engines.fused.model import (
+    BOX_BOX,
+    CYLINDER_BOX,
+    PLANE_CAPSULE,
+    PLANE_SPHERE,
+    Bodies,
+    Contacts,
+    Dofs,
+    Layout,
+    Memory,
+    World,
+)
+from mjx_dher.envs.engines.fused.round import collide_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.threads import gather, sync
 from mjx_dher.system.warp_setup import wp
@@ -63,6 +75,7 @@ def _constraints(
     contacts: Contacts,
     memory: Memory,
     lost: wp.array(dtype=int),  # type: ignore[valid-type]
+    capsules: bool,
     warps: int,
     thread: int,
     threads: int,
@@ -75,7 +88,7 @@ def _constraints(
     gather(warps)
     limit(dofs, contacts, memory, thread, threads)
     gather(warps)
-    touch(bodies, dofs, contacts, memory, thread, threads)
+    touch(bodies, dofs, contacts, memory, capsules, thread, threads)
     gather(warps)
     press(dofs, contacts, memory, thread, threads)
 
@@ -96,7 +109,7 @@ def _go_on(
     gather(warps)
     solve(world, memory, nv, thread, threads)
     gather(warps)
-    accelerate(world, dofs, memory, given, nv, thread, threads)
+    accelerate(world, bodies, dofs, memory, given, nv, thread, threads)
     gather(warps)
     integrate(world, bodies, memory, thread, threads)
 
@@ -107,11 +120,11 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
 
     Args:
       floats: memory of an environment.
-      threads_per_env: threads that share an environment.
-      warps: of 32 threads in a block; 0 on a CPU.
+      threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
       kinds: kinds of geom pairs in the model; code for other kinds is left out.
     """
     shared = warps * (32 // threads_per_env) * floats
+    capsules, round_ones = PLANE_CAPSULE in kinds, any(kind >= PLANE_SPHERE for kind in kinds)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -133,8 +146,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
     ):
         """Advances coordinates, velocities and the solver's first guess by `substeps` timesteps.
 
-        `spare` [num_envs, size of `layout`] is the memory on a CPU; `inputs` [num_envs, 7 + nu] has the mocap body's pose and
-        the controls. `lost` [1] counts contacts that do not fit.
+        `spare` [num_envs, size] is the memory on a CPU; `inputs` [num_envs, 7 nmocap + nu]; `lost` counts lost contacts.
         """
         env, thread = wp.tid()  # type: ignore[misc]
         threads = wp.static(threads_per_env)  # so that the compiler knows them
@@ -153,7 +165,10 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
             if wp.static(CYLINDER_BOX in kinds):
                 gather(wp.static(warps))
                 collide_cylinders(contacts, memory, thread, threads)
-            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(warps), thread, threads)
+            if wp.static(round_ones):
+                gather(wp.static(warps))
+                collide_round(contacts, memory, thread, threads)
+            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(capsules), wp.static(warps), thread, threads)
             _go_on(world, bodies, dofs, memory, given, wp.static(nv), wp.static(warps), thread, threads)
         copy(memory.qpos, qpos[env], thread, threads)
         copy(memory.qvel, qvel[env], thread, threads)

@@ -6,8 +6,9 @@ from mjx_dher.system.warp_setup import wp
 
 # How a body moves against its parent.
 STILL, HINGE, SLIDE, FREE, MOCAP = range(5)
-# Pairs of geoms, in the order of MuJoCo's types.
+# Pairs of geoms; those from PLANE_SPHERE on are of spheres and capsules.
 PLANE_BOX, PLANE_CYLINDER, BOX_BOX, CYLINDER_BOX = range(4)
+PLANE_SPHERE, PLANE_CAPSULE, SPHERE_SPHERE, SPHERE_CAPSULE, SPHERE_BOX, CAPSULE_CAPSULE, CAPSULE_BOX = range(4, 11)
 Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
 
 _ints, _floats, _vec3s, _quats = wp.array(dtype=int), wp.array(dtype=float), wp.array(dtype=wp.vec3), wp.array(dtype=wp.vec4)

@@ -15,6 +15,13 @@ CONTACT_KINDS = {
     ("PLANE", "CYLINDER"): (kinds.PLANE_CYLINDER, 4),
     ("BOX", "BOX"): (kinds.BOX_BOX, 8),
     ("CYLINDER", "BOX"): (kinds.CYLINDER_BOX, 5),
+    ("PLANE", "SPHERE"): (kinds.PLANE_SPHERE, 1),
+    ("PLANE", "CAPSULE"): (kinds.PLANE_CAPSULE, 2),
+    ("SPHERE", "SPHERE"): (kinds.SPHERE_SPHERE, 1),
+    ("SPHERE", "CAPSULE"): (kinds.SPHERE_CAPSULE, 1),
+    ("SPHERE", "BOX"): (kinds.SPHERE_BOX, 1),
+    ("CAPSULE", "CAPSULE"): (kinds.CAPSULE_CAPSULE, 2),
+    ("CAPSULE", "BOX"): (kinds.CAPSULE_BOX, 2),
 }  # types of two geoms -> (kind, most contacts)
 _JOINTS = {
     int(mujoco.mjtJoint.mjJNT_HINGE): kinds.HINGE,

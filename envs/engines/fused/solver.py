@@ -7,10 +7,11 @@ E. Todorov, Convex and analytically-invertible dynamics with contacts and constr
 
 from mjx_dher.envs.engines.fused.dynamics import damping
 from mjx_dher.envs.engines.fused.linear import direction
-from mjx_dher.envs.engines.fused.model import Dofs, Memory, World
+from mjx_dher.envs.engines.fused.model import FREE, Bodies, Dofs, Memory, World
 from mjx_dher.envs.engines.fused.threads import sync, total
 from mjx_dher.system.warp_setup import wp
 
+_FREE = wp.constant(FREE)
 _EQUALITIES = wp.constant(6)  # rows that hold from both sides, the first ones
 _SLOPE = wp.constant(1e-4)  # of the cost along the search direction, relative to that at its start, at which a search ends
 _ROUNDING = wp.constant(1e-10)  # a step's energy relative to that of the accelerations: what single precision leaves unsure
@@ -161,7 +162,16 @@ def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
 
 
 @wp.func
-def accelerate(world: World, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), nv: int, thread: int, threads: int):
+def accelerate(
+    world: World,
+    bodies: Bodies,
+    dofs: Dofs,
+    memory: Memory,
+    inputs: wp.array(dtype=float),
+    nv: int,
+    thread: int,
+    threads: int,
+):
     """Advances velocities by all forces, implicitly in damping."""
     sync(threads)
     for i in range(thread, nv, threads):
@@ -181,6 +191,30 @@ def accelerate(world: World, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=
         thread,
         threads,
     )
+    if dofs.implicit == 1:
+        sync(threads)
+        _gyrate(world, bodies, memory, nv, thread, threads)
+        sync(threads)
     for i in range(thread, nv, threads):
         memory.qvel[i] = memory.qvel[i] + world.timestep * memory.search[i]
     sync(threads)
+
+
+@wp.func
+def _gyrate(world: World, bodies: Bodies, memory: Memory, nv: int, thread: int, threads: int):
+    """Makes accelerations of free bodies that stand alone implicit in gyroscopic forces, as MuJoCo's implicitfast does."""
+    for b in range(thread, bodies.number, threads):
+        if bodies.kind[b] == _FREE and bodies.last[b] == b:
+            dof = bodies.dof[b] + 3
+            omega, alpha, mass = wp.vec3(), wp.vec3(), wp.mat33()
+            for i in range(3):
+                omega[i] = memory.qvel[dof + i]
+                alpha[i] = memory.search[dof + i]
+                for j in range(3):
+                    mass[i, j] = memory.mass[(dof + i) * nv + dof + j]
+            axes = bodies.principal[b]
+            inertia = axes * wp.diag(bodies.inertia[b]) * wp.transpose(axes)
+            change = wp.skew(omega) * inertia - wp.skew(inertia * omega)
+            alpha = wp.inverse(mass + world.timestep * change) * (mass * alpha)
+            for i in range(3):
+                memory.search[dof + i] = alpha[i]

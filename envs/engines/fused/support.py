@@ -74,6 +74,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
         ("jnt", "springs of free joints"): (model.jnt_stiffness != 0) & ~scalar,
         ("jnt", "limits of free joints"): (model.jnt_limited != 0) & ~scalar,
+        ("jnt", "free bodies, with implicitfast, that have parts or are not centred on their mass"): _off_centre(model),
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
         ("actuator", "actuators of free or ball joints"): on_joint & ~np.isin(driven, (_HINGE, _SLIDE)),
     }
@@ -89,6 +90,15 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     plain = [_is_plain_weld(model, index) for index in range(model.neq)]
     if plain not in ([], [True]):
         yield with_names("equality constraints other than one weld of a mocap body", model, "eq", range(model.neq))
+
+
+def _off_centre(model: mujoco.MjModel) -> np.ndarray:
+    """Free joints [njnt] for which the kernel leaves out what implicitfast does with gyroscopic forces."""
+    body = model.jnt_bodyid
+    alone = (model.jnt_type == _FREE) & (model.tree_dofnum[np.maximum(model.body_treeid[body], 0)] == 6)
+    parts = np.array([np.count_nonzero(model.body_rootid == each) > 1 for each in body], bool)
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return alone & implicit & (parts | np.any(model.body_ipos[body] != 0, axis=1))
 
 
 def _is_plain_weld(model: mujoco.MjModel, index: int) -> bool:

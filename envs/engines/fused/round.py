@@ -1,0 +1,98 @@
+"""Contacts of spheres and capsules, with MuJoCo Warp's functions for them, which follow MuJoCo C."""
+
+from mjx_dher.envs.engines.fused.contacts import geom_of
+from mjx_dher.envs.engines.fused.model import (
+    CAPSULE_BOX,
+    CAPSULE_CAPSULE,
+    PLANE_CAPSULE,
+    PLANE_SPHERE,
+    SPHERE_BOX,
+    SPHERE_CAPSULE,
+    SPHERE_SPHERE,
+    Contacts,
+    Memory,
+)
+from mjx_dher.envs.engines.fused.threads import sync
+from mjx_dher.system import private_api
+from mjx_dher.system.warp_setup import wp
+
+_PLANE_SPHERE, _PLANE_CAPSULE, _SPHERE_SPHERE, _SPHERE_CAPSULE, _SPHERE_BOX, _CAPSULE_CAPSULE, _CAPSULE_BOX = (
+    wp.constant(kind)
+    for kind in (PLANE_SPHERE, PLANE_CAPSULE, SPHERE_SPHERE, SPHERE_CAPSULE, SPHERE_BOX, CAPSULE_CAPSULE, CAPSULE_BOX)
+)
+_shapes = private_api.mujoco_warp_shapes()
+_plane_sphere, _sphere_sphere, _sphere_capsule = _shapes.plane_sphere, _shapes.sphere_sphere, _shapes.sphere_capsule
+_sphere_box, _capsule_capsule, _capsule_box = _shapes.sphere_box, _shapes.capsule_capsule, _shapes.capsule_box
+
+
+@wp.func
+def collide_round(contacts: Contacts, memory: Memory, thread: int, threads: int):
+    """Computes distance, place and normal of the slots of spheres and capsules."""
+    for p in range(thread, contacts.pairs, threads):
+        kind = contacts.kind[p]
+        if kind >= _PLANE_SPHERE:
+            geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
+            pos1, mat1, size1 = geom_of(contacts, memory, geom1)
+            pos2, mat2, size2 = geom_of(contacts, memory, geom2)
+            margin = contacts.margin[p]
+            apart = wp.length(pos2 - pos1) - contacts.geom_reach[geom1] - contacts.geom_reach[geom2]
+            if kind == _PLANE_SPHERE or kind == _PLANE_CAPSULE:
+                apart = wp.dot(pos2 - pos1, _axis(mat1)) - contacts.geom_reach[geom2]
+            if apart <= margin:
+                _meet(memory, kind, contacts.first[p], margin, pos1, mat1, size1, pos2, mat2, size2)
+    sync(threads)
+
+
+@wp.func
+def _meet(
+    memory: Memory,
+    kind: int,
+    first: int,
+    margin: float,
+    pos1: wp.vec3,
+    mat1: wp.mat33,
+    size1: wp.vec3,
+    pos2: wp.vec3,
+    mat2: wp.mat33,
+    size2: wp.vec3,
+):
+    """Sets the slots of a pair of geoms."""
+    axis1, axis2 = _axis(mat1), _axis(mat2)
+    if kind == _PLANE_SPHERE:
+        distance, place = _plane_sphere(axis1, pos1, pos2, size2[0])
+        _put(memory, first, distance, place, axis1)
+    elif kind == _PLANE_CAPSULE:
+        for i in range(2):
+            end = pos2 + wp.where(i == 0, size2[1], -size2[1]) * axis2
+            distance, place = _plane_sphere(axis1, pos1, end, size2[0])
+            _put(memory, first + i, distance, place, axis1)
+    elif kind == _SPHERE_SPHERE:
+        distance, place, normal = _sphere_sphere(pos1, size1[0], pos2, size2[0])
+        _put(memory, first, distance, place, normal)
+    elif kind == _SPHERE_CAPSULE:
+        distance, place, normal = _sphere_capsule(pos1, size1[0], pos2, axis2, size2[0], size2[1])
+        _put(memory, first, distance, place, normal)
+    elif kind == _SPHERE_BOX:
+        distance, place, normal = _sphere_box(pos1, size1[0], pos2, mat2, size2)
+        _put(memory, first, distance, place, normal)
+    elif kind == _CAPSULE_CAPSULE:
+        distances, places, normals = _capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1], margin)
+        for i in range(2):
+            _put(memory, first + i, distances[i], places[i], normals[i])
+    elif kind == _CAPSULE_BOX:
+        distances, places, normals = _capsule_box(pos1, axis1, size1[0], size1[1], pos2, mat2, size2)
+        for i in range(2):
+            _put(memory, first + i, distances[i], places[i], normals[i])
+
+
+@wp.func
+def _put(memory: Memory, slot: int, distance: float, place: wp.vec3, normal: wp.vec3):
+    memory.distance[slot] = distance
+    memory.place[slot] = place
+    memory.normal[slot] = normal
+
+
+@wp.func
+def _axis(mat: wp.mat33) -> wp.vec3:
+    """Third axis of a geom: a plane's normal, a capsule's direction."""
+    return wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
