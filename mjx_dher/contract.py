@@ -75,11 +75,13 @@ def check_env_parts(env: Any) -> None:
             raise ValueError(f"an environment has reset, step and compute_reward; {env!r} has no {name}")
     for name in ("action_size", "episode_length"):
         check_size(name, getattr(env, name, None))
+    step_seconds(env)
 
 
 def step_seconds(env: Any) -> float:
     """Seconds that a step of `env` takes in real time: its `dt`, or 0.04. Raises ValueError for a `dt` out of range."""
-    dt = getattr(env, "dt", STEP_SECONDS)
+    dt: Any = getattr(env, "dt", STEP_SECONDS)
+    dt = dt.item() if getattr(dt, "shape", None) == () else dt  # a scalar of NumPy or JAX
     check_number("dt", dt, "(0, 3600]", float)
     return float(dt)
 

@@ -75,12 +75,9 @@ class _GoalApi:
 
         Arguments as in `compute_reward`. A failure, which ends an episode for any goal, is in the `terminated` of `step`.
         """
-        if self._compiled.spec.ends_at_goal:
-            from mjx_dher import context
-
-            goals: Any = self._goals(achieved_goal, desired_goal)
-            return np.asarray(context.reached_fn(self._compiled.env)(*goals))[()]
-        return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
+        goals = self._goals(achieved_goal, desired_goal)
+        ends = self._compiled.spec.ends_at_goal
+        return np.asarray(self._compiled.reached(*goals) if ends else np.zeros(goals[0].shape[:-1], bool))[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """Returns [...] False: truncation does not depend on goals. Arguments as in `compute_reward`."""
@@ -330,18 +327,18 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
 
 
 def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[int | None]:
-    """Returns a seed for each of `count` environments, None where its random stream goes on."""
+    """Returns a seed for each of `count` environments, None if its random stream goes on."""
     if options:
         raise ValueError(f"reset takes no options; got {options!r}")
-    is_one = seed is None or not np.iterable(seed)
-    for one in [seed] if is_one else seed:
+    seeds = list(seed) if np.iterable(seed) else [seed]
+    for one in seeds:
         if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer)) or one < 0):
             raise ValueError(f"a seed must be an integer of at least 0, or None; got {one!r}")
-    if is_one:
-        return [None if seed is None else int(seed) + i for i in range(count)]
-    if len(seed) != count:
-        raise ValueError(f"seed must be one number or one for each of {count} environments; got {len(seed)}")
-    return [None if one is None else int(one) for one in seed]  # gymnasium takes no integers of NumPy's
+    if not np.iterable(seed):
+        seeds = [None if seed is None else int(seed) + i for i in range(count)]
+    if len(seeds) != count:
+        raise ValueError(f"seed must be one number or one for each of {count} environments; got {len(seeds)}")
+    return [None if one is None else int(one) for one in seeds]  # gymnasium takes no integers of NumPy's
 
 
 _VECTOR: dict[str, Any] = {"vector_entry_point": "mjx_dher.gym:GymVectorEnv"}

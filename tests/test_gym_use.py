@@ -103,6 +103,7 @@ def test_the_page_s_custom_environment_is_made():
 
 def test_the_environment_says_how_long_a_step_takes():
     assert gymnasium.make(ENV, name="test_gym_use:Slowed").metadata["render_fps"] == 50
+    assert gymnasium.make(ENV, name="test_gym_use:Slowed", dt=np.float32(0.5)).metadata["render_fps"] == 2
     assert gymnasium.make(ENV, name="point_mass:PointMass").metadata["render_fps"] == 25
     assert mjx_dher.gym.GymEnv.metadata["render_fps"] == 25
 
@@ -131,7 +132,7 @@ def test_stable_baselines3_makes_its_own_vector():
         ({"name": "point_mass:PointMas"}, ["env", "PointMas", "PointMass"]),
         ({"name": "point_mass:PointMass:x"}, ["env", "point_mass:PointMass:x", "module:attribute"]),
         ({"name": "point_mass:PointMass", "engine": "native"}, ["engine", "native"]),
-        ({"name": "test_gym_use:Slowed", "dt": -1.0}, ["dt", -1.0]),
+        *(({"name": "test_gym_use:Slowed", "dt": dt}, ["dt", dt]) for dt in (-1.0, float("nan"), float("inf"), "fast")),
     ],
 )
 def test_what_cannot_be_made_is_named(options, parts):

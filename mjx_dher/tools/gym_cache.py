@@ -33,6 +33,7 @@ class Programs:
     restart: Callable[[State, Any, Any], State]  # states, seeds [N], which to reset [N] -> states
     ended: Callable[[State], tuple[Any, Any]]  # state, or states [N] -> terminated, truncated; bool, of that shape
     reward: Callable[[np.ndarray, np.ndarray], Any]  # achieved [M, G], desired [M, G] -> [M]
+    reached: Callable[[Any, Any], Any]  # achieved [..., G], desired [..., G] -> bool [...]
 
     def check(self) -> None:
         """Raises ValueError if the environment found a fault in the steps so far."""
@@ -66,7 +67,7 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
 def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 
-    from mjx_dher import rollout
+    from mjx_dher import context, rollout
     from mjx_dher.contract import env_spec, step_seconds
 
     env = envs.make(name, **dict(options))
@@ -91,4 +92,5 @@ def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
         restart=jax.jit(restart),
         ended=jax.jit(functools.partial(rollout.ended, env, spec)),
         reward=jax.jit(env.compute_reward),
+        reached=context.reached_fn(env),
     )

@@ -19,6 +19,7 @@ import numpy as np
 
 from mjx_dher import lookup
 from mjx_dher.system import files, private_api, signals, subprocesses
+from mjx_dher.validation import check_all
 
 MOST_FPS = 50  # frames per second of a file: what a GIF can show
 HOLD_SECONDS = 0.4  # for which an episode's last frame is shown, so that the eye can compare object and goal
@@ -41,16 +42,13 @@ FORMATS = {
 
 def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
     """Raises ValueError for invalid arguments, before anything slow happens."""
-    problems = []
-    try:
-        files.check_file(out, FORMATS, overwrite)
-    except ValueError as error:
-        problems.append(str(error))
-    for field, value in (("width", width), ("height", height)):
-        if value not in SIZES:
-            problems.append(f"{field} must be an even integer from {SIZES[0]} to {SIZES[-1]}; got {value}")
-    if problems:
-        raise ValueError("\n".join(problems))
+    sizes = [(_check_size, "width", width), (_check_size, "height", height)]
+    check_all((files.check_file, out, FORMATS, overwrite), *sizes)
+
+
+def _check_size(field: str, value: int) -> None:
+    if value not in SIZES:
+        raise ValueError(f"{field} must be an even integer from {SIZES[0]} to {SIZES[-1]}; got {value}")
 
 
 def ffmpeg() -> str:
@@ -152,8 +150,7 @@ def record_episodes(
         played = record_rollout(env, policy, reset_key, num_episodes, lambda state: state.physics.qpos, keys)
         return played[2], played[0].desired_goal, played[1].success
 
-    qpos, goals, success = jax.device_get(run(jax.random.key(seed)))
-    return qpos, goals, success
+    return jax.device_get(run(jax.random.key(seed)))
 
 
 def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
@@ -200,12 +197,9 @@ class Painter:
     def __init__(self, env: Any, width: int, height: int):
         import mujoco
 
-        self._env, model = (
-            env,
-            copy.copy(env.model),
-        )  # the buffer size is set below; that of the environment's model must not change
+        model = copy.copy(env.model)  # the buffer size is set below; that of the environment's model must not change
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        self._model, self._data = model, mujoco.MjData(model)
+        self._env, self._model, self._data = env, model, mujoco.MjData(model)
         backend = choose_gl()
         try:
             with private_api.drawing_with(backend):
