@@ -183,7 +183,7 @@ class Mocap(Control):
 
 
 def is_servo(model: mujoco.MjModel, index: int) -> bool:
-    """Whether an actuator is a position servo: its force falls with the position of what it drives."""
+    """Whether an actuator is a position servo: its force falls with the position."""
     return bool(model.actuator_biastype[index] == _AFFINE and model.actuator_biasprm[index, 1] < 0)
 
 

@@ -1,4 +1,4 @@
-"""Kinds of goals. Each defines the goal's size, distance, threshold, sampling range and drawing, and what a model achieves."""
+"""Kinds of goals. Each defines size, distance, threshold, sampling range and drawing, and the goal that a state achieves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Goal:
     threshold: float  # largest distance at which the goal is reached
     low: Any = None  # lowest and highest goals that `sample` draws and a hand may drag to, [G] or [3]
     high: Any = None
-    place: Place | None = None  # what the goal is about, if it is about a site or body
+    place: Place | None = None  # the site or body of the goal
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
@@ -49,7 +49,7 @@ class Goal:
     distance: Any  # (achieved [..., G], desired [..., G]) -> [...]
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
-        """What to draw for a goal: balls, and bodies as ghosts."""
+        """Marks that show a goal: balls, and bodies as ghosts."""
         raise NotImplementedError
 
 

@@ -117,7 +117,7 @@ class Joint:
         return pos, mat + _times(mat, turn)
 
     def motion(self, mat: Array, qvel: Array) -> tuple[Array, Array]:
-        """The linear and the angular velocity [3] that the joint gives to what it moves, at its anchor."""
+        """The linear and the angular velocity [3] that the joint adds, at its anchor."""
         still, at = jnp.zeros(3, jnp.float32), self.qvel
         if self.kind == FREE:
             return qvel[at : at + 3], _turn(mat, qvel[at + 3 : at + 6])

@@ -141,7 +141,7 @@ class MujocoTask(GoalEnv):
         return None if self._object is None else np.stack(self._object[2:])
 
     def goal_marks(self, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
-        """What to draw for a goal in a configuration [nq]: balls and ghosts of bodies."""
+        """Marks that show a goal [G] in a configuration [nq]: balls, and bodies as ghosts."""
         return self.goal.marks(self.model, qpos, goal)
 
     def reset(self, key: PRNGKey) -> State:

@@ -19,6 +19,6 @@ class Reach(MujocoTask):
 class Push(Reach):
     """Pushes the box to a point on the floor."""
 
-    start = Start("low", ranges={"box": ((0.37, -0.15, 0.03), (0.52, 0.15, 0.03))})
+    start = Start("home", ranges={"box": ((0.37, -0.15, 0.03), (0.52, 0.15, 0.03))})
     goal = Position("body:box", low=(0.37, -0.15, 0.03), high=(0.52, 0.15, 0.03))
     observations = (*Reach.observations, "body:box", "body:box - site:tip", "rot:box", "vel:box", "angvel:box")
