@@ -241,7 +241,7 @@ def started(folder, name, *command, **variables):
                 process.kill()
 
 
-def until(condition, process, seconds=180.0):
+def until(condition, process, seconds=600.0):
     end = time.monotonic() + seconds
     while not condition():
         if process.poll() is not None or time.monotonic() > end:

@@ -109,8 +109,9 @@ def test_nodes_with_another_version_or_storage_of_their_own_are_refused(bench, t
         assert "must have the driver's code: version of mjx_dher is 0.0." in told
 
 
-def test_local_listens_on_loopback_alone_and_keeps_strangers_out():
+def test_local_listens_on_loopback_alone_and_keeps_strangers_out(tmp_path, monkeypatch):
     """Every listening socket of Ray's processes, and their folder; a caller without the token of this run."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # too long for a path of Ray's sockets
     pytest.importorskip("ray")
     pytest.importorskip("psutil")
     code = """

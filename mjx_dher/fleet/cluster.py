@@ -8,6 +8,7 @@ import os
 import secrets
 import socket
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from mjx_dher.validation import host_and_port
 
 RETRIES = 5  # of a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # for the head of a cluster
+LONG_PATH = 27  # characters of a folder in which paths of Ray's sockets are over the system's 107
 STORE_BYTES = 200 << 20  # of the object store of a cluster that is started here; the rest goes to the disk
 # Files beside custom code that no node needs, as .gitignore names them. The package is each node's own.
 NOT_SENT = ["/mjx_dher", "/envs", ".git", "__pycache__", "/runs", "/sweeps", ".venv", "venv", ".caches"]
@@ -75,7 +77,9 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
     with contextlib.ExitStack() as stack:
         if address == LOCAL:
-            private = stack.enter_context(files.temporary_folder("ray-"))
+            parent = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
+            parent = parent if len(parent) < LONG_PATH else "/tmp"
+            private = stack.enter_context(files.temporary_folder("ray-", parent))
             stack.enter_context(signals.cleaning(subprocesses.kill_sessions))
             place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}

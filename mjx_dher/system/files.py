@@ -227,9 +227,9 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 
 @contextlib.contextmanager
-def temporary_folder(prefix: str) -> Iterator[Path]:
+def temporary_folder(prefix: str, parent: str | None = None) -> Iterator[Path]:
     """Makes a private folder, which is removed at the end of the block."""
-    folder = tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
+    folder = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
     with signals.cleaning(folder.cleanup):
         yield Path(folder.name)
 
