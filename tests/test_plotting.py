@@ -47,12 +47,6 @@ def texts(figure):
     return [(text, text.get_window_extent(renderer)) for text in every if text.get_text() and text.get_visible()]
 
 
-@pytest.fixture(autouse=True)
-def close():
-    yield
-    plotting.close()
-
-
 @pytest.mark.parametrize(("count", "env"), [(1, "push"), (8, ENV)])
 @pytest.mark.parametrize("name", ["curves", "thresholds", "comparison"])
 def test_everything_written_is_inside_and_apart(name, env, count):

@@ -18,11 +18,10 @@ from mjx_dher.tools import figures
 
 def curves(groups: Sequence[Group], threshold: float) -> Any:
     """Draws success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
-    plt = _pyplot()
     labels = [textwrap.fill(_name(group), 120) for group in groups]
     columns = max(1, min(4, 140 // (6 + max(map(len, labels)))))
     height = 3.6 + 0.2 * math.ceil(len(groups) / columns)
-    figure, axes = plt.subplots(1, 3, figsize=(12, height), sharey=True, layout="constrained")
+    figure, axes = figures.subplots(1, 3, 12, height, sharey=True)
     for group, (color, line, marker) in zip(groups, figures.styles(len(groups))):
         middle, low, high = stats.curve_interval(group.success)
         every = max(1, len(group.epoch) // 8)
@@ -32,18 +31,11 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
             axis.plot(x, middle, **style, label=_name(group))
     side_by_side = max(group.lanes for group in groups) > 1
     seconds = "seconds (all runs side by side)" if side_by_side else "seconds (of one run)"
-    for axis, label in zip(axes, ("epoch", "million environment steps", seconds)):
+    for axis in axes:
         axis.axhline(threshold, color="0.6", linewidth=0.8)
         axis.axhline(groups[0].at_reset, color="0.6", linewidth=0.8, linestyle=":")
-        axis.set_xlabel(label)
-        axis.set_xlim(left=0)
-        axis.grid(alpha=0.2)
-    axes[0].set_ylim(-0.02, 1.02)
-    axes[0].set_ylabel("success rate")
     title = f"{groups[0].env}: interquartile mean of {_seeds(len(group.seeds) for group in groups)}, 95 % interval"
-    figure.suptitle(figures.folded(title, 12), fontsize=11)
-    handles, _ = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    figures.label_success(figure, axes, ("epoch", "million environment steps", seconds), labels, columns, title)
     return figure
 
 
@@ -52,11 +44,10 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
 
     Seeds that never reach the threshold lie above the dashed line.
     """
-    plt = _pyplot()
     names = ["\n".join(textwrap.fill(part, 20) for part in _name(group).split(", ")) for group in groups]
     lines = max(name.count("\n") for name in names)
     width = 1.6 + max(3.0, max(1.3, 0.085 * max(len(line) for name in names for line in name.split("\n"))) * len(groups))
-    figure, axis = plt.subplots(figsize=(width, 3.8 + 0.13 * lines), layout="constrained")
+    figure, (axis,) = figures.subplots(1, 1, width, 3.8 + 0.13 * lines)
     last = max(float(group.epoch[-1]) for group in groups)
     never = 1.1 * last
     for place, (group, row, (color, _, marker)) in enumerate(zip(groups, rows, figures.styles(len(groups)))):
@@ -78,10 +69,9 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
 
 def comparison(rows: Sequence[Row]) -> Any:
     """Draws final success, mean success over all epochs, and probability of improvement on the baseline, with intervals."""
-    plt = _pyplot()
     names = [textwrap.fill(f"{row.setting}{_failures(row.failed, row.seeds)}", 40) for row in rows]
     lines = sum(1 + name.count("\n") for name in names)
-    figure, axes = plt.subplots(1, 3, figsize=(11, 1.4 + 0.3 * lines + 0.15 * len(rows)), sharey=True, layout="constrained")
+    figure, axes = figures.subplots(1, 3, 11, 1.4 + 0.3 * lines + 0.15 * len(rows), sharey=True)
     panels = (
         ("final success (IQM)", [(r.final_iqm, r.final_low, r.final_high) for r in rows]),
         ("mean success over epochs (IQM)", [(r.area, r.area_low, r.area_high) for r in rows]),
@@ -121,13 +111,7 @@ def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold:
             path = folder / f"{run_folder.in_a_path(groups[0].env)}_{name}.{ending}"
             figures.write(figure, path)
             written.append(path)
-    close()
     return written
-
-
-def close() -> None:
-    """Frees all figures that were drawn."""
-    _pyplot().close("all")
 
 
 def _name(group: Group) -> str:
@@ -141,12 +125,3 @@ def _failures(failed: int, seeds: int) -> str:
 def _seeds(counts: Iterable[int]) -> str:
     low, *_, high = (*(ordered := sorted(counts)), ordered[-1])
     return f"{low} seeds" if low == high else f"{low} to {high} seeds"
-
-
-def _pyplot() -> Any:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt

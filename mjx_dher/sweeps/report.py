@@ -109,7 +109,6 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
         body.append(html.element("p", f"epochs to a success rate of {threshold:g}; {compared}"))
         for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
             body.append(html.figure(figures.to_svg(figure, 10 * number + place), name))
-    plotting.close()
     body += [html.element("h2", "Runs"), html.details(f"all {len(trials)} runs", _runs(trials))]
     body += [html.element("h2", "Settings"), *_shared_settings(trials)]
     body.append(_footer(None))

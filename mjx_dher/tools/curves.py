@@ -158,16 +158,8 @@ def draw_together(curves: Sequence[Curve]) -> Any:
         style = {"color": color, "linestyle": line, "marker": marker, "markevery": every, "markersize": 4}
         for axis, x in zip(axes, (curve.column("env_steps") / unit, curve.column("wall_seconds"))):
             axis.plot(x, rates, label=name, **style)
-    for axis, label in zip(axes, (label_steps, "seconds of training")):
-        axis.set_xlabel(label)
-        axis.set_xlim(left=0)
-        axis.set_ylim(-0.02, 1.02)
-        axis.grid(alpha=0.2)
-    axes[0].set_ylabel("success rate")
-    tasks = ", ".join(dict.fromkeys(curve.spec.env for curve in curves))
-    figure.suptitle(figures.folded(f"{tasks}: success of each evaluation", 10), fontsize=11)
-    handles, _ = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    title = f"{', '.join(dict.fromkeys(curve.spec.env for curve in curves))}: success of each evaluation"
+    figures.label_success(figure, axes, (label_steps, "seconds of training"), names, columns, title)
     return figure
 
 

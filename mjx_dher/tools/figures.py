@@ -55,14 +55,29 @@ def styles(number: int) -> list[tuple[Any, Any, str]]:
     return [_STYLES[i % len(_STYLES)] for i in range(number)]
 
 
-def subplots(rows: int, columns: int, width: float, height: float) -> tuple[Any, list[Any]]:
-    """Makes a figure, in inches, and returns it with its axes, row by row."""
+def subplots(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:
+    """Makes a figure, in inches, and returns it with its axes, row by row; `options` as for Matplotlib."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+
+
+def label_success(
+    figure: Any, axes: Sequence[Any], units: Sequence[str], names: Sequence[str], columns: int, title: str
+) -> None:
+    """Labels axes of success rates over other units, and names the curves, which all axes have, below them."""
+    for axis, unit in zip(axes, units):
+        axis.set_xlabel(unit)
+        axis.set_xlim(left=0)
+        axis.set_ylim(-0.02, 1.02)
+        axis.grid(alpha=0.2)
+    axes[0].set_ylabel("success rate")
+    figure.suptitle(folded(title, figure.get_figwidth()), fontsize=11)
+    handles, _ = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def write(figure: Any, path: Path) -> None:

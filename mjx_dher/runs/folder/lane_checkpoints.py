@@ -161,10 +161,9 @@ class LaneCheckpoints:
         """
         if not processes.leads():
             return
-        own = self.folders[0] / run_folder.CHECKPOINTS
-        for path in run_folder.checkpoints(self.folders[0])[1:] if keep_end else ():
-            shutil.rmtree(path, ignore_errors=True)
-        for path in {self.folder, *(() if keep_end else (own,))} - {self.folders[0]}:
+        own = self.folders[0]
+        old = run_folder.checkpoints(own)[1:] if keep_end else [own / run_folder.CHECKPOINTS]
+        for path in {*old, self.folder} - {own}:
             shutil.rmtree(path, ignore_errors=True)
         for path in self.shared.glob(f"*/{NAMES_FILE}"):
             names = _names(path)
