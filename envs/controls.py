@@ -69,10 +69,10 @@ class Actuators(Control):
         bound = copy.copy(self)
         own, joints = [""] * model.nu, [""] * model.nu  # names of actuators of this kind, and of their joints
         for i in filter(lambda i: self._suits(model, i), range(model.nu)):
-            own[i] = model.actuator(i).name
-            joints[i] = model.joint(joint).name if (joint := _joint(model, i)) >= 0 else ""
+            joints[i] = names_of(model, "joint")[joint] if (joint := _joint(model, i)) >= 0 else ""
+            own[i] = model.actuator(i).name or joints[i] or f"actuator_{i}"
         bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
-        bound.moved = [own[i] or joints[i] for i in bound.indices]
+        bound.moved = [own[i] for i in bound.indices]
         bound.size = 1 if self.together else len(bound.indices)
         bound.low, bound.high = np.array([_range(model, i) for i in bound.indices], np.float32).T
         bound._bind_joints(model, [_joint(model, i) for i in bound.indices])
@@ -164,7 +164,7 @@ class Mocap(Control):
         }
         if len(pulled) != 1:
             raise ValueError(f"mocap body {self.body!r} must be welded to one body; the model welds {len(pulled)} to it")
-        bound.place = Place(model, f"body:{model.body(pulled.pop()).name}")
+        bound.place = Place(model, f"body:{names_of(model, 'body')[pulled.pop()]}")
         bound.size = 6 if self.turn else 3
         bound.moved = [self.body]
         return bound
@@ -211,5 +211,5 @@ def _range(model: mujoco.MjModel, index: int) -> Any:
         return model.actuator_ctrlrange[index]
     if is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
         return np.sort(model.actuator_gear[index, 0] * model.jnt_range[joint])
-    name = model.actuator(index).name or model.joint(joint).name
+    name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")
     raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")

@@ -19,9 +19,9 @@ _COUNTS = {"joint": "njnt", "actuator": "nu"}
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Names of a model's objects of a kind ("site", "body", "joint", "actuator", ...), "" for those without one."""
+    """Names of a model's objects of a kind ("site", "body", "joint", "key", ...); the third joint without one is "joint_2"."""
     count = getattr(model, _COUNTS.get(kind, f"n{kind}"))
-    return [getattr(model, kind)(i).name for i in range(count)]
+    return [getattr(model, kind)(i).name or f"{kind}_{i}" for i in range(count)]
 
 
 class Place:
@@ -39,16 +39,17 @@ class Place:
         kind, _, rest = name.rpartition(":")
         kind = kind or ("site" if rest in names_of(model, "site") else "body")
         check_name(f"kind of {name!r}", kind, ("site", "body"))
-        check_name(kind, rest, filter(None, names_of(model, kind)))
+        names = names_of(model, kind)
+        check_name(kind, rest, names)
         self.name = f"{kind}:{rest}"
-        item = model.site(rest) if kind == "site" else model.body(rest)
+        item = getattr(model, kind)(names.index(rest))
         self.body = body = int(item.bodyid[0] if kind == "site" else item.id)
         self.offset = _frame(item.pos, item.quat) if kind == "site" else _frame(np.zeros(3), np.array([1.0, 0, 0, 0]))
         self._links: list[tuple[tuple[np.ndarray, np.ndarray], list[Joint]]] = []  # frame in the parent, and joints
         while body:
             if model.body_mocapid[body] >= 0:
                 raise ValueError(
-                    f"{self.name} moves with the mocap body {model.body(body).name!r}, which is no part of the state"
+                    f"{self.name} moves with the mocap body {names_of(model, 'body')[body]!r}, which is no part of the state"
                 )
             first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
             joints = [Joint(model, joint) for joint in range(first, first + count)]

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.goals import Goal
-from mjx_dher.envs.kinematics import HINGE, SLIDE, Place
+from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
 
 _SECONDS = 1.0  # of simulation, at most
 _OVERLAP = 0.02  # m
@@ -27,7 +27,7 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
     mujoco.mj_forward(model, data)
     for contact in data.contact:
         if contact.dist < -_OVERLAP:
-            names = [model.geom(geom).name or model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
+            names = [model.geom(geom).name or names_of(model, "body")[model.geom_bodyid[geom]] for geom in contact.geom]
             warnings.warn(f"{names[0]!r} and {names[1]!r} overlap by {-contact.dist:.2g} m at the start", stacklevel=2)
             break
     rng = np.random.default_rng(0)
@@ -41,7 +41,7 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
             for name in _BAD:
                 if data.warning[getattr(mujoco.mjtWarning, name)].number:
                     dof = int(data.warning[getattr(mujoco.mjtWarning, name)].lastinfo)
-                    joint = model.joint(int(model.dof_jntid[min(dof, model.nv - 1)])).name
+                    joint = names_of(model, "joint")[model.dof_jntid[min(dof, model.nv - 1)]]
                     raise ValueError(
                         f"unstable model: joint {joint!r} diverges, {what}; a smaller timestep, more damping or armature, or"
                         " a start without overlapping geoms can help"

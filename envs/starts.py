@@ -48,8 +48,8 @@ class Start:
         check_number("settle of start", self.settle, "[0, 1000]")
         data = mujoco.MjData(model)
         if self.keyframe is not None:
-            check_name("keyframe", self.keyframe, names_of(model, "key"))
-            mujoco.mj_resetDataKeyframe(model, data, model.key(self.keyframe).id)
+            check_name("keyframe", self.keyframe, keys := names_of(model, "key"))
+            mujoco.mj_resetDataKeyframe(model, data, keys.index(self.keyframe))
         bound.drawn = []
         places = _places(model)
         for name, ends in self.ranges.items():
@@ -86,8 +86,8 @@ def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.n
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
         if kind == FREE:
-            places[model.body(int(model.jnt_bodyid[i])).name] = (*at, np.full(3, -np.inf), np.full(3, np.inf))
+            places[names_of(model, "body")[model.jnt_bodyid[i]]] = (*at, np.full(3, -np.inf), np.full(3, np.inf))
         elif kind in (HINGE, SLIDE):
             low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] else np.array([[-np.inf], [np.inf]])
-            places[model.joint(i).name] = (*at, low - 1e-6, high + 1e-6)
+            places[names_of(model, "joint")[i]] = (*at, low - 1e-6, high + 1e-6)
     return places

@@ -7,6 +7,7 @@ from conftest import refuses
 
 from mjx_dher import envs
 from mjx_dher.envs.arm_kinematics import Chain
+from mjx_dher.envs.kinematics import Place, to_quat
 
 
 @pytest.mark.parametrize("name", envs.list_envs())
@@ -80,3 +81,59 @@ def test_a_body_that_slides_is_refused():
     env = envs.make("pick_and_place", engine="native")
     with refuses("finger_r", "hinge"):
         Chain(env.model, body="finger_r", site="grip")
+
+
+# A free body and a chain of two ball joints, slides with a reference, and two hinges of one body beside their anchors.
+TREE = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos=".1 .2 .3" euler="20 30 40">
+      <joint name="slide" type="slide" axis="1 1 0" ref=".2"/><geom size=".1"/>
+      <body name="ball" pos=".3 0 0"><joint type="ball" pos="0 .1 0"/><geom size=".1"/>
+        <body name="hinges" pos="0 0 .4" euler="0 10 0">
+          <joint axis="0 1 0" pos=".1 0 0" ref="10"/><joint axis="1 0 1" pos="0 .1 .1"/><geom size=".1"/>
+          <body name="fixed" pos=".1 0 0" euler="30 0 0"><geom size=".1"/><site name="tip" pos=".1 .2 0" euler="0 0 50"/></body>
+        </body>
+      </body>
+    </body>
+    <body name="cube" pos="1 0 0"><freejoint/><geom size=".1"/><site name="corner" pos=".1 .1 .1"/></body>
+    <body name="target" mocap="true"><body name="held"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["site:tip", "body:fixed", "body:hinges", "body:ball", "site:corner", "cube", "world"])
+def test_kinematics_are_mujoco_s_for_every_kind_of_joint(name):
+    model = mujoco.MjModel.from_xml_string(TREE)
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    place = Place(model, name)
+    pose, motion = jax.jit(place.pose), jax.jit(place.motion)
+    for _ in range(3):
+        data.qpos[:], data.qvel[:] = rng.normal(size=model.nq), rng.normal(size=model.nv)
+        mujoco.mj_normalizeQuat(model, data.qpos)
+        mujoco.mj_forward(model, data)
+        kind, _, rest = place.name.partition(":")
+        mine, kind = (
+            (data.site(rest), mujoco.mjtObj.mjOBJ_SITE) if kind == "site" else (data.body(rest), mujoco.mjtObj.mjOBJ_XBODY)
+        )
+        pos, mat = pose(jnp.float32(data.qpos))
+        np.testing.assert_allclose(pos, mine.xpos, atol=2e-6)
+        np.testing.assert_allclose(mat.ravel(), mine.xmat, atol=2e-6)
+        back = np.zeros(9)
+        mujoco.mju_quat2Mat(back, np.asarray(to_quat(mat), float))
+        np.testing.assert_allclose(back, mine.xmat, atol=2e-6)
+        twist = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, kind, mine.id, twist, 0)
+        linear, angular = motion(jnp.float32(data.qpos), jnp.float32(data.qvel))
+        np.testing.assert_allclose(linear, twist[3:], atol=1e-5)
+        np.testing.assert_allclose(angular, twist[:3], atol=1e-5)
+
+
+def test_a_place_that_the_state_does_not_determine_is_rejected():
+    model = mujoco.MjModel.from_xml_string(TREE)
+    with refuses("held", "target"):
+        Place(model, "body:held")
+    with refuses("site", "tap", "tip"):
+        Place(model, "site:tap")
+    with refuses("joint:x", "joint", "site", "body"):
+        Place(model, "joint:x")

@@ -1,4 +1,4 @@
-"""Tasks from an MJCF (`envs.task`): kinematics, controls, goals, observations and starts, by values computed by hand."""
+"""Tasks from an MJCF (`envs.task`): controls, goals, observations and starts, by values computed by hand."""
 
 import copy
 import dataclasses
@@ -14,64 +14,7 @@ from conftest import refuses
 from mjx_dher import testing
 from mjx_dher.envs import task
 from mjx_dher.envs.engines import Physics
-from mjx_dher.envs.kinematics import Place, to_quat
 from mjx_dher.viewer.player import Player, make_game
-
-# A free body and a chain of two ball joints, slides with a reference, and two hinges of one body beside their anchors.
-TREE = """
-<mujoco>
-  <worldbody>
-    <body name="base" pos=".1 .2 .3" euler="20 30 40">
-      <joint name="slide" type="slide" axis="1 1 0" ref=".2"/><geom size=".1"/>
-      <body name="ball" pos=".3 0 0"><joint type="ball" pos="0 .1 0"/><geom size=".1"/>
-        <body name="hinges" pos="0 0 .4" euler="0 10 0">
-          <joint axis="0 1 0" pos=".1 0 0" ref="10"/><joint axis="1 0 1" pos="0 .1 .1"/><geom size=".1"/>
-          <body name="fixed" pos=".1 0 0" euler="30 0 0"><geom size=".1"/><site name="tip" pos=".1 .2 0" euler="0 0 50"/></body>
-        </body>
-      </body>
-    </body>
-    <body name="cube" pos="1 0 0"><freejoint/><geom size=".1"/><site name="corner" pos=".1 .1 .1"/></body>
-    <body name="target" mocap="true"><body name="held"/></body>
-  </worldbody>
-</mujoco>"""
-
-
-@pytest.mark.parametrize("name", ["site:tip", "body:fixed", "body:hinges", "body:ball", "site:corner", "cube", "world"])
-def test_kinematics_are_mujoco_s_for_every_kind_of_joint(name):
-    model = mujoco.MjModel.from_xml_string(TREE)
-    data, rng = mujoco.MjData(model), np.random.default_rng(1)
-    place = Place(model, name)
-    pose, motion = jax.jit(place.pose), jax.jit(place.motion)
-    for _ in range(3):
-        data.qpos[:], data.qvel[:] = rng.normal(size=model.nq), rng.normal(size=model.nv)
-        mujoco.mj_normalizeQuat(model, data.qpos)
-        mujoco.mj_forward(model, data)
-        kind, _, rest = place.name.partition(":")
-        mine, kind = (
-            (data.site(rest), mujoco.mjtObj.mjOBJ_SITE) if kind == "site" else (data.body(rest), mujoco.mjtObj.mjOBJ_XBODY)
-        )
-        pos, mat = pose(jnp.float32(data.qpos))
-        np.testing.assert_allclose(pos, mine.xpos, atol=2e-6)
-        np.testing.assert_allclose(mat.ravel(), mine.xmat, atol=2e-6)
-        back = np.zeros(9)
-        mujoco.mju_quat2Mat(back, np.asarray(to_quat(mat), float))
-        np.testing.assert_allclose(back, mine.xmat, atol=2e-6)
-        twist = np.zeros(6)
-        mujoco.mj_objectVelocity(model, data, kind, mine.id, twist, 0)
-        linear, angular = motion(jnp.float32(data.qpos), jnp.float32(data.qvel))
-        np.testing.assert_allclose(linear, twist[3:], atol=1e-5)
-        np.testing.assert_allclose(angular, twist[:3], atol=1e-5)
-
-
-def test_a_place_that_the_state_does_not_determine_is_rejected():
-    model = mujoco.MjModel.from_xml_string(TREE)
-    with refuses("held", "target"):
-        Place(model, "body:held")
-    with refuses("site", "tap", "tip"):
-        Place(model, "site:tap")
-    with refuses("joint:x", "joint", "site", "body"):
-        Place(model, "joint:x")
-
 
 # Two hinges with servos, a motor on a slide, and a free box: nothing touches anything, and there is no gravity.
 MACHINE = """
@@ -312,6 +255,32 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
 def test_a_declaration_that_does_not_fit_the_model_is_rejected_before_training(declared, parts):
     with refuses(*parts):
         make(**declared)
+
+
+NAMELESS = """
+<mujoco>
+  <default><joint damping="1"/><geom size=".1"/></default>
+  <worldbody>
+    <body><joint axis="0 0 1"/><geom/><body pos=".3 0 0"><joint/><geom/><site name="s"/></body></body>
+    <body pos="0 0 1"><freejoint/><geom/></body>
+  </worldbody>
+  <actuator><motor site="s" ctrlrange="-1 1"/></actuator>
+  <keyframe><key qpos="0.5 0 0 0 2 1 0 0 0"/></keyframe>
+</mujoco>"""
+
+
+def test_objects_without_a_name_are_numbered():
+    ranges = {"joint_1": (0, 1), "body_3": ((0, 0, 1), (1, 1, 1))}
+    env = make(
+        model=NAMELESS,
+        control=task.Actuators(),
+        goal=task.Position("body:body_2", (0.2, 0.2, 0), (0.2, 0.2, 0)),
+        observations=("qpos:*", "qvel:*"),
+        start=task.Start("key_0", ranges),
+        hz=25,
+    )
+    assert (env.parts[0].moved, env.observation_size) == (["actuator_0"], 9 + 8)
+    np.testing.assert_allclose(env.achieved(env.start.physics)[:2], [0.3 * np.cos(0.5), 0.3 * np.sin(0.5)], atol=1e-6)
 
 
 def test_objects_that_overlap_at_the_start_are_reported():
