@@ -139,31 +139,33 @@ def test_a_run_comes_back_whole_and_once(trained, tmp_path):
     target = grid.folder_of(tmp_path, trial)
     (target / "checkpoints" / "epoch-000001").mkdir(parents=True)  # of a run without Ray
     (target / "metrics.csv").write_text("cut")
-    worker.unpack(target, parcel)
-    assert results.is_whole(target)
+    worker.unpack(target, trial, parcel)
+    assert results.is_done(target, trial)
     assert not (target / "checkpoints").exists()
     assert worker.pack(target) == parcel
     written = (target / "result.json").stat().st_mtime_ns
-    worker.unpack(target, parcel)
+    worker.unpack(target, trial, parcel)
     assert (target / "result.json").stat().st_mtime_ns == written
     assert len(tables.read(tmp_path)) == 1
 
 
 def test_a_damaged_run_is_rejected_and_nothing_is_lost(trained, tmp_path):
-    _, parcel = trained
+    trial, parcel = trained
     kept = tmp_path / "a" / "checkpoints" / "epoch-000001"
     kept.mkdir(parents=True)
     for damaged in (b"", b"nonsense", parcel[:-40], parcel[:200] + b"\0" * 50 + parcel[250:]):
         with refuses("damaged", error=FolderError):
-            worker.unpack(tmp_path / "a", damaged)
+            worker.unpack(tmp_path / "a", trial, damaged)
         assert kept.exists()
         assert not (tmp_path / "a" / "result.json").exists()
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("../outside", "x")
         archive.writestr("result.json", "{}")
     with refuses("damaged", error=FolderError):
-        worker.unpack(tmp_path / "b" / "c", (tmp_path / "other.zip").read_bytes())
+        worker.unpack(tmp_path / "b" / "c", trial, (tmp_path / "other.zip").read_bytes())
     assert not (tmp_path / "b" / "outside").exists()
+    with refuses("seed", error=FolderError):  # another trial
+        worker.unpack(tmp_path / "c", dataclasses.replace(trial, seed=1), parcel)
 
 
 def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):
@@ -209,7 +211,7 @@ def test_a_chunk_resumes_where_it_was_on_another_node(tmp_path, killed, monkeypa
     assert [news.steps / CONFIG.total_steps / 2 for news in told] == ([2, 3, 4] if killed else [3, 4])
     assert any("going on from" in line for line in told[0].lines)
     for trial, parcel in zip(trials, parcels):
-        worker.unpack(grid.folder_of(tmp_path / "fleet", trial), parcel)
+        worker.unpack(grid.folder_of(tmp_path / "fleet", trial), trial, parcel)
     for name in (tables.RESULTS, tables.FINALS):
         assert table(tmp_path / "fleet", name) == table(tmp_path / "plain", name)
 

@@ -21,6 +21,7 @@ from mjx_dher.cli import sweep
 from mjx_dher.cli import train as train_module
 from mjx_dher.policy import from_arrays
 from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.sweeps import grid
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import curves
 from point_mass import PointMass
@@ -192,6 +193,20 @@ def test_a_manifest_cannot_name_files_elsewhere(stopped, capsys):
         manifest["files"]["/dev/zero"] = "0"
         (path / "manifest.json").write_text(json.dumps({**manifest, "sha256": fingerprint.sha256_of(manifest)}))
     is_rejected(capsys, "resume", stopped, naming=["/dev/zero"])
+
+
+def test_the_folder_of_a_trial_with_another_run_in_it_is_not_that_trial(made, tmp_path):
+    folder = shutil.copytree(made / "mine" / "whole", grid.folder_of(tmp_path, OTHER))
+    assert not grid.is_done(tmp_path, OTHER)
+    names(results.trial_problem(folder, OTHER), "seed", 0, 1)
+    assert results.is_done(folder, SPEC)
+
+
+def test_other_versions_than_the_run_began_with_are_reported(stopped, monkeypatch, capsys):
+    content = run_folder.read_config(stopped)
+    edit(stopped, ("versions", "jax"), "0.0.1")
+    monkeypatch.setattr(train_module, "_train", lambda *arguments: 0)
+    assert resume(stopped, capsys)[1].count(f"jax was 0.0.1 and is {content['versions']['jax']}") == 1
 
 
 # JAX's flags

@@ -193,6 +193,8 @@ def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any],
             f"step sizes fall to {run.hparams.lr_end:g} of their start over the whole run, whose length has changed: they go on"
             " from what they would be at this point of a run of the new length"
         )
+    for text in run_folder.changed_versions(content):
+        console.print(f"since {args.run} began: {text}")
     told = "; ".join(f"{name} {fingerprint.text(value)}" for name, value in vars(options).items())
     console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}")
     return run, options

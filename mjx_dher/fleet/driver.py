@@ -94,7 +94,7 @@ def _deliver(job: Job, chunk: Chunk, parcels: Sequence[bytes]) -> int:
         folder = grid.folder_of(job.folder, spec)
         try:
             if parcel:
-                worker.unpack(folder, parcel)
+                worker.unpack(folder, spec, parcel)
                 written += 1
         except BusyError as error:  # a program without Ray trains it
             job.report(f"{folder} was not written: {error}")

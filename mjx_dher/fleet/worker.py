@@ -77,8 +77,7 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
                 report=reporter.add_line,
                 on_epoch=reporter.on_epoch,
             )
-        folders = [grid.folder_of(place, spec) for spec in chunk.specs]
-        return [pack(folder) if results.is_whole(folder) else b"" for folder in folders]
+        return [pack(grid.folder_of(place, spec)) if grid.is_done(place, spec) else b"" for spec in chunk.specs]
 
 
 class _Reporter:
@@ -143,18 +142,18 @@ def pack(folder: Path) -> bytes:
     return buffer.getvalue()
 
 
-def unpack(folder: Path, parcel: bytes) -> None:
-    """Writes a run that has ended into its folder, result.json last: the run is there whole, or has not ended.
+def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
+    """Writes a trial that has ended into its folder, result.json last: the run is there whole, or has not ended.
 
     A run that has ended there already stays as it is.
 
     Raises:
-      FolderError: another program has the folder, it cannot be written to, or the bytes are not a whole run.
+      FolderError: another program has the folder, it cannot be written to, or the bytes are not this trial, whole.
     """
     try:
         files.make_folder(folder)
         with files.lock(folder), zipfile.ZipFile(io.BytesIO(parcel)) as archive:
-            if results.is_whole(folder):
+            if results.is_done(folder, spec):
                 return
             content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are compared
             (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
@@ -168,5 +167,5 @@ def unpack(folder: Path, parcel: bytes) -> None:
         raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); run the same command again") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
         raise FolderError(f"{folder}: the run that came back is damaged ({error})") from error
-    if (problem := results.result_problem(folder)) is not None:
+    if (problem := results.trial_problem(folder, spec)) is not None:
         raise FolderError(f"the run that came back is damaged: {problem}")

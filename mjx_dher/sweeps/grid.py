@@ -63,7 +63,7 @@ def folder_of(sweep: Path, spec: RunSpec) -> Path:
 
 def is_done(sweep: Path, spec: RunSpec) -> bool:
     """Returns whether the trial has ended, and its result can be believed."""
-    return results.is_whole(folder_of(sweep, spec))
+    return results.is_done(folder_of(sweep, spec), spec)
 
 
 def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:

@@ -81,7 +81,7 @@ class Claims:
             run_folder.check_same(folder, spec)
         if not results.has_result(folder):
             return True
-        problem = results.result_problem(folder, with_policy=self.sweep)
+        problem = results.trial_problem(folder, spec) if self.sweep else results.result_problem(folder, with_policy=False)
         if self.sweep and problem is not None:
             self.report(f"{problem}; it is trained again")
         if self.sweep:

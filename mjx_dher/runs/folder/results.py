@@ -8,6 +8,7 @@ from typing import Any
 
 from mjx_dher.runs.folder import contents, loggers, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
+from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
@@ -21,13 +22,16 @@ def read_result(folder: Path) -> dict[str, Any]:
     """Reads the result of a run that has ended.
 
     Raises:
-      FolderError: it is missing or damaged.
+      FolderError: it is missing, damaged or of another run.
     """
     path = folder / run_folder.RESULT_FILE
     with run_folder.checked(path):
         content = {"reason": "", **files.read_json(path)}
         numbers = {name: value for name, value in content.items() if value is not None}
         contents.check(numbers, contents.RESULT_FINISHED if content["status"] == FINISHED else contents.RESULT)
+    if content["digest"] != (digest := run_folder.read_config(folder)["digest"]):
+        other = f"its digest is {content['digest']}, that of {run_folder.CONFIG_FILE} {digest}"
+        raise FolderError(f"{path} is of a run with other settings: {other}")
     return content
 
 
@@ -86,14 +90,22 @@ def result_problem(folder: Path, with_policy: bool = True) -> str | None:
     epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
     if len(rows) != epochs:
         return f"{folder / run_folder.METRICS_FILE} has whole lines of {len(rows)} of {epochs} epochs"
-    digest = content["digest"]
-    last = {run_folder.RESULT_FILE: result["digest"], run_folder.METRICS_FILE: rows[-1].get(loggers.DIGEST) if rows else digest}
-    for name, other in last.items():
-        if other != digest:
-            return f"{folder / name} is of a run with other settings: its digest is {other}, that of config.json {digest}"
+    if rows and rows[-1].get(loggers.DIGEST) != content["digest"]:
+        return (
+            f"{folder / run_folder.METRICS_FILE} ends with the digest {rows[-1].get(loggers.DIGEST)}, not {content['digest']}"
+        )
     return None
 
 
-def is_whole(folder: Path) -> bool:
-    """Whether the run has ended and its files are whole."""
-    return has_result(folder) and result_problem(folder) is None
+def trial_problem(folder: Path, spec: RunSpec) -> str | None:
+    """Reason why a trial of a sweep that has a result is not whole, or its folder holds another trial; None if it is right."""
+    try:
+        run_folder.check_same(folder, spec, ("physics",))
+    except FolderError as error:
+        return str(error)
+    return result_problem(folder)
+
+
+def is_done(folder: Path, spec: RunSpec) -> bool:
+    """Whether a trial of a sweep has ended, and its files are whole."""
+    return has_result(folder) and trial_problem(folder, spec) is None

@@ -113,6 +113,12 @@ def _versions() -> dict[str, str]:
     return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
 
 
+def changed_versions(content: Mapping[str, Any]) -> list[str]:
+    """Sentences about versions, of this program and of those that it needs, that differ from those in config.json."""
+    before, now = content.get("versions", {}), _versions()
+    return [f"{name} was {before[name]} and is {now[name]}" for name in now if before.get(name, now[name]) != now[name]]
+
+
 def checkpoints(path: Path) -> list[Path]:
     """Checkpoints of the run in `path`, the newest first."""
     paths = (path / CHECKPOINTS).glob("epoch-*")
@@ -254,13 +260,13 @@ def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
     return list(fingerprint.differences(identity_of(content, spec), now).values())
 
 
-def check_same(path: Path, spec: RunSpec) -> None:
+def check_same(path: Path, spec: RunSpec, may_change: Sequence[str] = fingerprint.MAY_CHANGE) -> None:
     """Raises FolderError, which names the differences, if the folder holds a run with other settings than may change."""
     content = read_config(path)
     before = identity_of(content, to_spec(path, content))
     now = fingerprint.identity(spec, content["physics"], content["sources"], fingerprint.jax_flags())
     changed = fingerprint.differences(before, now)
-    if refused := [text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE]:
+    if refused := [text for name, text in changed.items() if name not in may_change]:
         raise FolderError(f"{path} holds a run with other settings: {'; '.join(refused)}")
 
 
