@@ -116,6 +116,10 @@ def test_what_an_engine_cannot_do_is_rejected_when_it_is_made():
     for engine in ("native", "jax"):
         with pytest.raises(ValueError, match=r"delays.*Simulator"):
             make_engine(engine, model, SUBSTEPS)
+    asleep = mujoco.MjModel.from_xml_string(f'<mujoco><option><flag sleep="enable"/></option>{MODELS["arm"][9:]}')
+    for engine in ("native", "jax", "warp"):
+        with refuses("sleeping", "sleep"):
+            make_engine(engine, asleep, SUBSTEPS)
     with pytest.raises(ValueError, match="delays"):
         Simulator(model).advance(*start(model))
     cylinder = arm().replace('type="box" size=".02 .02 .04"', 'type="cylinder" size=".02 .04" contype="1"')

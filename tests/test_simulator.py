@@ -158,6 +158,7 @@ def test_bad_arguments_are_rejected():
     cases = [  # a call, and what the error must name
         (lambda model: Simulator("figure.xml"), ["model", "mujoco.MjModel", "str"]),
         (lambda model: Simulator(model, derived="xpos"), ["derived", "xpos"]),
+        (lambda model: Simulator(model, derived=None), ["derived", None]),
         (lambda model: Simulator(model, derived=["xposs"]), ["derived", "xposs", "xpos"]),
         (lambda model: Simulator(model, derived=["qpos"]), ["derived", "qpos"]),
         (lambda model: Simulator(model, derived=["qfrc_inverse"]), ["derived", "qfrc_inverse", "mj_inverse"]),

@@ -46,6 +46,8 @@ def check_state(model: mujoco.MjModel) -> None:
     """Raises ValueError if the model has state that `Physics` does not hold."""
     if model.nhistory or model.npluginstate:
         raise ValueError("the model has delays or plugins, whose state `Physics` does not hold; use mjx_dher.envs.Simulator")
+    if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
+        raise ValueError('the model has sleeping bodies, whose state `Physics` does not hold; remove <flag sleep="enable"/>')
 
 
 def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) -> None:

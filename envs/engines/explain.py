@@ -18,8 +18,6 @@ _CURES = {
     "nativeccd": '<flag nativeccd="disable"/>',
     "stand_in": "add the geom that it names",
     "friction in joints": 'frictionloss="0"',
-    "delays": "use mjx_dher.envs.Simulator",
-    "sleep": 'remove <flag sleep="enable"/>',
 }
 
 
@@ -46,7 +44,9 @@ def _verdict(model: mujoco.MjModel, engine: str, otherwise: str, **options: Any)
     try:
         make_engine(engine, model, 1, **options)
     except ValueError as error:
-        reason = str(error).removesuffix(f"; {_NATIVE}")
+        reason, _, cure = str(error).partition("; ")
+        if cure and cure != _NATIVE:
+            return Verdict(name, reason, cure)
         cures = [cure for words, cure in _CURES.items() if words in reason]
         return Verdict(name, reason, "; or ".join([*cures, otherwise]))
     return Verdict(name, "", "")

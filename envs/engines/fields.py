@@ -32,7 +32,7 @@ def derived_fields(names: Sequence[str], state: Sequence[str]) -> tuple[str, ...
     Raises:
       ValueError: one is no field of MjData, belongs to the `state`, or has no value that MuJoCo computes at every timestep.
     """
-    if isinstance(names, str):
+    if isinstance(names, str) or not isinstance(names, Sequence):
         raise ValueError(f"derived must be a list of names; got {names!r}")
     for name in names:
         if name in REJECTED:

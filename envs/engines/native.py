@@ -105,9 +105,9 @@ class Simulator:
         self._model = copy.copy(model)
         # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        if "energy" in derived:
-            self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
+        if "energy" in self._derived:
+            self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         self._num_threads = num_threads or usable_cores()
         self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived)}"
         batch = Batch(self._model, 1, 1)

@@ -8,10 +8,10 @@ import json
 import mujoco
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from mjx_dher import envs
 from mjx_dher.cli.commands import parse
+from mjx_dher.cli.common import print_table
 from mjx_dher.spec import to_arguments
 
 
@@ -40,8 +40,6 @@ def engines_command(argv: list[str], console: Console) -> int:
     if args.json:
         print(json.dumps([{**verdict._asdict(), "supported": not verdict.reason} for verdict in verdicts], indent=2))
         return 0
-    table = Table("engine", "supported", "reason", "cure")
-    for verdict in verdicts:
-        table.add_row(verdict.engine, "no" if verdict.reason else "yes", verdict.reason, verdict.cure)
-    console.print(table)
+    rows = [(each.engine, "no" if each.reason else "yes", each.reason, each.cure) for each in verdicts]
+    print_table(("engine", "supported", "reason", "cure"), rows, console)
     return 0
