@@ -172,7 +172,6 @@ def signals(folder: Path, count: int, seed: int, workers: int = 1) -> tuple[str,
     """Sends `count` signals to each command; returns what came of it, and the faults."""
     folder.mkdir(parents=True)
     names = [name for name in COMMANDS if name != "ray" or importlib.util.find_spec("ray")]
-    names = [name for name in names if name in os.environ.get("SIGNALS", " ".join(names)).split()]
 
     def every(name: str) -> Trials:
         trials = Trials(name, folder, random.Random(f"{seed} {name}"))
@@ -184,10 +183,3 @@ def signals(folder: Path, count: int, seed: int, workers: int = 1) -> tuple[str,
         done = list(pool.map(every, names))
     told = "; ".join(f"{x.name} {x.stopped} stopped, {x.ended} ended, {max(x.seconds, default=0):.1f} s at most" for x in done)
     return told, [fault for trials in done for fault in trials.faults]
-
-
-if __name__ == "__main__":
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as place:
-        print(*signals(Path(place, "signals"), int(sys.argv[1]), int(sys.argv[2]), 2), sep="\n")

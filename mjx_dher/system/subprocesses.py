@@ -49,7 +49,7 @@ def started(command: Sequence[str], variables: Mapping[str, str] | None = None) 
 
 def kill(process: subprocess.Popen[Any]) -> None:
     """Kills a program that leads a session, and those that it has started there."""
-    with contextlib.suppress(ProcessLookupError):  # all have ended
+    with contextlib.suppress(OSError):  # all have ended
         os.killpg(process.pid, signal.SIGKILL)
 
 
