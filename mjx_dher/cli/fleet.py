@@ -25,7 +25,7 @@ from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
 from mjx_dher.system.caches import prepare
 
-SECONDS_WITHOUT_NEWS = 7.0  # of a cluster, after a signal: it has gone
+SECONDS_WITHOUT_NEWS = 8.0  # of a cluster, after a signal: it has gone
 
 
 @dataclasses.dataclass(frozen=True)

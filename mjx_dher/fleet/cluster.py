@@ -194,7 +194,7 @@ class Cluster:
     def look(self, stop: bool) -> list[News]:
         """Returns the news of chunks, and passes on whether to stop."""
         try:
-            return list(self._ray.get(self._board.look.remote(stop), timeout=5))
+            return list(self._ray.get(self._board.look.remote(stop), timeout=3))
         except self._ray.exceptions.RayError:  # the actor is restarting
             return []
 

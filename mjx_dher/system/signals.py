@@ -54,7 +54,7 @@ class _Signals:
         """Reads the pipe for as long as the process lives."""
         signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
         while True:
-            select.select([read], [], [], 1.0)
+            select.select([read], [], [], 0.5)
             self.look()
 
     def look(self) -> None:
