@@ -18,7 +18,7 @@ from flax import struct
 from mjx_dher.check import array, describe
 from mjx_dher.types import Array, Episode, PRNGKey, PyTree, check_size
 
-HUGE = 2.0**64  # a weight above which sums could overflow
+HUGE = 2.0**64  # a value above which sums could overflow
 
 
 @struct.dataclass
@@ -190,18 +190,18 @@ def can_sample(state: ReplayState) -> Array:
     return state.size > 0
 
 
-def sum_factor(weights: Array) -> Array:
-    """Power of two [] for weights of 0 or more: times it, they can be summed without overflow. It is 1 unless one is huge.
+def sum_factor(values: Array) -> Array:
+    """Power of two []: times it, values can be summed without overflow. It is 1 unless one of them is huge.
 
     A power of two keeps every digit, so proportions and, divided by it again, means stay what they are.
     """
-    return jnp.where(jnp.max(weights) > HUGE, 1.0 / HUGE, 1.0)
+    return jnp.where(jnp.max(jnp.abs(values)) > HUGE, 1.0 / HUGE, 1.0)
 
 
-def mean_weight(weights: Array, number: Array | int) -> Array:
-    """Mean [] of the `number` weights among `weights` [E], of which others are 0; 0 if there is none."""
-    factor = sum_factor(weights)
-    return jnp.sum(weights * factor) / jnp.maximum(number, 1).astype(jnp.float32) / factor
+def mean(values: Array, number: Array | int) -> Array:
+    """Mean [] of `number` of the values [E], the others being 0; 0 if there is none. It does not overflow."""
+    factor = sum_factor(values)
+    return jnp.sum(values * factor) / jnp.maximum(number, 1).astype(jnp.float32) / factor
 
 
 def cumulative(state: ReplayState) -> Cumulative:

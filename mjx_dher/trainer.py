@@ -201,7 +201,7 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     key, eval_key = jax.random.split(state.key)
     discarded = split.total(jnp.sum(cycles.pop("discarded_episodes")), loop.axis_name)
     outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes, loop.axis_name)
-    means = split.mean(jax.tree.map(jnp.mean, cycles), loop.axis_name)
+    means = split.mean(jax.tree.map(lambda x: replay.mean(x, len(x)), cycles), loop.axis_name)
     evaluated = split.mean((evaluate.summary(outcome), evaluate.faults(outcome)), loop.axis_name)
     faults = {name: jnp.maximum(means[name], share) for name, share in evaluated[1].items()}
     metrics = evaluated[0] | means
@@ -240,7 +240,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": replay.mean_weight(*drawn),
+        "priority_mean": replay.mean(*drawn),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,
