@@ -18,6 +18,7 @@ from mujoco.batch import DATA_FIELDS
 from mjx_dher.envs import Simulator, make
 from mjx_dher.envs.engines import Controls, native
 from mjx_dher.envs.engines.fields import REJECTED
+from mjx_dher.tools import gym_cache
 
 # Whatever a state can have: an actuator with activation, a mocap body with a weld, a tendon, a delayed sensor, a keyframe.
 RICH = """
@@ -265,6 +266,13 @@ def test_lost_contacts_are_reported_and_other_people_s_warnings_left_alone(tmp_p
     assert not np.isfinite(wild.qvel).all()
     assert mujoco.get_mju_user_warning() is before
     assert list(tmp_path.iterdir()) == []
+
+
+def test_environments_of_gym_with_many_options_are_not_all_kept():
+    made = [weakref.ref(gym_cache.programs("reach", {"distance_threshold": 0.01 * (1 + i)}).env) for i in range(20)]
+    gc.collect()
+    assert sum(ref() is not None for ref in made) <= 16
+    gym_cache._compile.cache_clear()
 
 
 def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
