@@ -49,8 +49,7 @@ def options_of(content: dict[str, Any]) -> Options:
 
 def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     """Origin of settings: the run, the version that wrote them, and whether they were edited since."""
-    versions = content.get("versions", {})
-    version = versions.get("mjx_dher", "unknown") if isinstance(versions, dict) else "unknown"
+    version = content.get("versions", {}).get("mjx_dher", "unknown")
     now = fingerprint.digest(run_folder.identity_of(content, run))
     edited = "; edited since" if content["digest"] != now else ""
     lacking = fingerprint.settings(run).keys() - {*content, *content["config"], *content["hparams"]} if edited else ()

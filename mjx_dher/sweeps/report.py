@@ -140,8 +140,8 @@ def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
     yield html.details("the same in all runs", html.table(("setting", "value"), rows))
 
 
-def _footer(versions: Any) -> str:
-    told = ", ".join(f"{name} {version}" for name, version in versions.items()) if isinstance(versions, dict) else ""
+def _footer(versions: dict[str, str] | None) -> str:
+    told = ", ".join(f"{name} {version}" for name, version in (versions or {}).items())
     return html.element("p", f"Written by mjx-dher {__version__}." + (f" The run: {told}." if told else ""))
 
 
