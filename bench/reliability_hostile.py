@@ -227,7 +227,7 @@ def manifest(case):
 
 
 CHANGES = (environment, environment, environment, component, component, learner, demonstrations, link, link, folder_link, names)
-BREAKING = (link, file)  # what they leave cannot be edited
+BREAKING = (link, folder_link, file)  # what they leave cannot be edited
 CHANGES += (text, file, unpickled, manifest)
 
 

@@ -10,12 +10,11 @@ import functools
 import importlib
 import importlib.util
 import inspect
-import os
 import pkgutil
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from importlib.machinery import PathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +42,7 @@ NO_COMPONENTS = frozenset(
         *("setuptools", "tyro", "viser", "warp"),
     }
 )
+current_folder = False  # whether components are searched in the current folder, too, as commands do
 
 
 def command_name() -> str:
@@ -83,6 +83,9 @@ def load_import_path(field: str, value: str) -> Any:
     _check_import_path(field, value)
     trust.check(field, value, module_file(value))
     name, attribute = value.split(":")
+    top = name.partition(".")[0]
+    if top not in sys.modules and importlib.util.find_spec(top) is None:  # it is in the current folder
+        sys.path.append("")
     try:
         module = importlib.import_module(name)
     except Exception as error:
@@ -102,11 +105,21 @@ def load_import_path(field: str, value: str) -> Any:
     return component
 
 
+def find_module(top: str) -> ModuleSpec | None:
+    """Finds a top-level module on Python's path, or else in the current folder; does not import it.
+
+    The current folder is on the path only once the user has used a component from there. Else JAX would import plugins, and
+    this library packages of extras that are not installed, from a folder that someone else has made.
+    """
+    spec = importlib.util.find_spec(top)
+    return PathFinder.find_spec(top, [""]) if spec is None and current_folder else spec
+
+
 def module_file(value: str) -> Path | None:
     """File of the module in "module:attribute"; None if there is none. Neither it nor a package around it is imported."""
     top, *rest = value.partition(":")[0].split(".")
     try:
-        spec = importlib.util.find_spec(top)
+        spec = find_module(top)
         for name in rest:
             spec = PathFinder.find_spec(name, list(spec.submodule_search_locations or ())) if spec else None
     except (ValueError, ImportError):  # __main__ has no spec, for example
@@ -140,7 +153,7 @@ def _check_import_path(field: str, value: str) -> None:
         raise ValueError(f"{field} must be module:attribute, the module's name as `import` takes it; got {value!r}")
     _check_origin(field, value, name)
     top = name.partition(".")[0]
-    if top not in sys.modules and importlib.util.find_spec(top) is None:
+    if top not in sys.modules and find_module(top) is None:
         raise _no_module(field, value, top)
 
 
@@ -152,7 +165,7 @@ def _check_origin(field: str, value: str, module: str) -> None:
 def _no_module(field: str, value: str, missing: str) -> ValueError:
     """The error for `missing`, the shortest prefix of a module's name that does not exist."""
     parent = missing.rpartition(".")[0]
-    paths = getattr(sys.modules[parent], "__path__", ()) if parent else [path or os.getcwd() for path in sys.path]
+    paths = getattr(sys.modules[parent], "__path__", ()) if parent else [".", *sys.path]
     modules = [parent, *(f"{parent}.{module.name}".lstrip(".") for module in pkgutil.iter_modules(paths))]
     place = f"in {parent}" if parent else "in the current folder or on Python's path"
     return ValueError(f"{field} {value!r}: there is no module {missing!r} {place}{_hint(missing, modules, cutoff=0.75)}")

@@ -1,6 +1,7 @@
 """Files do not decide which code runs, and their names and links lead nowhere outside of their folder."""
 
 import dataclasses
+import importlib.util
 import io
 import json
 import os
@@ -17,11 +18,12 @@ from rich.table import Table
 import mjx_dher
 from mjx_dher import RunSpec, cli, envs, lookup, trust
 from mjx_dher.cli import train
-from mjx_dher.cli.output import PlainConsole
+from mjx_dher.cli.output import PlainConsole, printable
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy.numpy_policy import Policy
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.spec import to_arguments, to_texts, validate
+from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
 OWN = RunSpec(env="point_mass:PointMass", config=TINY)
@@ -155,6 +157,17 @@ def test_the_same_name_with_other_arguments_or_of_another_file_is_not_trusted(he
         lookup.load_import_path("env", spec.env)
 
 
+def test_the_current_folder_is_on_the_path_only_for_a_component_from_there(received, here, monkeypatch):
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    received(RunSpec(env="evil:Env", config=TINY))
+    cli.main(COMMANDS["eval"])
+    cli.main(["eval", "reach", "--episodes", "0"])
+    assert importlib.util.find_spec("evil") is None  # nor do JAX's plugins, or an extra that is not installed, come from here
+    (here / "mine.py").write_text("from point_mass import PointMass")
+    assert cli.main([*COMMANDS["train"], "--env", "mine:PointMass"]) == 0
+    assert "" in sys.path
+
+
 def test_a_name_that_the_user_types_is_trusted(received, here):
     received(OWN)
     assert cli.main(COMMANDS["train"]) == 2
@@ -242,6 +255,20 @@ def test_control_characters_of_a_file_are_printed_as_escapes(here, capsys):
     table.add_row("b\x1b[2J")
     console.print(table)
     assert "\x1b" not in console.file.getvalue()
+
+
+def test_names_that_the_locale_cannot_decode_are_printed():
+    assert printable("\udcc3\udca9/\udcff") == "é/\\xff"
+
+
+def test_half_a_character_is_neither_read_nor_written(here):
+    write(here / "run", OWN)
+    content = json.loads((here / "run" / "config.json").read_text())
+    with pytest.raises(UnicodeEncodeError):
+        files.write_json(here / "run" / "config.json", {**content, "physics": "\ud800"})
+    (here / "run" / "config.json").write_text(json.dumps({**content, "physics": "\ud800"}))
+    for command in ("plot", "report", "eval"):
+        assert cli.main([command, "run"]) == 2
 
 
 def test_a_pipe_in_place_of_metrics_does_not_block(here):

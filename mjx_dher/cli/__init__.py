@@ -23,8 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     atexit.register(gc.freeze)
     argv = list(sys.argv[1:] if argv is None else argv)
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
-    if "" not in sys.path:  # the current folder, for --env module:attribute; last, so that it hides nothing
-        sys.path.append("")
+    lookup.current_folder = True  # for --env module:attribute
     trains = name in TRAINING and not {"--dry-run", "--version"} & set(argv)
     with signals.taken(), output.guarded() as stream:
         try:

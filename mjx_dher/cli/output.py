@@ -18,10 +18,12 @@ from rich.text import Text
 
 # Characters that act on a terminal or reverse its text, in place of being printed: all but tab and line feed.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+_BYTES = re.compile("[\udc80-\udcff]+")  # of a file name, as Python decodes them
 
 
 def printable(text: str) -> str:
-    """Text with its control characters escaped, as text from a file must be before a terminal gets it."""
+    """Text with its control characters escaped, and the bytes of file names that the locale cannot decode as UTF-8."""
+    text = _BYTES.sub(lambda match: match[0].encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"), text)
     return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
 
 

@@ -83,7 +83,9 @@ def read_json(file: Path) -> Any:
             content = stream.read(LARGEST_JSON + 1)
         if len(content) > LARGEST_JSON:
             raise ValueError(f"it is larger than {LARGEST_JSON >> 20} MB")
-        return json.loads(content.decode())
+        value = json.loads(content.decode())
+        json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair is no text: nothing can print it
+        return value
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
@@ -288,7 +290,7 @@ def remove(path: Path) -> None:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes `content` as JSON, as `write` does; what is not finite becomes null."""
-    write(path, f"{json.dumps(_without_nan(content), indent=2, allow_nan=False)}\n".encode())
+    write(path, f"{json.dumps(_without_nan(content), indent=2, allow_nan=False, ensure_ascii=False)}\n".encode())
 
 
 def write(path: Path, content: bytes) -> None:
