@@ -150,8 +150,9 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     for path in checkpoints_to_resume(folder):
         try:
             with checked(path):
-                failed = _check_lines(path, lines)
-                manifest, arrays = _load(path, template)
+                manifest = read_manifest(path)
+                failed = _check_lines(path, manifest, lines)
+                arrays = _load(path, manifest, template)
             state = _place(arrays, template)
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
         except FolderError as error:
@@ -159,9 +160,8 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
 
 
-def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]:
+def _check_lines(path: Path, manifest: Mapping[str, Any], lines: Sequence[int]) -> dict[int, tuple[int, str]]:
     """The failed runs; raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
-    manifest = read_manifest(path)
     failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
     for lane, whole in enumerate(lines):
         if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
@@ -169,16 +169,12 @@ def _check_lines(path: Path, lines: Sequence[int]) -> dict[int, tuple[int, str]]
     return failed
 
 
-def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
-    manifest, present = read_manifest(path), {file.relative_to(path).as_posix() for file in _files(path)}
+def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.ndarray]:
+    present = {file.relative_to(path).as_posix() for file in _files(path)}
     for name, digest in manifest["files"].items():
         if name not in present:  # nor is a file of another folder read
             raise CheckpointError(f"{path} is damaged: {name} is missing")
-        try:
-            digest_now = _digest(path / name)
-        except OSError as error:
-            raise CheckpointError(f"{path} is damaged: {name} cannot be read ({error.strerror})") from error
-        if digest_now != digest:
+        if _digest(path / name) != digest:
             raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
     if manifest["epoch"] != epoch_of(path):
         raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
@@ -190,7 +186,7 @@ def _load(path: Path, template: Any) -> tuple[dict[str, Any], list[np.ndarray]]:
     shapes = _to_shapes(template)
     arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
     _check_devices(path, arrays, shapes)
-    return manifest, _fit(path, arrays, shapes)
+    return _fit(path, arrays, shapes)
 
 
 def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
