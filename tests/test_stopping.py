@@ -61,6 +61,21 @@ except BaseException as error:
     assert program(code)[:3] == (143, "", "stopped\n")
 
 
+def test_a_handler_in_c_of_a_library_is_replaced():
+    """As Ray's, which prints where each thread is and aborts."""
+    code = """
+import ctypes
+signals.take()
+libc = ctypes.CDLL(None)
+libc.signal.argtypes = [ctypes.c_int, ctypes.c_void_p]
+libc.signal(signal.SIGTERM, ctypes.cast(libc.abort, ctypes.c_void_p))
+time.sleep(0.4)
+send(signal.SIGTERM)
+time.sleep(60)
+"""
+    assert program(code)[:3] == (143, "", "stopped\n")
+
+
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_held_block_is_asked_once_by_signals_within_half_a_second(number):
     code = f"""

@@ -82,8 +82,9 @@ def run(cluster: Any, job: Job) -> list[str]:
         if not stopping and job.should_stop():
             stopping = True
             for one in running:
-                if one.chunk.id not in begun:
+                if one.chunk.id not in begun:  # it may be compiling: nothing is lost if nobody waits for it
                     cluster.cancel(one)
+            running = [one for one in running if one.chunk.id in begun]
     return lost
 
 

@@ -8,6 +8,7 @@ ends the process at once, unless a block is `held`, which ends in order.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import fcntl
 import math
 import os
@@ -24,6 +25,11 @@ SECONDS_OF_ONE = 0.5  # in which more signals are the same one: `timeout`, srun 
 SECONDS_TO_END = 7.0  # after a signal, for what follows the held blocks
 SECONDS_TO_CLEAN = 1.5
 STOPPING = "stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved"
+
+# The functions behind `signal.signal` work in any thread. They take and give the address of a handler in C.
+_GET, _SET = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
+_GET.restype = _SET.restype = ctypes.c_void_p
+_GET.argtypes, _SET.argtypes = [ctypes.c_int], [ctypes.c_int, ctypes.c_void_p]
 
 
 class Held:
@@ -45,17 +51,22 @@ class _Signals:
         self.lock = threading.RLock()
         self.pipe: tuple[int, ...] | None = None
         self.before: dict[int, Any] = {}  # the handlers that ours have replaced
+        self.ours: int | None = None  # address of Python's handler in C
         self.asked: int | None = None
         self.since = 0.0
         self.blocks = [Held(lambda text: None, "stopped", SECONDS_TO_END)]  # the first is what is not held
         self.cleaners: dict[object, Callable[[], object]] = {}
 
     def listen(self, read: int) -> None:
-        """Reads the pipe for as long as the process lives."""
+        """Reads the pipe for as long as the process lives. A library that takes a signal, as Ray does, has it for 0.1 s."""
         signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
         while True:
-            select.select([read], [], [], 0.5)
-            self.look()
+            select.select([read], [], [], 0.1)
+            with self.lock:
+                self.look()
+                for number in self.before:
+                    if _GET(number) != self.ours:
+                        _SET(number, self.ours)
 
     def look(self) -> None:
         """Answers the signals that have come."""
@@ -143,10 +154,12 @@ def take() -> None:
         os.register_at_fork(before=_signals.before_fork, after_in_parent=_signals.in_parent, after_in_child=_signals.in_child)
         threading.Thread(target=_signals.listen, args=[_signals.pipe[0]], name="signals", daemon=True).start()
     signal.set_wakeup_fd(_signals.pipe[1], warn_on_full_buffer=False)
-    for number in NUMBERS:
-        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
-            before = signal.signal(number, _wake)
-            _signals.before.setdefault(number, before or signal.SIG_DFL)
+    with _signals.lock:
+        for number in NUMBERS:
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                before = signal.signal(number, _wake)
+                _signals.before.setdefault(number, before or signal.SIG_DFL)
+        _signals.ours = _GET(signal.SIGINT)
 
 
 def take_back() -> None:
