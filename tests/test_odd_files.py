@@ -2,6 +2,7 @@
 
 import os
 
+import numpy as np
 import pytest
 from conftest import refuses
 from test_export import random_policy, save_run
@@ -9,6 +10,7 @@ from test_export import random_policy, save_run
 import mjx_dher
 from mjx_dher import cli
 from mjx_dher.config import Config, HParams
+from mjx_dher.policy import from_arrays
 from mjx_dher.runs.folder import results
 from mjx_dher.system.files import FolderError
 from mjx_dher.validation import validate
@@ -43,6 +45,26 @@ def test_a_pipe_in_the_place_of_a_result_is_not_waited_for(run):
     os.mkfifo(run / "result.json")
     with refuses("result.json", error=FolderError):
         results.read_result(run)
+
+
+def arrays_of(folder):
+    with np.load(folder / "policy.npz") as file:
+        return {name: file[name] for name in file.files}
+
+
+def test_a_policy_that_would_be_gigabytes_is_rejected_before_it_is_unpacked(run, monkeypatch):
+    np.savez_compressed(run / "policy.npz", **arrays_of(run), layer9_kernel=np.zeros((1000, 3000), np.float32))
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *args, **kwargs: pytest.fail("unpacked"))
+    with refuses("policy.npz", error=FolderError):
+        mjx_dher.load_policy(run)
+
+
+@pytest.mark.parametrize("name", ["layer0_kernel", "layer0_bias", "layer1_kernel"])
+def test_weights_that_make_an_action_nan_are_rejected(run, name):
+    arrays = arrays_of(run)
+    from_arrays(arrays)
+    with refuses("NaN"):
+        from_arrays({**arrays, name: np.full_like(arrays[name], 3e38)})
 
 
 def test_batches_that_no_device_can_index_are_refused():

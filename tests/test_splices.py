@@ -10,16 +10,17 @@ import sys
 import jax
 import numpy as np
 import pytest
+import sweep_helpers
 from configs import SHORT, flags
 from conftest import EXAMPLES, ROOT, names, refuses
-from sweep_helpers import compile_once  # noqa: F401
+from sweep_helpers import compile_once, cut_short, make_grid  # noqa: F401
+from sweep_helpers import run as run_sweep
 from test_identity import SPEC, edit, resume, train
 
 import mjx_dher
 from mjx_dher import Options, cli
 from mjx_dher.cli import sweep
 from mjx_dher.cli import train as train_module
-from mjx_dher.policy import from_arrays
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system.files import FolderError
@@ -202,6 +203,19 @@ def test_the_folder_of_a_trial_with_another_run_in_it_is_not_that_trial(made, tm
     assert results.is_done(folder, SPEC)
 
 
+@pytest.mark.slow
+def test_a_sweep_starts_runs_over_whose_metrics_are_of_another(tmp_path):
+    trials = make_grid(("future",), (0, 1), static=sweep_helpers.LONGER)
+    cut_short(tmp_path, trials, 2, lanes=2)
+    one, other = (grid.folder_of(tmp_path, trial) for trial in trials)
+    shutil.copy(other / "metrics.csv", one / "metrics.csv")
+    told = []
+    run_sweep(tmp_path, trials, lanes=2, report=told.append)
+    digest = run_folder.read_config(other)["digest"]
+    assert any("metrics.csv" in line and digest in line for line in told)
+    assert [grid.is_done(tmp_path, trial) for trial in trials] == [True, True]
+
+
 def test_other_versions_than_the_run_began_with_are_reported(stopped, monkeypatch, capsys):
     content = run_folder.read_config(stopped)
     edit(stopped, ("versions", "jax"), "0.0.1")
@@ -307,31 +321,6 @@ def test_settings_that_no_component_reads_are_ignored_with_a_line(capsys):
     plain = sweep.parse_sweep_args(sweeps)[1]
     assert sweep.parse_sweep_args([*sweeps, "--renewals", "5", "--sweep.temperature", "2", "3"], told.append)[1] == plain
     names(told[1], "renewals", "temperature")
-
-
-# Policies
-
-
-def arrays_of(folder):
-    with np.load(folder / "policy.npz") as file:
-        return {name: file[name] for name in file.files}
-
-
-def test_a_policy_that_would_be_gigabytes_is_rejected_before_it_is_unpacked(stopped, monkeypatch):
-    arrays = arrays_of(stopped)
-    bomb = {**arrays, "layer9_kernel": np.zeros((1000, 3000), np.float32)}
-    np.savez_compressed(stopped / "policy.npz", **bomb)
-    monkeypatch.setattr(np.lib.format, "read_array", lambda *args, **kwargs: pytest.fail("unpacked"))
-    with refuses("policy.npz", error=FolderError):
-        mjx_dher.load_policy(stopped)
-
-
-@pytest.mark.parametrize("name", ["layer0_kernel", "layer0_bias", "layer1_kernel"])
-def test_weights_that_make_an_action_nan_are_rejected(made, name):
-    arrays = arrays_of(made / "mine" / "whole")
-    from_arrays(arrays)
-    with refuses("layer1" if name == "layer1_kernel" else "NaN"):
-        from_arrays({**arrays, name: np.full_like(arrays[name], 3e38)})
 
 
 # Output
