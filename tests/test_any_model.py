@@ -15,6 +15,7 @@ from mjx_dher import cli
 from mjx_dher.envs import Simulator
 from mjx_dher.envs.engines import graph, make_engine, pairs
 from mjx_dher.envs.engines import mjx as mjx_engine
+from mjx_dher.envs.engines.fused import simulation
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -74,7 +75,7 @@ def test_contacts_without_memory_are_reported_by_the_graph():
     engine.check()  # told once
 
 
-def test_the_path_of_warp_and_its_memory_follow_from_the_model():
+def test_the_path_of_warp_and_its_memory_follow_from_the_model(monkeypatch):
     model = mujoco.MjModel.from_xml_string(MODELS["two mocap bodies"])
     engine = make_engine("warp", model, SUBSTEPS, allow_cpu=True)
     assert engine.path == "graph"
@@ -83,6 +84,10 @@ def test_the_path_of_warp_and_its_memory_follow_from_the_model():
         make_engine("warp", model, SUBSTEPS, path="grahp", allow_cpu=True)
     with refuses("fused", "equality"):
         make_engine("warp", model, SUBSTEPS, path="fused", allow_cpu=True)
+    monkeypatch.setattr(simulation, "shared_memory", lambda: 1000)
+    small = make_engine("warp", mujoco.MjModel.from_xml_string(arm()), SUBSTEPS, allow_cpu=True)
+    assert small.path == "graph"
+    names(small.note, "1,000", "bytes")
     # The cube's four corners on the floor; 4 of 4 rows, 12 joints' friction and 5 limits with two sides.
     assert pairs.most(mujoco.MjModel.from_xml_string(arm())) == (4, 4 * 4 + 12 + 2 * 5)
     crowd = "".join(BODY.format(i, f"b{i}") for i in range(8))

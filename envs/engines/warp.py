@@ -71,7 +71,7 @@ class WarpEngine:
             if count is not None:
                 check_count(name, count)
         self._model, self._substeps = copy.copy(model), substeps
-        self.path, self.note = _choose(model, path)
+        self.path, self.note = _choose(model, path, constraints)
         if self.path == "graph":
             most = graph.memory_for(model)
             defaults = (model.opt.iterations, model.opt.ls_iterations)
@@ -186,20 +186,28 @@ class WarpEngine:
         return made
 
 
-def _choose(model: mujoco.MjModel, path: str) -> tuple[str, str]:
+def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[str, str]:
     """Returns the path that runs, and why.
 
     Raises:
       ValueError: it does not support the model.
     """
-    left_out = support.unsupported(model)
-    if path == "fused" and left_out:
-        raise ValueError(f"engine warp: the fused kernel does not support features of the model: {', '.join(left_out)}")
-    if path == "fused" or (path == "auto" and not left_out):
-        return "fused", "the fused kernel"
+    left_out, reason = support.unsupported(model), "as asked"
+    if left_out and path != "graph":
+        reason = f"the fused kernel does not support features of the model: {', '.join(left_out)}"
+        if path == "fused":
+            raise ValueError(f"engine warp: {reason}")
+    if path != "graph" and not left_out:
+        try:
+            simulation.check_fits(model, constraints or simulation.most_rows(model))
+            return "fused", "the fused kernel"
+        except ValueError as error:
+            if path == "fused":
+                raise
+            reason = str(error)
     if unknown := graph.unsupported(model):
         raise ValueError(f"engine warp does not support features of the model: {', '.join(unknown)}; use engine native")
-    return "graph", f"MuJoCo Warp; the fused kernel leaves out {', '.join(left_out)}" if left_out else "MuJoCo Warp, as asked"
+    return "graph", f"MuJoCo Warp; {reason}"
 
 
 def _check_gpu() -> None:

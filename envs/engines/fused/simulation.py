@@ -63,6 +63,18 @@ class Simulation:
         return lost
 
 
+def shared_memory() -> int | None:
+    """Bytes of shared memory of a block on the first GPU; None without a GPU."""
+    return wp.get_device("cuda:0").max_shared_memory_per_block if wp.is_cuda_available() else None
+
+
+def check_fits(model: mujoco.MjModel, rows: int) -> None:
+    """Raises ValueError if the GPU's shared memory does not suffice for an environment with `rows` rows of constraints."""
+    if (shared := shared_memory()) is not None:
+        contacts, dofs = setup.contacts_of(model), setup.dofs_of(model)
+        most_warps(setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs).size, shared)
+
+
 def most_warps(size: int, shared: int) -> int:
     """Number of warps of a block, if an environment takes `size` floats and a block has `shared` bytes.
 

@@ -111,6 +111,7 @@ def _is_plain_weld(model: mujoco.MjModel, index: int) -> bool:
 
 def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
     pairs = all_pairs(model)
+    geoms: dict[str, dict[int, None]] = {}
     for *ends, dim in zip(pairs.geom1, pairs.geom2, pairs.dim):
         kind, what = setup.pair_types(model, *ends), None
         if kind not in setup.CONTACT_KINDS:
@@ -120,4 +121,6 @@ def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
         elif dim > 4:
             what = "contacts with rolling friction"
         if what:
-            yield with_names(what, model, "geom", ends)
+            geoms.setdefault(what, {}).update(dict.fromkeys(ends))
+    for what, these in geoms.items():
+        yield with_names(what, model, "geom", these)
