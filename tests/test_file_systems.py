@@ -147,7 +147,7 @@ def is_in_the_locale_s_encoding(call):
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
     texts = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]
     given = {keyword.arg for keyword in call.keywords}
-    other = getattr(getattr(call.func, "value", None), "id", "") in ("os", "webbrowser")
+    other = getattr(getattr(call.func, "value", None), "id", "") in ("os", "webbrowser", "archive")  # they open no text
     return name in TEXT and "encoding" not in given and not other and not any("b" in str(text) for text in texts[-1:])
 
 
