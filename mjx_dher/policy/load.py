@@ -49,10 +49,10 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
             raise FolderError(f"{path} is of a run with other settings: {other}")
         if not {"env_spec", "sizes"} & arrays.keys():
             return from_arrays(arrays)
-    if use:
-        raise ValueError(f"{use} needs a policy of NumPy arrays; {path} is of a custom learner or custom networks")
     if spec is None:
         raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
+    if use:
+        raise ValueError(f"{use} needs a policy of NumPy arrays; {spec.learner!r} with networks {spec.networks!r} has none")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
 
     with run_folder.checked(path, "cannot be played"):
