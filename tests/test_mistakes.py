@@ -144,7 +144,7 @@ THROUGH = [
     ("sampler", "nan_late", []),
     ("sampler", "two_arguments", []),
     ("metric", "without_axis", ["--sampler", "closest"]),
-    ("metric", "similarity", []),  # no sampler reads it, but it was handed in
+    ("metric", "similarity", ["--sampler", "closest"]),
     ("weight_kernel", "pole", ["--sampler", "weighted"]),
     ("weight_normalization", "by_least", ["--sampler", "weighted"]),
     ("priority", "negative", []),

@@ -201,9 +201,9 @@ def test_counters_are_told():
 def test_commands_run_in_order_and_later_ones_wait():
     commands, done = panel.Commands(), []
     assert not commands.run()
-    commands.put(lambda: done.append(1))
-    commands.put(lambda: commands.put(lambda: done.append(3)))
-    commands.put(lambda: done.append(2))
+    commands.put("first", lambda: done.append(1))
+    commands.put("next", lambda: commands.put("first", lambda: done.append(3)))
+    commands.put("last", lambda: done.append(2))
     assert commands.run()
     assert done == [1, 2]
     assert commands.run()
