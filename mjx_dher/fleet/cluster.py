@@ -75,12 +75,13 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
+    started: list[int] = []  # Ray's node: its workers outlive it by seconds
     with contextlib.ExitStack() as stack:
         if address == LOCAL:
             parent = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
             parent = parent if len(parent) < LONG_PATH else "/tmp"
             private = stack.enter_context(files.temporary_folder("ray-", parent))
-            stack.enter_context(signals.cleaning(subprocesses.kill_sessions))
+            stack.enter_context(signals.cleaning(lambda: subprocesses.kill_sessions(started)))
             place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}
             # Ray then listens on 127.0.0.1 alone, and only processes with this token can call it.
@@ -96,6 +97,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
         except Exception as error:  # Ray raises errors of many kinds
             raise ValueError(f"ray: the cluster at {address} cannot be joined ({_first_line(error)})") from error
+        started.extend(subprocesses.leaders() if address == LOCAL else ())
         signals.take_back()
         yield Cluster()
 

@@ -98,6 +98,7 @@ class _Signals:
         limit.start()
         with contextlib.suppress(OSError):
             os.write(2, f"{self.blocks[-1].told}\n".encode())
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # other threads go on until the end, without what is cleaned away
             if os.isatty(1):
                 os.write(1, b"\x1b[?25h")  # a progress bar hides the cursor
         for clean in (sys.stdout.flush, *reversed(list(self.cleaners.values())), _kill_children):

@@ -53,13 +53,20 @@ def kill(process: subprocess.Popen[Any]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def kill_sessions() -> None:
-    """Kills the processes, of whatever parent, in sessions that programs of this one lead. Needs Linux."""
+def leaders() -> list[int]:
+    """Programs that this one has started, in sessions of their own. Needs Linux."""
     with contextlib.suppress(OSError):
-        leaders = [pid for pid in signals.children() if os.getsid(pid) == pid]  # they first: they start the others
-        for pid in (*leaders, *(int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())):
+        return [pid for pid in signals.children() if os.getsid(pid) == pid]
+    return []
+
+
+def kill_sessions(more: Sequence[int] = ()) -> None:
+    """Kills the processes, of any parent, in the sessions of `leaders` and of those given, which may have ended."""
+    first = [*leaders(), *more]  # they start the others
+    with contextlib.suppress(OSError):
+        for pid in (*first, *(int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())):
             with contextlib.suppress(OSError):  # it has just ended
-                if os.getsid(pid) in leaders:
+                if os.getsid(pid) in first:
                     os.kill(pid, signal.SIGKILL)
 
 
