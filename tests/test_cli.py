@@ -319,8 +319,8 @@ def test_an_unwritable_out_is_refused(tmp_path, capsys):
     [
         (["sweep", "--out", "/proc/x", "--seeds", "1"], "/proc/x"),
         (["sweep", "--out", "/dev/null/x", "--seeds", "1"], "/dev/null/x"),
-        (["--env", "json:dumps"], "env 'json:dumps'"),
-        (["--sampler", "json:nonsense"], "sampler 'json:nonsense': module json has no 'nonsense'"),
+        (["--env", "json:dumps"], "env must be a component; 'json:dumps'"),
+        (["--sampler", "docs.examples.point_mass:nonsense"], "has no 'nonsense'"),
         (["--metric", "json:JSONDecoder"], "metric"),
         (["--networks", "json:dumps"], "networks"),
         (["--learner", "json:dumps"], "learner"),

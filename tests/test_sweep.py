@@ -306,7 +306,7 @@ def test_what_is_no_sweep_is_named(tmp_path):
             "5 epochs",
         ),
         ("config.json", json.dumps({"schema": 0}), "schema"),
-        ("result.json", "{", "damaged"),
+        ("result.json", "{", "line 1 column 2"),
     ):
         (cell / name).write_text(content)
         with refuses(name, part, error=FolderError):
