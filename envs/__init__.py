@@ -30,7 +30,8 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
       name: one of `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
       engine: "native" (MuJoCo C on the host's cores), "warp" (a kernel for NVIDIA GPUs), "jax" (MJX) or "auto" (native on
         a CPU, warp on an NVIDIA GPU, else jax). It is passed on if the constructor has this argument.
-      **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`.
+      **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`, and of wrappers:
+        `action_filter`, `action_delay`, `obs_noise` and `frame_stack` (`envs.wrappers`).
 
     Raises:
       ValueError: there is no such environment, module, attribute or engine (the message names the nearest), an argument is out
@@ -38,6 +39,8 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
     """
     constructor = load("env", name)
     _check_kind(name, constructor)
+    own = inspect.signature(constructor).parameters  # an argument of the same name is the constructor's
+    wrapped = {key: overrides.pop(key) for key in _WRAPPERS if key in overrides and key not in own}
     if _takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
@@ -51,6 +54,8 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
         kind = "" if isinstance(error, TypeError) else f"{type(error).__name__}: "
         raise ValueError(f"env {name!r} cannot be made: {kind}{error}") from error
     _check_members(name, env, ("action_size", "episode_length", *_METHODS))
+    for key, value in wrapped.items():
+        env = getattr(importlib.import_module("mjx_dher.envs.wrappers"), _WRAPPERS[key])(env, value)
     return env
 
 
@@ -80,10 +85,17 @@ def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict
 
         named += [key for key in engine_options(overrides["engine"]) if key not in named]
     for key in overrides:
-        check_name(f"argument of env {name}", key, named)
+        check_name(f"argument of env {name}", key, [*named, *_WRAPPERS])
 
 
 _METHODS = ("reset", "step", "compute_reward")  # of types.Env
+# Wrappers by argument, the innermost first.
+_WRAPPERS = {
+    "action_filter": "ActionFilter",
+    "action_delay": "ActionDelay",
+    "obs_noise": "ObservationNoise",
+    "frame_stack": "FrameStack",
+}
 
 
 def takes_engine(name: str) -> bool:

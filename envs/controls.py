@@ -52,6 +52,10 @@ class Control:
         """Returns `controls` with the inputs for `action` [size]."""
         raise NotImplementedError
 
+    def rest(self, ctrl: np.ndarray) -> np.ndarray:
+        """The action [size] that keeps the start, whose inputs are `ctrl` [nu]."""
+        return np.zeros(self.size, np.float32)
+
 
 class Actuators(Control):
     """Actuators of any kind: -1 and 1 are the ends of the actuator's ctrlrange.
@@ -81,6 +85,11 @@ class Actuators(Control):
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
         ctrl = 0.5 * (self.high + self.low) + 0.5 * (self.high - self.low) * action
         return dataclasses.replace(controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(ctrl))
+
+    def rest(self, ctrl: np.ndarray) -> np.ndarray:
+        middle, half = 0.5 * (self.high + self.low), np.maximum(0.5 * (self.high - self.low), 1e-12)
+        action = np.clip((ctrl[self.indices] - middle) / half, -1.0, 1.0).astype(np.float32)
+        return action.mean(keepdims=True) if self.together else action
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
         return True
@@ -118,6 +127,9 @@ class JointDelta(JointPosition):
         return dataclasses.replace(
             controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(jnp.clip(target, self.low, self.high))
         )
+
+    def rest(self, ctrl: np.ndarray) -> np.ndarray:
+        return Control.rest(self, ctrl)
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
         return is_servo(model, index) and _joint(model, index) >= 0

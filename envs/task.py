@@ -105,6 +105,7 @@ class MujocoTask(GoalEnv):
         self.goal_distance: DistanceFn = self.goal.distance
         self.start = _checked("start", self.start, Start).bind(self.model)
         self._rest, self._hold = self.start.physics, self.start.hold
+        self.rest_action = np.concatenate([part.rest(np.asarray(self._hold.ctrl)) for part in self.parts])  # keeps the start
         self._object = next((each for each in self.start.drawn if len(each.low) == 3), None)
         texts = (self.observations,) if isinstance(self.observations, str) else tuple(self.observations)
         if not texts or len(set(texts)) < len(texts):

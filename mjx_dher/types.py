@@ -154,6 +154,7 @@ class Env(Protocol):
       reached(achieved_goal, desired_goal): whether the goal is reached, bool [...]. Default: the reward is at its maximum.
       goal_distance(achieved_goal, desired_goal): distance [...] for metrics, `weighted` and logs. Default: Euclidean.
       dt: seconds that a step takes, for videos, the viewer, gymnasium and `energy`. Default: 0.04.
+      rest_action: action [A] that keeps the start, which delays and filters of actions begin with. Default: 0.
       with_goal(state, goal): a first state with another desired goal [G]; goal generators need it.
       check(): called on the host after each epoch; raises ValueError if steps were silently wrong.
     """

@@ -66,8 +66,14 @@ def _fresh(spec: RunSpec) -> Path:
 
 
 def engine_name(env: Any) -> str:
-    """Name of the physics of an environment: of its `engine`, or of another attribute that is one; "none" without any."""
-    values = [getattr(env, "engine", None), *getattr(env, "__dict__", {}).values()]
+    """Name of the physics of an environment: of its `engine`, or of another attribute that is one; "none" without any.
+
+    A wrapper has the environment within in its attribute `env`.
+    """
+    own = getattr(env, "__dict__", {})
+    if getattr(env, "engine", None) is None and "env" in own:
+        return engine_name(own["env"])
+    values = [getattr(env, "engine", None), *own.values()]
     return next((value.name for value in values if hasattr(value, "advance") and hasattr(value, "name")), "none")
 
 

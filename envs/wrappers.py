@@ -1,0 +1,211 @@
+"""Wrappers for any environment: observation noise, action delay, action filter and frame stack. They compose.
+
+A wrapper is an environment itself. It has the members of the environment within, and its states have the fields of the states
+within. With the same key, both start the same episode.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mjx_dher.contract import check_env_parts, env_spec
+from mjx_dher.types import Array, EnvSpec, GoalObs, PRNGKey, PyTree
+from mjx_dher.validation import check_number
+
+__all__ = ["ActionDelay", "ActionFilter", "FrameStack", "ObservationNoise", "Wrapper", "WrapperState"]
+
+_KEY = 0x57524150  # the own key of the innermost wrapper is `fold_in(key, _KEY)`; the next one takes the next number
+
+
+@struct.dataclass
+class WrapperState:
+    """State of a wrapped environment. Other fields, such as `reward` and `physics`, are those of `inner`."""
+
+    inner: PyTree  # the state within
+    obs: GoalObs
+    memory: PyTree  # the wrapper's own
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "inner":  # while a copy is made, `inner` is missing
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+
+class Wrapper:
+    """Base class: passes actions and observations on as they are. Goals, rewards and success stay those within."""
+
+    def __init__(self, env: Any):
+        check_env_parts(env)
+        self.env = env
+        self._number: int = env._number + 1 if isinstance(env, Wrapper) else _KEY
+        self._rest = np.asarray(getattr(env, "rest_action", np.zeros(env.action_size)), np.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "env":
+            raise AttributeError(name)
+        own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
+        return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
+
+    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+        """Memory and observation after a reset that gave `observation`."""
+        return (), observation
+
+    def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
+        """Memory, and the action [A] that is applied in place of `action`."""
+        return memory, action
+
+    def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+        """Memory, and what is observed in place of `observation`."""
+        return memory, observation
+
+    def reset(self, key: PRNGKey) -> WrapperState:
+        """Returns an initial state; `key` draws the start as it does without the wrapper."""
+        inner = self.env.reset(key)
+        memory, observation = self.begin(jax.random.fold_in(key, self._number), inner.obs["observation"])
+        return WrapperState(inner, _observed(inner, observation), memory)
+
+    def step(self, state: WrapperState, action: Array) -> WrapperState:
+        """Returns the state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
+        if jnp.shape(action) != (self.env.action_size,):
+            raise ValueError(f"action must be [{self.env.action_size}]; got shape {list(jnp.shape(action))}")
+        memory, action = self.act(state.memory, jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0))
+        return self._seen(self.env.step(state.inner, action), memory)
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """Rewards [...] of goals [..., G], those of the environment within."""
+        return self.env.compute_reward(achieved_goal, desired_goal)
+
+    def _seen(self, inner: Any, memory: PyTree) -> WrapperState:
+        memory, observation = self.see(memory, inner.obs["observation"])
+        return WrapperState(inner, _observed(inner, observation), memory)
+
+    def _with_goal(self, state: WrapperState, goal: Array) -> WrapperState:
+        inner = self.env.with_goal(state.inner, goal)
+        return WrapperState(inner, _observed(inner, state.obs["observation"]), state.memory)
+
+    def _with_object(self, state: WrapperState, position: Array) -> WrapperState:
+        return self._seen(self.env.with_object(state.inner, position), state.memory)
+
+
+def _observed(inner: Any, observation: PyTree) -> GoalObs:
+    """The goals of a state within, with another observation."""
+    obs: Any = {**inner.obs, "observation": observation}
+    return obs
+
+
+class ObservationNoise(Wrapper):
+    """Adds normal noise to the observation, drawn at each step. The achieved goal and rewards have none.
+
+    Args:
+      obs_noise: standard deviation in [0, 1000]; a number, or [D] for an observation that is a vector.
+    """
+
+    def __init__(self, env: Any, obs_noise: Any):
+        super().__init__(env)
+        for value in np.ravel(obs_noise).tolist():
+            check_number("obs_noise", value, "[0, 1000]", float)
+        self._std = np.asarray(obs_noise, np.float32)
+        spec = env_spec(env)
+        if self._std.ndim and self._std.shape != (spec.observation_size,):
+            raise ValueError(f"obs_noise must be a number or [{spec.observation_size}]; got shape {list(self._std.shape)}")
+        if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(spec.observation)):
+            raise ValueError(f"obs_noise takes observations of floats; they are {spec.observation}")
+
+    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+        return self.see(key, observation)
+
+    def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+        following, key = jax.random.split(memory)
+        leaves, structure = jax.tree.flatten(observation)
+        keys = jax.random.split(key, len(leaves))
+        drawn = [x + self._std * jax.random.normal(own, x.shape, x.dtype) for own, x in zip(keys, leaves)]
+        return following, jax.tree.unflatten(structure, drawn)
+
+
+class ActionDelay(Wrapper):
+    """Applies actions some steps late. Until the first one arrives, the environment's `rest_action` is, or 0.
+
+    Args:
+      action_delay: steps, at most 1000; (low, high) or the text "low-high" for a number that each reset draws.
+    """
+
+    def __init__(self, env: Any, action_delay: int | tuple[int, int] | str):
+        super().__init__(env)
+        between = re.fullmatch(r"(\d{1,4})-(\d{1,4})", action_delay) if isinstance(action_delay, str) else None
+        given: Any = tuple(map(int, between.groups())) if between else action_delay
+        self._least, self._most = given if isinstance(given, tuple) and len(given) == 2 else (given, given)
+        check_number("action_delay", self._least, "[0, 1000]")
+        check_number("action_delay", self._most, f"[{self._least}, 1000]")
+
+    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+        steps = jax.random.randint(key, (), self._least, self._most + 1, jnp.int32)
+        return (steps, jnp.tile(self._rest, (self._most, 1))), observation
+
+    def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
+        steps, earlier = memory  # earlier actions, the latest first
+        actions = jnp.concatenate([action[None], earlier])
+        return (steps, actions[: self._most]), actions[steps]
+
+
+class ActionFilter(Wrapper):
+    """Applies y_t = c y_(t-1) + (1 - c) a_t in place of the action a_t. At first, y is `rest_action`, or 0.
+
+    Args:
+      action_filter: c in [0, 1): 0 filters nothing, and 0.9 much.
+    """
+
+    def __init__(self, env: Any, action_filter: float):
+        super().__init__(env)
+        check_number("action_filter", action_filter, "[0, 1)", float)
+        self._kept = float(action_filter)
+
+    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+        return jnp.asarray(self._rest), observation
+
+    def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
+        filtered = self._kept * memory + (1.0 - self._kept) * action
+        return filtered, filtered
+
+
+class FrameStack(Wrapper):
+    """Observes the last n observations, joined along their last axis, the latest first. A reset repeats the first one.
+
+    Args:
+      frame_stack: n in [1, 100].
+    """
+
+    def __init__(self, env: Any, frame_stack: int):
+        super().__init__(env)
+        check_number("frame_stack", frame_stack, "[1, 100]")
+        self._frames = frame_stack
+        if not all(leaf.shape for leaf in jax.tree.leaves(env_spec(env).observation)):
+            raise ValueError(f"frame_stack takes observations of vectors; they are {env_spec(env).observation}")
+
+    @property
+    def observation_size(self) -> int:
+        """Size of n observations."""
+        return self._frames * self.env.observation_size
+
+    @property
+    def spec(self) -> EnvSpec:
+        """The contract of the environment within, with larger observations."""
+        joined = jax.eval_shape(self._join, (self.env.spec.observation,) * self._frames)
+        return dataclasses.replace(self.env.spec, observation=joined)
+
+    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+        return self.see((observation,) * self._frames, observation)
+
+    def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+        frames = (observation, *memory[:-1])
+        return frames, self._join(frames)
+
+    @staticmethod
+    def _join(frames: tuple[PyTree, ...]) -> PyTree:
+        return jax.tree.map(lambda *each: jnp.concatenate(each, axis=-1), *frames)
