@@ -56,6 +56,14 @@ class Control:
         """The action [size] that keeps the start, whose inputs are `ctrl` [nu]."""
         return np.zeros(self.size, np.float32)
 
+    def describe(self) -> dict[str, Any]:
+        """Kind, names of what it moves, and scale and limits, as JSON."""
+        about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved)}
+        for name in ("scale", "turn", "low", "high"):
+            if name in vars(self):
+                about[name] = np.round(np.asarray(vars(self)[name], float), 6).tolist()
+        return about
+
 
 class Actuators(Control):
     """Actuators of any kind: -1 and 1 are the ends of the actuator's ctrlrange.

@@ -104,6 +104,10 @@ class FetchEnv(MujocoTask):
         self._rest: Any = Physics(qpos, qvel, warmstart=np.zeros_like(qvel), act=np.zeros(0, np.float32))  # type: ignore[arg-type]
 
     @property
+    def robot_interface(self) -> dict[str, Any]:
+        return {}
+
+    @property
     def spec(self) -> EnvSpec:
         return dataclasses.replace(super().spec, reward_range=(-1.0, 0.0))
 

@@ -127,6 +127,12 @@ class MujocoTask(GoalEnv):
         return EnvSpec(observation, self.goal_size, self.action_size, self.episode_length, reward_range=(lowest, 0.0))
 
     @property
+    def robot_interface(self) -> dict[str, Any]:
+        """Controls and observation layout as JSON, for exported policies."""
+        layout = {name: [part.start, part.stop] for name, part in self.layout.items()}
+        return {"controls": [part.describe() for part in self.parts], "layout": layout}
+
+    @property
     def goal_bounds(self) -> np.ndarray | None:
         """Lowest and highest coordinates [2, 3] of goals, m, if they are positions."""
         return None if self.goal.low is None or self.goal.place is None else np.stack([self.goal.low, self.goal.high])

@@ -86,6 +86,11 @@ def step_seconds(env: Any) -> float:
     return float(dt)
 
 
+def robot_interface(env: Any) -> dict[str, Any]:
+    """Seconds of a step, and a task's controls and observation layout, as JSON."""
+    return {"dt": round(step_seconds(env), 9), **getattr(env, "robot_interface", {})}
+
+
 def check_first(state: Any, leading: tuple[int, ...]) -> None:
     """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
     for name in ("obs", "reward", "success"):

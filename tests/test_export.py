@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import re
 import subprocess
 import sys
@@ -12,7 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 
 import mjx_dher
-from mjx_dher import RunSpec, cli
+from mjx_dher import RunSpec, cli, contract, envs
 from mjx_dher.policy import Policy
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.tools import export
@@ -113,6 +114,7 @@ ABOUT = {
     "format_version": "1",
     "mjx_dher": mjx_dher.__version__,
     "env": "slide",
+    "env_kwargs": "",
     "sampler": "weighted",
     "seed": "3",
     "observation_size": "7",
@@ -139,6 +141,23 @@ def test_an_onnx_file_says_what_it_is(run):
 
     assert ends(model.graph.input) == {"observation": ["N", D], "desired_goal": ["N", G]}
     assert ends(model.graph.output) == {"action": ["N", A]}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_file_carries_what_a_robot_needs(name, tmp_path):
+    """Rate, controls and layout of the task that a run was trained on, and its arguments."""
+    env = envs.make("my_arm:Reach", engine="native", obs_noise=0.01)
+    started = RunSpec(env="my_arm:Reach", env_kwargs=("obs_noise=0.01",))
+    path, out = tmp_path / "run", tmp_path / f"policy.{name}"
+    run_folder.write_config(path, started, "native", {"interface": contract.robot_interface(env)})
+    save_policy(path, random_policy())
+    assert cli.main(["export", str(path), "--format", name, "--out", str(out)]) == 0
+    about = export.FORMATS[name][1](out).about
+    (control,) = json.loads(about["controls"])
+    assert (about["dt"], about["env_kwargs"]) == ("0.04", "obs_noise=0.01")
+    assert (control["kind"], control["scale"], control["moves"]) == ("JointDelta", 0.15, [f"j{i}" for i in range(1, 7)])
+    assert len(control["low"]) == len(control["high"]) == 6
+    assert json.loads(about["layout"])["vel:tip"] == [3, 6]
 
 
 def test_a_safetensors_file_holds_the_policy_to_the_bit(run):

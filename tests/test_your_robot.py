@@ -1,5 +1,6 @@
 """docs/your_robot.md and its arm, docs/examples/my_arm.py: from an MJCF to ONNX, on every engine."""
 
+import json
 import re
 
 import jax
@@ -38,6 +39,7 @@ def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
             assert cli.main(command) == 0, line
     assert float(re.findall(r"^success ([\d.]+)", capsys.readouterr().out, re.M)[0]) >= 0.9
     assert (tmp_path / "arm.onnx").stat().st_size > 10_000
+    assert json.loads((tmp_path / "runs/arm/config.json").read_text())["interface"]["dt"] == 0.04
     (robot,) = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "def targets" in block]
     names = {"Reach": my_arm.Reach}
     exec(compile(robot, "your_robot.md", "exec"), names)

@@ -41,12 +41,12 @@ def export_command(argv: list[str], console: Console) -> int:
     args = parse(ExportArgs, argv)
     lookup.check_name("format", args.format, export.FORMATS)
     folder = find_run(args.run, console)
-    run = run_folder.read_spec(folder)
+    content, run = run_folder.read_run(folder)
     beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside
     export.check(args.format, out, args.overwrite)
     policy = load_plain(folder, "export")
-    difference = export.write(policy, run, args.format, out)
+    difference = export.write(policy, run, args.format, out, content.get("interface", {}))
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(
         f"{run.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"

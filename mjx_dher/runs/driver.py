@@ -18,6 +18,7 @@ import numpy as np
 from mjx_dher import config as config_lib
 from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
+from mjx_dher.contract import robot_interface
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
@@ -243,7 +244,7 @@ def _open(
     digest = fingerprint.digest(run)
     earlier = results.earlier_digests(folder, digest) if ended else []
     placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
-    extra = {**dataclasses.asdict(session.options), **placed}
+    extra = {**dataclasses.asdict(session.options), **placed, "interface": robot_interface(session.env)}
     run_folder.write_config(folder, spec, run["physics"], extra, earlier, resumes=ended > 0)
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
     own = session.make_sinks(spec, folder)

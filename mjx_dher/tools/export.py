@@ -5,8 +5,10 @@ docs/policies.md describes both files. Neither writing nor reading them needs JA
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,14 +43,15 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
     lookup.require_extra(f"format {file_format}", file_format, "export")
 
 
-def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
-    """Returns the metadata of an exported file."""
+def metadata(policy: Policy, run: RunSpec, interface: Mapping[str, Any] = MappingProxyType({})) -> dict[str, str]:
+    """Returns the metadata of an exported file. `interface` is the run's `contract.robot_interface`, as JSON."""
     observation_size, goal_size, action_size = sizes(policy)
     content = {
         "format": "mjx-dher policy",
         "format_version": FORMAT_VERSION,
         "mjx_dher": __version__,
         "env": run.env,
+        "env_kwargs": " ".join(run.env_kwargs),
         "sampler": run.sampler,
         "seed": run.seed,
         "observation_size": observation_size,
@@ -58,7 +61,8 @@ def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
         "norm_clip": policy.norm_clip,
         "obs_clip": policy.obs_clip,
     }
-    return {name: str(value) for name, value in content.items()}
+    about = {name: json.dumps(interface[name]) for name in ("dt", "controls", "layout") if name in interface}
+    return {**about, **{name: str(value) for name, value in content.items()}}
 
 
 def sizes(policy: Policy) -> tuple[int, int, int]:
@@ -66,7 +70,9 @@ def sizes(policy: Policy) -> tuple[int, int, int]:
     return len(policy.observation_mean), len(policy.goal_mean), len(policy.layers[-1][1])
 
 
-def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
+def write(
+    policy: Policy, run: RunSpec, file_format: str, out: Path, interface: Mapping[str, Any] = MappingProxyType({})
+) -> float:
     """Writes the policy to `out`, reads it back, and compares. Unless it passes, an existing file stays as it was.
 
     Args:
@@ -74,6 +80,7 @@ def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
       run: settings of the run, for the metadata.
       file_format: one of FORMATS.
       out: path of the file; see `check`.
+      interface: of the run, for the metadata.
 
     Returns:
       The largest difference between the actions of the file and of the policy, over CHECKED observations.
@@ -82,7 +89,7 @@ def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
       ValueError: `out` cannot be written, or the file read back differs from the policy.
     """
     to_bytes, read = FORMATS[file_format]
-    about = metadata(policy, run)
+    about = metadata(policy, run, interface)
     try:
         with files.atomic_write(out) as partial:
             partial.write_bytes(to_bytes(policy, about))
