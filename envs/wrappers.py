@@ -45,11 +45,13 @@ class Wrapper:
         check_env_parts(env)
         self.env = env
         self._number: int = env._number + 1 if isinstance(env, Wrapper) else _KEY
-        self._rest = np.asarray(getattr(env, "rest_action", np.zeros(env.action_size)), np.float32)
+        self._rest = np.broadcast_to(np.asarray(getattr(env, "rest_action", 0.0), np.float32), (env.action_size,))
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "env":
             raise AttributeError(name)
+        if name in ("init_state", "first_state"):  # they draw nothing, so the wrapper's own part would be missing
+            raise AttributeError(f"a wrapped environment has no {name}: it starts by reset(key)")
         own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 

@@ -196,6 +196,7 @@ def test_a_task_has_its_members_when_wrapped(name):
         np.testing.assert_allclose(moved.obs["achieved_goal"], [1.3, 0.7, 0.425])
         assert jax.tree.structure(moved) == jax.tree.structure(state)
     env.check()
+    assert not hasattr(env, "first_state")  # it would lack the wrapper's memory
 
 
 class Absolute(my_arm.Reach):
