@@ -65,7 +65,7 @@ def test_an_evaluation_gives_the_same_numbers(archive, capsys):
     }
 
 
-@pytest.mark.parametrize("name", made.RUNS)
+@pytest.mark.parametrize("name", ["tqc", pytest.param("ddpg", marks=pytest.mark.slow)])
 def test_a_stopped_run_resumes(archive, name):
     folder = archive / f"{name}_stopped"
     assert run_folder.read_spec(folder) == made.RUNS[name]

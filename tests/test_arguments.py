@@ -141,7 +141,7 @@ def test_starts_are_the_same_in_64_bits(name, in_64_bits, task):
         np.testing.assert_allclose(leaf, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_a_step_keeps_its_types_in_64_bits(engine, in_64_bits):
     env = envs.make("reach", engine=engine)
     state = jax.eval_shape(env.reset, jax.random.key(0))
@@ -149,6 +149,7 @@ def test_a_step_keeps_its_types_in_64_bits(engine, in_64_bits):
     assert [leaf.dtype for leaf in jax.tree.leaves(after)] == [leaf.dtype for leaf in jax.tree.leaves(state)]
 
 
+@pytest.mark.slow
 def test_a_loop_of_one_s_own_runs_in_64_bits(in_64_bits, capsys):
     own_learner.main(["--rounds", "1", "--updates", "1"])
     assert capsys.readouterr().out.startswith("round 1: success ")

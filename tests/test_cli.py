@@ -260,6 +260,7 @@ def test_progress_of_many_runs():
 POINT_MASS = ["--env", "docs.examples.point_mass:PointMass"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     out = tmp_path / "run"
     long = [*POINT_MASS, *TINY, "--total-steps", "40000", "--out", str(out)]

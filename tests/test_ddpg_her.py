@@ -125,6 +125,7 @@ def trainer_curve():
     return curve
 
 
+@pytest.mark.slow
 def test_it_learns_reach_as_the_trainer_does():
     """Two seeds of each had means of 0.44 to 0.58.
 

@@ -147,6 +147,7 @@ def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, m
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_a_stopped_run_ends_as_the_one_that_was_not(file, tmp_path):
     config = dataclasses.replace(TINY, total_steps=120)
     spec = RunSpec("point_mass:PointMass", config=config, demonstrations=str(file))

@@ -26,6 +26,7 @@ def run_on_four_devices(marker, seconds):
     assert " passed" in process.stdout
 
 
+@pytest.mark.slow
 def test_on_four_devices():
     run_on_four_devices("not slow", 600)
 

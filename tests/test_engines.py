@@ -89,6 +89,7 @@ def test_open_loop_replay_follows_the_original(name, object_error, task):
     assert np.median(np.linalg.norm(obj[:, -1] - there[:, -1], axis=-1)) < object_error
 
 
+@pytest.mark.slow
 def test_engines_follow_the_same_episode(task, recorded):
     """`jax` against `native` on recorded scripted episodes.
 

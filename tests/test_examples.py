@@ -68,7 +68,7 @@ def test_figures_of_any_model_fall(capsys):
     ("example", "arguments", "least"),
     [
         (contrastive, ["--epochs", "2"], 0.9),
-        (image_reach, ["--epochs", "3"], 0.8),
+        pytest.param(image_reach, ["--epochs", "3"], 0.8, marks=pytest.mark.slow),
         (trap, ["--epochs", "4"], 0.6),
         pytest.param(trap, ["--epochs", "12", "--dense"], 0.6, marks=pytest.mark.slow),
     ],

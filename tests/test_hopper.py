@@ -179,7 +179,8 @@ def assert_as_good_as_xla(found, action_size, cases):
     assert np.max(mine) < 0.1
 
 
-@pytest.mark.parametrize("action_size", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("action_size", [4, 2])
 def test_gradients_are_put_together(action_size, monkeypatch):
     monkeypatch.setattr(hopper, "_calls", lambda: (critic_pass, actor_pass))
     cases = [case(action_size, seed) for seed in range(3)]

@@ -43,6 +43,7 @@ def flags_of(out):
     return [*own, "--total-steps", "80", "--final-episodes", "4", "--out", str(out)]
 
 
+@pytest.mark.slow
 def test_a_sweep_of_own_code_that_changed_trains_it_anew_and_says_so(own, tmp_path, capsys):
     command = ["sweep", *flags_of(tmp_path / "sweep"), "--seeds", "2"]
     assert cli.main(command) == 0

@@ -119,6 +119,7 @@ def test_another_program_s_checkpoints_stay(tmp_path):
     assert not (tmp_path / "unfinished").exists()
 
 
+@pytest.mark.slow
 def test_a_lane_is_that_run_alone(tmp_path):
     """The same first parameters, to the bit, and the same draws; afterwards rounding, because XLA sums products of another
     shape in another order, which 24 updates let grow to less than 1e-4 here."""
@@ -165,6 +166,7 @@ def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had
     assert table(cut, tables.FINALS) == table(whole, tables.FINALS)
 
 
+@pytest.mark.slow
 def test_what_ran_side_by_side_goes_on_from_its_checkpoint_to_the_same_tables(tmp_path):
     trials, cut, whole, seen, said = make_grid(static=LONGER), tmp_path / "cut", tmp_path / "whole", [], []
     cut_short(cut, trials, 3, lanes=4)

@@ -83,7 +83,7 @@ def interrupting(monkeypatch, after, number):
     return seen
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path, point_mass, monkeypatch, capsys, number):
     """In the first epoch of the second of two programs."""
     seen = interrupting(monkeypatch, 5, number)
