@@ -18,7 +18,8 @@ def survives(*args: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("task", ["push", *(pytest.param(t, marks=pytest.mark.slow) for t in TASKS if t != "push")])
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
 def test_physics_survives_10_000_slams(task):
     survives("--tasks", task, "--actions", "10000")
 

@@ -123,6 +123,7 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
     assert any("(1 failed)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
 
 
+@pytest.mark.slow
 def test_a_lane_that_had_failed_when_the_others_were_stopped_costs_them_nothing(trained, tmp_path, monkeypatch):
     """They go on from their checkpoint, and all end as those that were not stopped."""
     monkeypatch.setattr(ddpg.DDPG, "update", breaking())

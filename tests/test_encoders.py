@@ -104,6 +104,7 @@ class Camera(PointMass):
         return state.replace(obs={**state.obs, "observation": {"image": image, "vector": vector}})
 
 
+@pytest.mark.slow
 def test_dicts_with_images_are_trained_on(tmp_path, monkeypatch):
     """From the rollout to the stored policy, which acts as the learner does."""
     monkeypatch.setitem(sys.modules, "mine", types.SimpleNamespace(networks=seeing))

@@ -189,7 +189,7 @@ def make_point_mass(run):
     return PointMass()
 
 
-@pytest.mark.parametrize("killed", [False, True])
+@pytest.mark.parametrize("killed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_chunk_resumes_where_it_was_on_another_node(tmp_path, killed, monkeypatch):
     """Its runs end as if nothing had happened; two side by side, in the second of four epochs."""
     monkeypatch.setattr(worker, "SECONDS_BETWEEN_NEWS", -1.0)

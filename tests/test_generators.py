@@ -65,6 +65,7 @@ def played_for(generate):
     return state.replay.episodes.desired_goal[: SMALL.num_envs]
 
 
+@pytest.mark.slow
 def test_a_goal_that_is_not_finite_leaves_the_reset_s():
 
     def some(key, obs, ring, context):

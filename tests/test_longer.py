@@ -62,6 +62,7 @@ def test_a_run_that_kept_nothing_says_how_to_train_a_longer_one(tmp_path, capsys
     assert f"`train.py --config {out} --total-steps N`" in error
 
 
+@pytest.mark.slow
 def test_what_falling_step_sizes_do_is_said(tmp_path, capsys):
     out = tmp_path / "run"
     assert cli.main([*FLAGS, "--keep-end", "--lr-end", "0.1", "--out", str(out)]) == 0

@@ -268,6 +268,7 @@ def test_lost_contacts_are_reported_and_other_people_s_warnings_left_alone(tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_environments_of_gym_with_many_options_are_not_all_kept():
     made = [weakref.ref(gym_cache.programs("reach", {"distance_threshold": 0.01 * (1 + i)}).env) for i in range(20)]
     gc.collect()
