@@ -232,7 +232,7 @@ CHANGES += (text, file, unpickled, manifest)
 
 
 def in_a_process(place, act, seconds=SECONDS):
-    """Exit status of `act`, called in a fork in the folder `place`, whose file "output" has what it prints; None: too late."""
+    """Exit status of `act`, called in a fork in the folder `place`, whose file "output" keeps the output. None: too late."""
     if (pid := os.fork()) == 0:
         status = 99
         try:
@@ -290,7 +290,7 @@ def opened(case):
 
 
 def faults_of(case, status):
-    """What a case did that it must not."""
+    """Forbidden effects of a case."""
     output = (case.place / "output").read_text(errors="replace")
     if os.path.exists(case.canary):
         yield "code ran"
@@ -308,7 +308,7 @@ def faults_of(case, status):
 
 
 def hostile(folder, count=200, seed=0):
-    """Makes and opens `count` cases; returns what was done, what came of it, and the faults."""
+    """Makes and opens `count` cases. Returns the action, a summary and the faults."""
     sys.path[:0] = [str(ROOT / "docs" / "examples"), ""]
     rng, base, ended, faults = random.Random(seed), folder / "base", {}, []
     make_base(base)

@@ -74,13 +74,13 @@ class Trials:
         return subprocess.Popen([sys.executable, "-u", "train.py", *argv], cwd=ROOT, env={**os.environ, "MARK": mark}, **pipes)
 
     def _left(self, out: Path) -> object:
-        """What an ended command has left."""
+        """Faults that an ended command has left."""
         if self.name == "view":
             return None
         return reliability_pairs.of_run(out) if self.name == "train" else reliability_pairs.of_sweep(out)
 
     def run(self) -> None:
-        """Sends a signal, and looks at what comes of it."""
+        """Sends a signal, and records the response."""
         mark, number = uuid.uuid4().hex, self.rng.choice((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
         send, twice = self.rng.choice((os.kill, os.killpg)), self.rng.random() < 0.5
         process = self._start(self.out, mark)
@@ -121,7 +121,7 @@ class Trials:
         return found + ([] if self.name == "view" else self._lost(status))
 
     def _lost(self, status: int) -> list[str]:
-        """Epochs without a checkpoint, and what differs from an undisturbed end."""
+        """Epochs without a checkpoint, and differences from an undisturbed run."""
         if status == 0 or (self.name == "train" and (self.out / run_folder.RESULT_FILE).exists()):
             self.ended += 1
             right = self._left(self.out) == self.right
@@ -169,7 +169,7 @@ def _marked(mark: str) -> list[str]:
 
 
 def signals(folder: Path, count: int, seed: int, workers: int = 1) -> tuple[str, list[str]]:
-    """Sends `count` signals to each command; returns what came of it, and the faults."""
+    """Sends `count` signals to each command. Returns a summary and the faults."""
     folder.mkdir(parents=True)
     names = [name for name in COMMANDS if name != "ray" or importlib.util.find_spec("ray")]
 

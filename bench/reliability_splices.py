@@ -14,7 +14,7 @@ FILES = ("config.json", "policy.npz", "result.json", "metrics.csv")
 
 
 def splices(folder):
-    """Every file, line of metrics.csv, checkpoint and file of a checkpoint of one run, in place of another's."""
+    """Every file, line of metrics.csv, checkpoint and file of a checkpoint of one run, in the folder of another run."""
     runs = make(folder)
     tried, rejected, faults = 0, 0, []
     for kind in ("stopped", "whole"):
@@ -101,7 +101,7 @@ def put_checkpoint(copy, path):
 
 
 def outcome_of(command, kind, copy, runs):
-    """The status of a command on a copy, and what is wrong with what it made of it; empty if nothing is."""
+    """Status of a command on a copy, and a description of its fault, or an empty text."""
     right, before = runs["right"], everything(copy)
     more = {"eval": ["--episodes", "4"], "plot": ["--formats", "svg"], "report": [], "resume": ["--no-curve"]}[command]
     if command == "resume" and kind == "whole":

@@ -47,7 +47,7 @@ OWN_CYCLES, LONG_CYCLES = "50 an epoch", "1 an epoch"
 
 
 def verdicts(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of the paper's claims: with its own cycles where these have been run, else with longer ones."""
+    """Table of the paper's claims, with its own cycles or, if these have not been run, with longer ones."""
     push, pick = the_set["push"], the_set["pick_and_place"]
     found = paper_set.compared(the_set)
     claim = {result.comparison.task: result for result in found["the paper's own cycles"]}
@@ -55,16 +55,16 @@ def verdicts(the_set: Mapping[str, Sweeps]) -> str:
     methods = gain(push, "own_methods", "epsilon_closest", "closest")
     own = [
         ["Push: `weighted` converges sooner than `future`", *_sooner(claim["push"])],
-        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, "own_push", START), 2)],
-        ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, "own_push", 0.9), 5)],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, paper_set.OWN["push"], START), 2)],
+        ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, paper_set.OWN["push"], 0.9), 5)],
         ["Push: `epsilon_closest` is behind `future`", *_success(behind["epsilon_closest"].difference, -1)],
         ["Push: `closest` is behind `epsilon_closest`", *_success(methods)],
         ["PickAndPlace: `weighted` converges sooner than `future`", *_sooner(claim["pick_and_place"])],
-        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, "own_pick_and_place", START), 2)],
-        ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, "own_pick_and_place", 0.9), 10)],
+        ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, paper_set.OWN["pick_and_place"], START), 2)],
+        ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, paper_set.OWN["pick_and_place"], 0.9), 10)],
     ]
     for task in ("push", "pick_and_place"):
-        early, late = (window(the_set[task], f"own_{task}", part) for part in (slice(FIRST), slice(-LAST[task], None)))
+        early, late = (window(the_set[task], paper_set.OWN[task], part) for part in (slice(FIRST), slice(-LAST[task], None)))
         own.append([f"{NAMES[task]}: epochs 1 to {FIRST} are alike", *_alike(early)])
         own.append([f"{NAMES[task]}: in the last {LAST[task]} epochs `weighted` is at least as good", *_no_worse(late)])
     slide = next(result for result in found["the paper's claim"] if result.comparison.task == "slide")
@@ -87,10 +87,10 @@ def _sooner(result: paper_set.Compared) -> list[str]:
 
 
 def lottery(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of what one curve each would show: pairs of seeds in which one is sooner by what the paper says."""
+    """Table of single pairs of seeds: the number of pairs that show the gain in the paper."""
     rows = []
     for task, claimed in (("push", 5), ("pick_and_place", 10)):
-        weighted, future = (reach(the_set[task][f"own_{task}", name], 0.9) for name in ("weighted", "future"))
+        weighted, future = (reach(the_set[task][paper_set.OWN[task], name], 0.9) for name in ("weighted", "future"))
         same = (future[:, None] - future)[~np.eye(len(future), dtype=bool)]
         counts = [f"{np.sum(gains >= claimed)} of {gains.size}" for gains in (future[:, None] - weighted, same)]
         rows.append([NAMES[task], str(claimed), *counts])
@@ -98,7 +98,7 @@ def lottery(the_set: Mapping[str, Sweeps]) -> str:
 
 
 def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
-    """Returns the cells of a claim that success is larger, or smaller where `sign` is -1.
+    """Cells of a claim that success is larger, or smaller if `sign` is -1.
 
     `p` is corrected over the claim's family, None where the claim is in none.
     """
@@ -111,7 +111,7 @@ def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
 
 
 def _epochs(d: Difference, claimed: float) -> list[str]:
-    """Returns the cells of a claim that epochs are saved, at least `claimed`."""
+    """Cells of a claim that at least `claimed` epochs are saved."""
     left = f"**no**: {claimed:g} are outside the interval" if d.high < claimed else "not shown" if d.low <= 0 else "**yes**"
     mean, interval, p = signed(d, 1)
     return [f"{mean} epochs sooner", interval, p, left]
@@ -139,7 +139,7 @@ def _no_worse(d: Difference) -> list[str]:
 
 
 def samplers(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of the samplers, on all tasks."""
+    """Table of the samplers, on all tasks."""
     order = ("future", "weighted", "episode", "epsilon_closest", "closest", "random")
     rows = []
     for task, sweeps in data.items():
@@ -159,7 +159,7 @@ def samplers(data: Mapping[str, Sweeps]) -> str:
 
 
 def ks(the_set: Mapping[str, Sweeps]) -> str:
-    """Returns the table of hindsight goals."""
+    """Table of hindsight goals."""
     rows = []
     for task, curves in paper_set.ks(the_set).items():
         for k, own in curves.items():
@@ -171,7 +171,7 @@ def ks(the_set: Mapping[str, Sweeps]) -> str:
 
 
 def kernels(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of kernels and temperatures."""
+    """Table of kernels and temperatures."""
     push, rows, default = data["push"], [], "weighted, linear, temperature 1"
     for kernel in ("linear", "inverse", "softmax"):
         for temperature in ("0.25", "1", "4"):
@@ -233,7 +233,7 @@ CHANGES = (  # what, task, the sweep, and the one that it is compared with
 
 
 def robustness(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of what was changed about the sweeps for speed."""
+    """Table of the changes that made sweeps faster."""
     rows = []
     for what, task, sweep, before in CHANGES:
         settings = [name for own, name in data[task] if own == sweep and (before, name) in data[task]]
@@ -253,7 +253,7 @@ PUBLISHED = (  # million steps to a success rate, as read off a published curve 
 
 
 def field(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of published curves beside ours, in environment steps."""
+    """Table of published curves and ours, in environment steps."""
     rows = [list(row) for row in PUBLISHED]
     for name in ("future", "weighted"):
         cells = []
@@ -270,8 +270,8 @@ OWN, TODAY = "the paper's cycles, 20 seeds", "today's preset"  # names of the se
 
 def own_samplers(the_set: Mapping[str, Sweeps]) -> str:
     """Table of the samplers with the paper's own cycles."""
-    named = {"own_methods": "samplers", **{f"own_{task}": "samplers" for task in NAMES}}
-    own = {t: {(named[w], n): c for (w, n), c in s.items() if w in named} for t, s in the_set.items()}
+    names = {"own_methods", *paper_set.OWN.values()}
+    own = {t: {("samplers", n): c for (w, n), c in s.items() if w in names} for t, s in the_set.items()}
     return samplers({task: sweeps for task, sweeps in own.items() if sweeps})
 
 
@@ -280,7 +280,7 @@ OF_BEFORE: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"kernels": kernel
 
 
 def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
-    """Returns all tables by name, of the curves of the set and of those of 2026-11-22."""
+    """All tables by name, from the curves of the set and the curves of 2026-11-22."""
     today = paper_set.current(the_set)
     found = {name: make(today) for name, make in OF_TODAY.items()} | {name: make(before) for name, make in OF_BEFORE.items()}
     found |= {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "own_samplers": own_samplers(the_set)}
@@ -293,7 +293,7 @@ def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) ->
     today = paper_set.current(the_set)
     found = {}
     for task, sweeps in before.items():
-        own = {(OWN, name): curves for (sweep, name), curves in the_set[task].items() if sweep == f"own_{task}"}
+        own = {(OWN, name): curves for (sweep, name), curves in the_set[task].items() if sweep == paper_set.OWN[task]}
         found[task] = own | {(TODAY, name): curves for (_, name), curves in today[task].items()} | dict(sweeps)
     return found
 

@@ -68,7 +68,7 @@ def area(curves: Curves, epochs: int | None = None) -> NDArray:
 
 
 def reach(curves: Curves, threshold: float) -> NDArray:
-    """Returns the first epoch [S] at or above a success rate, infinity where there is none."""
+    """First epoch [S] at or above a success rate, or infinity."""
     return stats.first_reach(np.arange(1, curves.success.shape[1] + 1), curves.success, threshold)
 
 
@@ -96,12 +96,12 @@ def with_seeds(curves: Curves, seeds: tuple[int, ...]) -> Curves:
 
 
 def sooner(sweeps: Sweeps, sweep: str, threshold: float) -> Difference:
-    """Returns by how many epochs `weighted` is at a threshold before `future`."""
+    """Number of epochs by which `weighted` reaches a threshold before `future`."""
     return difference(reach(sweeps[sweep, "future"], threshold), reach(sweeps[sweep, "weighted"], threshold))
 
 
 def window(sweeps: Sweeps, sweep: str, part: slice) -> Difference:
-    """Returns by how much the mean success of `weighted` exceeds that of `future` in some of the epochs."""
+    """Difference in mean success between `weighted` and `future` in some of the epochs."""
     return difference(*(sweeps[sweep, name].success[:, part].mean(axis=1) for name in ("weighted", "future")))
 
 

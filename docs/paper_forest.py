@@ -21,7 +21,7 @@ Line = tuple[str, str, Difference, "tuple[float, float] | None"]  # label, sweep
 
 
 def success_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line]:
-    """Returns what is drawn of success: over all epochs, and over the last ones."""
+    """Differences in success to draw: over all epochs, and over the last ones."""
     lines: list[Line] = []
     for task, sweeps in data.items():
         for sweep in (name for name in names if (name, "weighted") in sweeps):
@@ -33,7 +33,7 @@ def success_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Li
 
 
 def epoch_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line]:
-    """Returns what is drawn of epochs: to the start, and to the threshold."""
+    """Differences in epochs to draw: to the start, and to the threshold."""
     lines: list[Line] = []
     for task, sweeps in data.items():
         for threshold in (START, THRESHOLDS[task]):
@@ -63,7 +63,7 @@ def draw(data: Mapping[str, Sweeps], path: Path, main: tuple[str, ...]) -> None:
 
 
 def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
-    """Draws every comparison of the set, a panel a task; dark where p, corrected over its family, is below 0.05."""
+    """Draws every comparison of the set, one panel per task. Dark: p is below 0.05, corrected over its family."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -94,7 +94,7 @@ def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
 
 
 def _short(result: Compared) -> str:
-    """Returns a comparison's name in the picture: its setting, and what it is compared with unless that is `future`."""
+    """Name of a comparison in the picture: its setting, and its baseline unless that is `future`."""
     setting, against = (result.comparison.setting, (result.comparison.against or ("", ""))[1])
     for name, word in WORDS.items():
         setting, against = setting.replace(name, word), against.replace(name, word)
@@ -102,7 +102,7 @@ def _short(result: Compared) -> str:
 
 
 def _panel(ax, lines: list[Line]) -> None:
-    """Draws intervals from top to bottom; those of one question stand close together."""
+    """Draws intervals from top to bottom. Intervals with the same label are close together."""
     y, before, ticks = 0.0, "", []
     for label, _, d, claimed in lines:
         y -= 0.32 if label == before else 1.0

@@ -48,7 +48,7 @@ class Comparison(NamedTuple):
 
 
 def _readings() -> list[Comparison]:
-    """Returns the readings other than the default one, on each task."""
+    """Readings other than the default one, on each task."""
     linear = {"push": ("sum", "max", "minmax", "none", "far"), "pick_and_place": ("sum", "minmax", "far")}
     softmax = {"push": ("mean", "none")}
     found = []
@@ -82,7 +82,7 @@ HEAD = "question | task | setting | against | epochs | mean success | 95 % inter
 
 
 def load_set(folder: Path) -> dict[str, Sweeps]:
-    """Returns the curves of the set, by task, of those tasks that have any."""
+    """Curves of the set by task, for tasks that have any."""
     return {task: read(path) for task in NAMES if (path := folder / f"{task}_curves.csv").is_file()}
 
 
@@ -112,7 +112,7 @@ def ks(data: Mapping[str, Sweeps]) -> dict[str, dict[int, Curves]]:
 
 
 class Compared(NamedTuple):
-    """What a comparison came to."""
+    """Result of a comparison."""
 
     comparison: Comparison
     difference: Difference
@@ -121,7 +121,7 @@ class Compared(NamedTuple):
 
 
 def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
-    """Returns by family what each comparison came to whose curves are all there."""
+    """Results by family, of the comparisons whose curves are complete."""
     found = {}
     for family, comparisons in FAMILIES.items():
         ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
@@ -133,7 +133,7 @@ def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
 
 
 def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
-    """Returns a row for each comparison whose curves are all there."""
+    """A row for each comparison whose curves are complete."""
     found = []
     for family, results in compared(data).items():
         for c, d, epochs, p in results:
@@ -143,7 +143,7 @@ def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
 
 
 def verdict(low: float, high: float, p: float) -> str:
-    """Returns what an interval and a corrected p say: better or worse with p below 0.05, alike within 0.02 of none."""
+    """Verdict from an interval and a corrected p: better or worse with p below 0.05, alike within 0.02 of 0."""
     if p < 0.05:
         return "better" if low > 0 else "worse" if high < 0 else "not shown"
     return "alike" if low > -MARGIN and high < MARGIN else "not shown"

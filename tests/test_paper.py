@@ -176,6 +176,17 @@ def test_the_pooled_estimate_by_hand():
     assert make_results_figures.pooled(sweeps) == pytest.approx((0.2, 0.2 - 1.2706, 0.2 + 1.2706), abs=1e-3)
 
 
+def test_sweeps_of_other_precision_are_weighed_by_both_variances():
+    """Means 0 and 0.3, variances 0.01 and 0.03: Q is 2.25, the variance between 0.025, the weights 1/0.035 and 1/0.055."""
+    sweeps = [
+        paper_analysis.Difference(mean + variance**0.5 * np.array([-1, 1]), mean, 0.0, 0.0, 1.0)
+        for mean, variance in ((0.0, 0.01), (0.3, 0.03))
+    ]
+    mean, low, high = make_results_figures.pooled(sweeps)
+    assert mean == pytest.approx(0.35 / 3, abs=1e-6)  # 0.075 without the variance between them
+    assert (mean - low, high - mean) == pytest.approx((1.8583, 1.8583), abs=1e-3)
+
+
 def test_verdicts_of_intervals():
     assert paper_set.verdict(0.001, 0.03, 0.04) == "better"
     assert paper_set.verdict(-0.03, -0.001, 0.04) == "worse"
