@@ -1,7 +1,7 @@
 """Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
 
     python bench/learner.py [--learners ddpg td3 sac redq tqc dtqc] [--networks mlp] [--batch-sizes 256 512 1024] [--seeds 1]
-        [--sampler weighted] [--dtype bfloat16 [--kernels hopper]] [--num-critics 2] [--policy-delay 1]
+        [--sampler weighted] [--dtype bfloat16] [--num-critics 2] [--policy-delay 1]
         [--hidden-sizes 256 256 256] [--updates 500]
 
 As in training: as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
@@ -120,7 +120,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
-    parser.add_argument("--kernels", default="xla", choices=["xla", "hopper"], help="what computes the gradients")
     parser.add_argument("--hidden-sizes", type=int, nargs="+", default=list(Config.hidden_sizes))
     parser.add_argument("--updates", type=int, default=500, help="at least so many in each timed program")
     parser.add_argument("--num-critics", type=int, default=2)
@@ -131,7 +130,6 @@ def main() -> None:
         config = Config(
             batch_size=batch_size,
             learner_dtype=args.dtype,
-            learner_kernels=args.kernels,
             hidden_sizes=tuple(args.hidden_sizes),
             num_critics=args.num_critics,
             policy_delay=args.policy_delay,

@@ -67,9 +67,6 @@ class Config:
     learner_dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many runs side by side.
     Parameters, and the policy that plays, are float32 with either."""
-    learner_kernels: Literal["auto", "xla", "hopper"] = "auto"
-    """Implementation of the gradients: xla, hopper (this library's kernels for an NVIDIA H100 or H200, for bfloat16) or auto,
-    which takes hopper wherever it can."""
     n_step: Annotated[int, Number("[1, 1000]")] = 1
     """Steps of a return that are taken from the episode, before the value of the state that they lead to."""
     renewals: Annotated[int, Number("[0, 1000000]")] = 0

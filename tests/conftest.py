@@ -156,7 +156,7 @@ def resets(task):
 # The modules that take longest, which start first, so that no worker is left with one of them at the end. Each runs in one
 # worker as a whole (--dist loadfile): its fixtures and what it compiles are made once.
 LONGEST = (
-    *("sweep", "trainer", "engines", "cli", "checkpoint", "sweep_cli", "warp", "render", "driver", "hopper", "ddpg", "own"),
+    *("sweep", "trainer", "engines", "cli", "checkpoint", "sweep_cli", "warp", "render", "driver", "ddpg", "own"),
     *("mistakes", "identity", "wrong_calls", "claims", "relabel", "replay", "doctor"),
 )
 

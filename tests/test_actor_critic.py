@@ -302,10 +302,7 @@ def seven(action_size, hidden_sizes, dtype, heads=networks.PLAIN):
 
 
 def test_what_does_not_combine_is_refused_by_name():
-    hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
     for name in NAMES:
-        with refuses("learner_kernels", "hopper", "ddpg", name):
-            learners.make(name, hopper, SPEC)
         with refuses("learner", name, "networks", "heads"):
             learners.make(name, SMALL, SPEC, lambda action_size, hidden_sizes, dtype: networks.mlp(2, (8,)))
         with refuses("learner", name, "critic"):

@@ -2,12 +2,13 @@
 
 import csv
 import json
+import shutil
 import sys
 import tarfile
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, refuses
 
 import mjx_dher
 from mjx_dher import cli
@@ -95,3 +96,16 @@ def test_a_sweep_resumes_and_its_tables_read(archive):
     ]
     for trial in trials:
         compare(trial["folder"], archive / "expected" / "sweep" / "cells" / trial["folder"].name)
+
+
+def test_a_setting_of_earlier_versions_is_read_and_cannot_be_resumed_with_another_value(archive, tmp_path):
+    """config.json has `learner_kernels`, which is gone."""
+    folder = tmp_path / "run"
+    shutil.copytree(archive / "ddpg_ended", folder)
+    content = json.loads((folder / "config.json").read_text())
+    assert content["config"]["learner_kernels"] == "auto"
+    spec = run_folder.to_spec(folder, content)
+    content["config"]["learner_kernels"] = "xla"
+    (folder / "config.json").write_text(json.dumps(content))
+    with refuses("learner_kernels", "xla", "auto"):
+        run_folder.check_same(folder, spec)

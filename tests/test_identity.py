@@ -112,7 +112,6 @@ EDITS = {
     ("config", "replay_size"): 120,
     ("config", "hidden_sizes"): [9],
     ("config", "learner_dtype"): "bfloat16",
-    ("config", "learner_kernels"): "xla",
     **{("hparams", name): 0.123 for name in HParams._fields},
 }
 EDITS = {path: value for path, value in EDITS.items() if path != ("config", "cycles_per_epoch")} | {

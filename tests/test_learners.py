@@ -75,12 +75,11 @@ def mine(monkeypatch):
 
 
 def test_the_default_is_ddpg_with_the_paper_s_networks():
-    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="xla"), TASK)
+    learner = learners.make("ddpg", dataclasses.replace(SMALL, learner_dtype="bfloat16"), TASK)
     assert isinstance(learner, ddpg.DDPG)
     assert learner.spec == TASK
     assert learner.networks == networks.mlp(2, (32, 32), "float32") == Networks(Actor(2, (32, 32)), Critic((32, 32)))
     assert learner.learning == networks.mlp(2, (32, 32), "bfloat16")
-    assert learner.compute_gradients is ddpg.compute_gradients
 
 
 def test_a_learner_is_a_function_or_a_place(mine):
@@ -188,14 +187,6 @@ def test_networks_of_the_wrong_output_shape_are_refused(made, parts):
     with pytest.raises(ValueError, match="networks") as error:
         learners.make("ddpg", SMALL, TASK, lambda action_size, hidden_sizes, dtype: made)
     assert all(part in str(error.value).replace("float32[2,3]", "(2, 3)") for part in parts), error.value
-
-
-def test_kernels_know_the_default_networks_alone():
-    hopper = dataclasses.replace(SMALL, learner_dtype="bfloat16", learner_kernels="hopper")
-    with refuses("learner_kernels", "hopper", "mlp"):
-        learners.make("ddpg", hopper, TASK, own_networks)
-    auto = dataclasses.replace(hopper, learner_kernels="auto")
-    assert learners.make("ddpg", auto, TASK, own_networks).compute_gradients is ddpg.compute_gradients
 
 
 @pytest.fixture(scope="module")

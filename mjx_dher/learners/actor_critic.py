@@ -132,8 +132,6 @@ class ActorCritic(ActorCriticBase):
 
 
 def _make(name: str, config: Config, spec: EnvSpec, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
-    if config.learner_kernels == "hopper":
-        raise ValueError(f"learner_kernels hopper computes learner ddpg; it is {name}")
     check_heads(networks, name)
     heads = Heads(gaussian=actor.is_gaussian, critic_size=parts.size)
     acting, learning = common.make_networks(name, config, spec, networks, heads)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import cast
 
 import jax
@@ -14,7 +13,7 @@ from flax import struct
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
 from mjx_dher.learners.common import ActorCriticBase, Losses, Params
-from mjx_dher.networks import Actor, Critic, Networks, NetworksFn, zeros
+from mjx_dher.networks import Networks, NetworksFn, zeros
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
@@ -32,8 +31,6 @@ class DDPGState:
 
 
 Bounds = tuple[Array | float, Array | float]  # of returns
-# compute_gradients(networks, params, target params, normalized batch, bounds, hparams) -> gradients, losses
-GradientFn = Callable[[Networks, Params, Params, Batch, Bounds, HParams], tuple[Params, Losses]]
 
 
 def compute_gradients(
@@ -67,8 +64,6 @@ def compute_gradients(
 class DDPG(ActorCriticBase):
     """The learner: pure functions of a `DDPGState`. `learners.Learner` describes the methods."""
 
-    compute_gradients: GradientFn = compute_gradients  # kernels may replace it
-
     def init(self, key: PRNGKey) -> DDPGState:
         """Makes fresh networks, targets equal to them, and empty normalizers."""
         actor_key, critic_key = jax.random.split(key)
@@ -93,7 +88,7 @@ class DDPG(ActorCriticBase):
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
         """Takes one step of Adam for critic and actor, both from the parameters before it."""
         batch, bounds = self.normalize_batch(state, batch, hparams), self.return_bounds(hparams)
-        gradients, losses = self.compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
+        gradients, losses = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
         updates, opt_state = adam.update(self.mean(gradients), state.opt_state)
         params = optax.apply_updates(state.params, updates)
@@ -102,22 +97,5 @@ class DDPG(ActorCriticBase):
 
 
 def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> DDPG:
-    """Makes the learner, with the gradients that `config.learner_kernels` selects.
-
-    Raises:
-      ValueError: kernels that cannot compute this run's gradients, or networks that give the wrong shapes.
-    """
-    acting, learning = common.make_networks("ddpg", config, spec, networks)
-    return DDPG(spec, acting, learning, compute_gradients=_choose_gradients(config, spec, acting))
-
-
-def _choose_gradients(config: Config, spec: EnvSpec, networks: Networks) -> GradientFn:
-    if config.learner_kernels == "xla" or (config.learner_kernels == "auto" and config.learner_dtype != "bfloat16"):
-        return compute_gradients
-    from mjx_dher.hopper import gradients as hopper
-
-    stock = isinstance(networks.actor, Actor) and isinstance(networks.critic, Critic)
-    reason = hopper.unsupported_reason(config, spec) if stock else "networks mlp"
-    if config.learner_kernels == "hopper" and reason is not None:
-        raise ValueError(f"learner_kernels hopper needs {reason}")
-    return compute_gradients if reason is not None else hopper.compute_gradients
+    """Makes the learner. Raises ValueError for networks that give the wrong shapes."""
+    return DDPG(spec, *common.make_networks("ddpg", config, spec, networks))

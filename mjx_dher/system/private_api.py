@@ -6,8 +6,8 @@ fails, naming the function to delete, once a newer version does without. The lib
 Two dependencies on internals stay where they are used, because they are not names of Python:
 
 - `runs.loop.compile_lowered` disables the pass triton-softmax-rewriter of XLA (jaxlib 0.10.2; no upstream issue known).
-- envs/engines/fused/threads.py and hopper/kernels.cu use `wp::array_t` and `dynamic_smem_base` of Warp's C++ code, and the
-  latter numbers lanes in the order in which Warp flattens the axes of `jax.vmap` (warp-lang 1.18.0; no upstream issue known).
+- envs/engines/fused/threads.py uses `wp::array_t` and `dynamic_smem_base` of Warp's C++ code (warp-lang 1.18.0; no upstream
+  issue known).
 """
 
 from __future__ import annotations

@@ -22,9 +22,8 @@ wp.config.log_level = wp.LOG_WARNING  # otherwise Warp prints a line for each ke
 def prepare() -> None:
     """Starts Warp and sets how kernels are compiled. Call it before anything else of Warp's.
 
-    They may use the instructions that only Hopper GPUs have (see `hopper`), and are kept as machine code: what Warp keeps by
-    default, the driver would compile once more. Where Warp's cache folder cannot be used, a warning says so, and a folder of
-    this process takes its place.
+    They are kept as machine code: what Warp keeps by default, the driver would compile once more. If Warp's cache folder cannot
+    be used, a warning says so, and a folder of this process takes its place.
     """
     try:
         if not (wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")):
@@ -46,8 +45,6 @@ def prepare() -> None:
     devices = wp.get_cuda_devices()
     if devices and all(device.is_cubin_supported for device in devices):
         wp.config.cuda_output = "cubin"
-    if devices and all(device.arch == 90 for device in devices):
-        wp.config.cuda_arch_suffix = "a"
 
 
 def load(module: Any, block: int | None = None) -> None:

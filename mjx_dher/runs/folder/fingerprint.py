@@ -33,11 +33,12 @@ _WORDS = {**dict.fromkeys(("y", "yes", "t", "true", "on", "1"), 1), **dict.fromk
 ALWAYS = frozenset(
     (
         *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
-        *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype", "learner_kernels"),
+        *("target_period", "batch_size", "total_steps", "replay_size", "hidden_sizes", "learner_dtype"),
         *("eval_episodes", "actor_lr", "critic_lr", "lr_end", "gamma", "polyak", "action_l2", "random_eps", "noise_std"),
         *("her_k", "priority_fraction", "epsilon", "temperature", "obs_clip", "norm_clip", "norm_eps"),
     )
 )
+REMOVED = {"learner_kernels": "auto"}  # a setting that this version lacks, in the digests of the versions that had it
 
 
 def settings(spec: RunSpec) -> dict[str, Any]:
@@ -124,7 +125,7 @@ def identity(
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
-    return {**content, "sources": dict(own_sources), **(flags or {})}
+    return {**content, **REMOVED, "sources": dict(own_sources), **(flags or {})}
 
 
 def digest(content: Mapping[str, Any]) -> str:
@@ -135,7 +136,7 @@ def digest(content: Mapping[str, Any]) -> str:
 def trial_name(spec: RunSpec) -> str:
     """Name of a trial's folder: readable settings, and a digest of all settings, custom code and JAX's flags."""
     values, defaults = settings(spec), settings(RunSpec())
-    kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]}
+    kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]} | REMOVED
     kept.pop("demonstrations", None)
     numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests

@@ -224,7 +224,8 @@ def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec
 
 def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
     """The `identity` of the run that config.json describes."""
-    return fingerprint.identity(spec, content["physics"], content["sources"], content.get("jax_flags"))
+    own = fingerprint.identity(spec, content["physics"], content["sources"], content.get("jax_flags"))
+    return {**own, **{name: content["config"].get(name, value) for name, value in fingerprint.REMOVED.items()}}
 
 
 def digests(content: Mapping[str, Any]) -> list[str] | None:
@@ -333,7 +334,7 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
         if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default is not what was meant
             raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         spec = RunSpec(
-            config=Config(**config),
+            config=Config(**{name: value for name, value in config.items() if name not in fingerprint.REMOVED}),
             hparams=HParams(**{name: math.inf if x == INFINITE else x for name, x in content["hparams"].items()}),
             **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
             env_kwargs=tuple(content["env_kwargs"]),
