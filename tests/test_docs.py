@@ -38,9 +38,9 @@ def blocks(language):
 
 # Blocks that other tests run: the document, and the test.
 ELSEWHERE = {
-    "README.md": "test_readme.py",
     "docs/gymnasium.md": "test_gym_use.py",
     "docs/policies.md": "test_export.py",
+    "docs/start.md": "test_start.py",
     "docs/tutorial.md": "test_examples.py",
     "docs/your_robot.md": "test_your_robot.py",
 }

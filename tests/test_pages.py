@@ -125,8 +125,8 @@ def published(task, preset):
     return [row["success"] for row in rows], {row["env_steps"] for row in rows}
 
 
-def test_the_readme_s_table_of_results_is_that_of_the_file():
-    lines = (ROOT / "README.md").read_text().splitlines()
+def test_the_table_of_presets_is_that_of_the_file():
+    lines = (ROOT / "docs" / "experiments" / "presets.md").read_text().splitlines()
     (head,) = (i for i, line in enumerate(lines) if line.startswith("|") and "preset `cpu`" in line and "preset `gpu`" in line)
     names = cells(lines[head])
     tasks = set()
@@ -142,6 +142,32 @@ def test_the_readme_s_table_of_results_is_that_of_the_file():
             assert SUCCESS.findall(row[column]) == rates, (task, preset)
             assert {row[column + 1].strip().replace(",", "")} == (steps or {""}), (task, preset)
     assert tasks == {"push", "pick_and_place", "slide", "reach"}
+
+
+def test_the_readme_s_ranges_are_of_these_seeds_and_of_the_originals():
+    readme, bench = (ROOT / "README.md").read_text(), (ROOT / "bench" / "README.md").read_text()
+    for task in ("push", "pick_and_place", "slide"):
+        row = next(cells(line) for line in readme.splitlines() if line.startswith(f"| `{task}` | 0"))
+        there = next(cells(line)[5] for line in bench.splitlines() if re.match(rf"\| {task} \| [\d,]+ \| \d+ \|", line))
+        for shown, seeds in ((row[1], SUCCESS.findall(there)), (row[3], published(task, "cpu")[0])):
+            assert shown.strip() == f"{min(seeds)} to {max(seeds)}"
+
+
+def test_the_gain_of_td_error_over_all_sweeps():
+    """Mean and Student's t interval of thirty pairs; 2.045 is the 97.5 % point of t with 29 degrees of freedom."""
+    runs = {}
+    for name in ("bakeoff_runs", "bakeoff_repeat_runs", "bakeoff_third_runs"):
+        with (ROOT / "docs" / f"{name}.csv").open() as file:
+            for row in csv.DictReader(file):
+                if row["learner"] == "best":
+                    runs[row["task"], row["arm"], int(row["seed"])] = float(row["mean_success"])
+    page = " ".join((ROOT / "docs" / "what_helps.md").read_text().split())
+    for task in ("pick_and_place", "slide"):
+        seeds = [seed for name, arm, seed in runs if (name, arm) == (task, "td_error")]
+        assert len(seeds) == 30
+        gains = np.array([runs[task, "td_error", seed] - runs[task, "future", seed] for seed in seeds])
+        half = 2.0452 * gains.std(ddof=1) / 30**0.5
+        assert f"{gains.mean():.3f} ({gains.mean() - half:.3f} to {gains.mean() + half:.3f})" in page
 
 
 def test_the_benchmarks_say_the_same_of_the_presets():

@@ -32,6 +32,7 @@ include_patterns = [
     "docs/*.md",
     "docs/*.ipynb",
     "docs/api/*.md",
+    "docs/experiments/*.md",
     "bench/*.md",
     "mjx_dher/policy/bundled/*/*.md",
 ]
