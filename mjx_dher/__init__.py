@@ -1,6 +1,6 @@
-"""mjx-dher: goal-conditioned robot manipulation with Hindsight Experience Replay, compiled whole.
+"""Goal-conditioned robot manipulation with Hindsight Experience Replay, compiled as one JAX program.
 
-Importing this package loads neither JAX nor MuJoCo; each name below loads what it needs when it is first used.
+Importing this package loads neither JAX nor MuJoCo. Each name below loads its module on first use.
 """
 
 from __future__ import annotations

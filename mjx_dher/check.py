@@ -1,4 +1,4 @@
-"""One check of the arrays that a user's functions return."""
+"""Check of arrays that user functions return."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NAMES = {jnp.floating: "floats", jnp.integer: "integers", jnp.number: "numbers"
 
 
 def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floating) -> Array:
-    """Converts `value` to an array and checks its shape and dtype. Works under tracing, at no cost in the program.
+    """Converts `value` to an array and checks its shape and dtype. Works under tracing, at no run-time cost.
 
     Args:
       what: name of the value and its symbolic shape, such as "sampler: log weights [T+1]".
@@ -22,7 +22,7 @@ def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floatin
       kind: expected kind of dtype: `jnp.floating`, `jnp.integer`, `jnp.number` or `jnp.bool_`.
 
     Raises:
-      ValueError: names the value, what is expected and what was given.
+      ValueError: names the value, the expected and the given shape and dtype.
     """
     expected = f"{what} must be {_NAMES[kind]} of shape {list(shape)}"
     try:
@@ -38,7 +38,7 @@ def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floatin
 
 
 def describe(value: Any) -> str:
-    """Dtype and shape of an array, such as "float32[3, 4]"; the type of anything else."""
+    """Dtype and shape of an array, such as "float32[3, 4]", or the type of another object."""
     if isinstance(value, jax.Array):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"

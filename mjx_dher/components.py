@@ -1,4 +1,4 @@
-"""The built-in components of a run, one row each. Loads neither JAX nor MuJoCo, nor a component before `load`."""
+"""Table of the built-in components. Loads neither JAX nor MuJoCo; `load` imports a component."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from mjx_dher.lookup import check_function, check_name, load_import_path
 
 
 class Component(NamedTuple):
-    """A built-in component: one row of `COMPONENTS` and one function."""
+    """A built-in component: one row of `COMPONENTS`."""
 
     path: str  # module:attribute
-    line: str  # what it is, for `list`
-    reads: tuple[str, ...] = ()  # settings that only some components of its field read
-    group: str = ""  # runs that share a compiled program can differ within a group
+    line: str  # description in `list`
+    reads: tuple[str, ...] = ()  # settings that it reads and others of its field do not
+    group: str = ""  # runs of one compiled program can differ within a group
 
 
 _BY_METRIC = ("metric",)
@@ -26,7 +26,7 @@ _SMOOTHING = ("target_noise", "target_noise_clip")
 _ENTROPY = ("entropy_weight", "entropy_target")
 _QUANTILES = ("num_quantiles", "dropped_quantiles")
 
-# Built-in components by field of `RunSpec` and by name. Each field also takes "module:attribute", a custom component.
+# Built-in components by `RunSpec` field and name. Each field also takes a custom component as "module:attribute".
 COMPONENTS: dict[str, dict[str, Component]] = {
     "env": {
         "pick_and_place": Component(
@@ -53,7 +53,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "weighted": Component("mjx_dher.samplers:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
         "next_future": Component(
             "mjx_dher.contrib.goals:next_future",
-            "the step's own next goal, one time in her_k, else any future one (Next-Future)",
+            "the next goal with probability 1/her_k, else any future one (Next-Future)",
         ),
     },
     "weight_kernel": {
@@ -77,13 +77,13 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "position": Component("mjx_dher.samplers:position", "Euclidean distance between goals"),
         "velocity": Component("mjx_dher.contrib.metrics:velocity", "distance in position and velocity to rest at the goal"),
         "resting_point": Component(
-            "mjx_dher.contrib.metrics:resting_point", "distance of where Slide's puck would come to rest"
+            "mjx_dher.contrib.metrics:resting_point", "distance from the point where Slide's puck would come to rest"
         ),
         "resting_point_rough": Component(
             "mjx_dher.contrib.metrics:resting_point_rough", "the same with the friction of Push's and PickAndPlace's block"
         ),
         "time_to_goal": Component(
-            "mjx_dher.contrib.metrics:time_to_goal", "steps from there to the goal, by the learner's critic"
+            "mjx_dher.contrib.metrics:time_to_goal", "steps to the goal as estimated by the learner's critic"
         ),
     },
     "priority": {
@@ -105,19 +105,19 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         ),
         "dpp": Component(
             "mjx_dher.contrib.transitions:dpp",
-            "diversity, and of transitions two with goals apart (DTGSH's k-DPP)",
+            "diversity, and pairs of transitions with goals far apart (DTGSH's k-DPP)",
             (),
             "transitions",
         ),
         "td_error": Component(
             "mjx_dher.priorities:td_error",
-            "episodes, and transitions with hindsight goals, by their errors of one step (HGR)",
+            "episodes and relabelled transitions by their one-step errors (HGR)",
             ("renewals",),
             "transitions",
         ),
         "curriculum": Component(
             "mjx_dher.contrib.transitions:curriculum",
-            "transitions with goals diverse at first, near later (CHER)",
+            "transitions with diverse goals at first, near goals later (CHER)",
             (),
             "transitions",
         ),
@@ -129,9 +129,9 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         ),
     },
     "generator": {
-        "reset": Component("mjx_dher.contrib.generators:reset", "the goals that the resets drew"),
+        "reset": Component("mjx_dher.contrib.generators:reset", "goals from the environment's reset"),
         "hgg": Component(
-            "mjx_dher.contrib.goals:hgg", "goals achieved before, on the way to those of the resets (Hindsight Goal Generation)"
+            "mjx_dher.contrib.goals:hgg", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"
         ),
     },
     "learner": {
@@ -150,7 +150,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         ),
         "redq": Component(
             "mjx_dher.learners.actor_critic:redq",
-            "REDQ (Chen et al. 2021): SAC with many critics, some of them drawn for each target",
+            "REDQ (Chen et al. 2021): SAC with many critics, a random subset per target",
             (*_CRITICS, "subset_critics", *_ENTROPY),
         ),
         "tqc": Component(
@@ -167,16 +167,16 @@ COMPONENTS: dict[str, dict[str, Component]] = {
     "networks": {
         "mlp": Component("mjx_dher.networks:mlp", "hidden layers with ReLU"),
         "layer_norm": Component("mjx_dher.networks:layer_norm", "mlp with layer normalization in the critics"),
-        "fan_in": Component("mjx_dher.networks:fan_in", "mlp with first weights and biases as PyTorch's"),
+        "fan_in": Component("mjx_dher.networks:fan_in", "mlp with PyTorch's initialization"),
     },
 }
 
 
 def load(field: str, value: Any, *parameters: str) -> Any:
-    """Imports the component that `value` names, by its built-in name or as module:attribute. Other values are the component.
+    """Imports the component called `value`, a built-in name or module:attribute. Other values are returned as they are.
 
     Raises:
-      ValueError: no such name, module or attribute, or not a function of `parameters`, if any are given.
+      ValueError: there is no such name, module or attribute, or it is not a function of `parameters`, if given.
     """
     if isinstance(value, str):
         table = COMPONENTS[field]
@@ -186,7 +186,7 @@ def load(field: str, value: Any, *parameters: str) -> Any:
 
 
 def help_text(field: str, text: str) -> str:
-    """Help of the option of a component: the text, the built-in names, and the components that read it."""
+    """Help text of a component's option, with the built-in names and the components that read it."""
     readers = [name for table in COMPONENTS.values() for name, component in table.items() if field in component.reads]
     read = f" Read by {', '.join(readers)}." if readers else ""
     return f"{text}: {', '.join(COMPONENTS[field])}, or module:attribute.{read}"
@@ -194,12 +194,12 @@ def help_text(field: str, text: str) -> str:
 
 @functools.cache
 def _owners(setting: str) -> tuple[str, ...]:
-    """Fields with components that read a setting which not every component reads."""
+    """Fields with components that read `setting`, if not every component reads it."""
     return tuple(field for field, table in COMPONENTS.items() if any(setting in row.reads for row in table.values()))
 
 
 def reads(settings: Mapping[str, Any], setting: str) -> bool:
-    """Whether a setting makes a difference to the run with these settings.
+    """Whether `setting` affects a run with these settings.
 
     A custom component may read any setting that a built-in component of its field reads.
     """

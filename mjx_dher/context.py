@@ -1,7 +1,7 @@
-"""What a method may look at beside the data: the task's goal functions, numbers, progress, and the learner's values.
+"""`Context`: inputs of relabelling, priorities and goal generators besides the data.
 
-Relabelling, priorities and goal generators all take a `Context`. The trainer makes one for each cycle, from the learner as it
-then is.
+It holds the task's goal functions, the run's numbers and progress, and the learner's values. The trainer makes one per cycle,
+with the current learner.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from mjx_dher.config import HParams
 from mjx_dher.contract import STEP_SECONDS, step_seconds
 from mjx_dher.types import Array, Batch, DistanceFn, PyTree, ReachedFn, RewardFn
 
-_ROWS_AT_ONCE = 256  # episodes that `of_each_episode` computes at a time: their activations need memory
+_ROWS_AT_ONCE = 256  # episodes per step of `of_each_episode`, to limit memory
 
 
 def euclidean(achieved: Array, desired: Array) -> Array:
-    """Euclidean distance [...] of goals [..., G]: the default `goal_distance`."""
+    """Euclidean distance [...] between goals [..., G]: the default `goal_distance`."""
     # Coordinate by coordinate: XLA on a CPU takes three times as long for a sum over an axis of 3.
     squares = jnp.square(achieved - desired)
     return jnp.sqrt(sum(squares[..., i] for i in range(squares.shape[-1])))
 
 
 class Values(NamedTuple):
-    """The learner's policy and values as they are now; a learner with a method `value` has them (`learners.Learner`)."""
+    """Current policy and value function of a learner that defines `value` (`learners.Learner`)."""
 
     act: Callable[[PyTree, Array], Array]  # observation [..., D], goal [..., G] -> action [..., A] of the deterministic policy
     value: Callable[[PyTree, Array, Array], Array]  # observation, goal, action [..., A] -> estimated return [...]
@@ -38,20 +38,20 @@ class Values(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a method may look at. Only the first two fields are needed to relabel by hand."""
+    """Inputs of a method besides the data. To relabel by hand, you need only the first two fields."""
 
     compute_reward: RewardFn
     hparams: HParams
     reward_range: tuple[float, float] = (-1.0, 0.0)
     ends_at_goal: bool = False  # whether reaching the goal ends an episode
-    reached_fn: ReachedFn | None = None  # the environment's own `reached`
+    reached_fn: ReachedFn | None = None  # the environment's `reached`
     goal_distance: DistanceFn = euclidean
-    dt: float = STEP_SECONDS  # s that a step takes
-    progress: Array | float = 0.0  # [] share of the run's updates that have been made
-    values: Values | None = None  # for a method that says `uses_values`, else None
+    dt: float = STEP_SECONDS  # seconds per step
+    progress: Array | float = 0.0  # [] fraction of the run's updates made so far
+    values: Values | None = None  # None unless the method has `uses_values`
 
     def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Whether goals [..., G] are reached, bool [...]: the environment's `reached`, or a reward at its maximum."""
+        """Whether goals [..., G] are reached, bool [...]: by the environment's `reached`, or by a reward at its maximum."""
         if self.reached_fn is not None:
             return self.reached_fn(achieved_goal, desired_goal)
         return self.compute_reward(achieved_goal, desired_goal) >= self.reward_range[1]
@@ -61,7 +61,7 @@ class Context(NamedTuple):
         return return_bounds(self.reward_range, self.hparams.gamma)
 
     def td_error(self, batch: Batch) -> Array:
-        """One-step errors r + discount V(s', g) - Q(s, a, g), shape [B], of a batch [B]."""
+        """One-step errors r + discount V(s', g) - Q(s, a, g) of a batch, shape [B]."""
         assert self.values is not None
         following = self.values.of_state(batch.next_observation, batch.desired_goal)
         target = jnp.clip(batch.reward + batch.discount * following, *self.bounds())
@@ -69,7 +69,7 @@ class Context(NamedTuple):
 
 
 def of_env(env: Any, hparams: HParams, **fields: Any) -> Context:
-    """Makes the context of an environment's goal functions; `fields` are further fields of `Context`."""
+    """Context with an environment's goal functions. `fields` are other fields of `Context`."""
     spec = getattr(env, "spec", None)
     if spec is not None:
         fields = {"reward_range": spec.reward_range, "ends_at_goal": spec.ends_at_goal, **fields}
@@ -79,21 +79,21 @@ def of_env(env: Any, hparams: HParams, **fields: Any) -> Context:
 
 
 def reached_fn(env: Any) -> ReachedFn:
-    """Whether an environment's goals are reached: its own `reached`, or a reward at its maximum (`Context.reached`)."""
+    """Function that tests whether an environment's goals are reached (`Context.reached`)."""
     return of_env(env, HParams()).reached
 
 
 def return_bounds(reward_range: tuple[float, float], gamma: Array | float) -> tuple[Array | float, Array | float]:
     """Lowest and highest discounted return of rewards in `reward_range`, for episodes of any length.
 
-    A return that ends early counts as if rewards of 0 followed it, so the bounds include 0.
+    The bounds include 0, because a return that ends early counts as if rewards of 0 followed.
     """
     low, high = (min(reward_range[0], 0.0), max(reward_range[1], 0.0))
     return low / (1.0 - gamma), high / (1.0 - gamma)
 
 
 def pick(results: Sequence[Any], number: Array) -> Array:
-    """Selects the result with index `number` [], traced: what lanes of one program do that use different components."""
+    """Selects the result with the traced index `number` [], for lanes of one program that use different components."""
     kept = jnp.asarray(results[0])
     for index, result in enumerate(results[1:], 1):
         kept = jnp.where(number == index, result, kept)
@@ -101,16 +101,16 @@ def pick(results: Sequence[Any], number: Array) -> Array:
 
 
 def of_each_episode(function: Callable[[Any], Array], episodes: Any) -> Array:
-    """Applies `function` to each episode (leaves lead with [E]), a few hundred at a time."""
+    """Maps `function` over episodes (leaves lead with [E]), a few hundred at a time."""
     number = jax.tree.leaves(episodes)[0].shape[0]
     return jax.lax.map(function, episodes, batch_size=min(number, _ROWS_AT_ONCE))
 
 
 def one_of(functions: Sequence[Callable[..., Any]], index: str) -> Callable[..., Array]:
-    """Joins functions of one signature in one compiled program: the traced number `hparams.<index>` says whose result counts.
+    """Joins functions of one signature into one whose result the traced number `hparams.<index>` selects.
 
-    All of them are computed, so that a lane gets what its function alone would give. One argument is an `HParams` with the
-    field `index`, or a `Context` with such `hparams`.
+    All functions are computed, so each lane gets exactly the result of its own function. One argument must be an `HParams`
+    with the field `index`, or a `Context` with such `hparams`.
     """
 
     def chosen(*args: Any, **more: Any) -> Array:

@@ -1,4 +1,4 @@
-"""An environment's contract: its spec, and checks of what `reset` and `step` give. Nothing here runs an environment."""
+"""Contract of an environment: its spec, and checks of the states from `reset` and `step`. Runs no environment."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ FLAGS = ("failed", "done", "terminal")  # optional fields of a state, [] bool
 
 
 def env_spec(env: Env) -> EnvSpec:
-    """The spec of an environment, which is not run: its own `spec`, or one that follows from its attributes and arrays.
+    """Spec of an environment: its `spec`, or one derived from its attributes and arrays. The environment is traced, not run.
 
     Raises:
-      ValueError: `env` is no environment, or its spec disagrees with its arrays; the message names the field.
+      ValueError: `env` is not an environment, or its spec disagrees with its arrays. The message names the field.
     """
     return _spec_and_shapes(env)[0]
 
@@ -51,7 +51,7 @@ def _say(leaf: Any) -> Any:
 
 
 def episode_template(env: Env) -> Episode:
-    """Shapes and dtypes of one episode of `env`, which is not run. Raises ValueError if `env` is no environment."""
+    """Shapes and dtypes of one episode, without running `env`. Raises ValueError if `env` is not an environment."""
     spec, first = _spec_and_shapes(env)
 
     def repeat(x: Any, times: int) -> Any:
@@ -67,7 +67,7 @@ def episode_template(env: Env) -> Episode:
 
 
 def check_env_parts(env: Any) -> None:
-    """Raises ValueError unless `env` has the methods and the two numbers of an `Env`. It is not run."""
+    """Raises ValueError unless `env` has the methods and the two sizes of an `Env`."""
     if isinstance(env, type):
         raise ValueError(f"an environment is an object, not a class: {env.__name__}(...) instead of {env.__name__}")
     for name in ("reset", "step", "compute_reward"):
@@ -79,7 +79,7 @@ def check_env_parts(env: Any) -> None:
 
 
 def step_seconds(env: Any) -> float:
-    """Seconds that a step of `env` takes in real time: its `dt`, or 0.04. Raises ValueError for a `dt` out of range."""
+    """Seconds per step of `env`: its `dt`, or 0.04. Raises ValueError if `dt` is out of range."""
     dt: Any = getattr(env, "dt", STEP_SECONDS)
     dt = dt.item() if getattr(dt, "shape", None) == () else dt  # a scalar of NumPy or JAX
     check_number("dt", dt, "(0, 3600]", float)
@@ -87,12 +87,12 @@ def step_seconds(env: Any) -> float:
 
 
 def robot_interface(env: Any) -> dict[str, Any]:
-    """Seconds of a step, and a task's controls and observation layout, as JSON."""
+    """Seconds per step, and a task's controls and observation layout, as JSON."""
     return {"dt": round(step_seconds(env), 9), **getattr(env, "robot_interface", {})}
 
 
 def check_first(state: Any, leading: tuple[int, ...]) -> None:
-    """Raises ValueError unless a state of `reset`, or its shapes, has what an `EnvState` has, behind the axes `leading`."""
+    """Raises ValueError unless a state from `reset`, or its shapes, has the fields of `EnvState` after the axes `leading`."""
     for name in ("obs", "reward", "success"):
         if not hasattr(state, name):
             raise ValueError(f"reset must give a state with obs, reward and success; this {type(state).__name__} has no {name}")
@@ -117,7 +117,7 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
 
 
 def check_same_shapes(before: Any, after: Any, method: str = "step") -> None:
-    """Raises ValueError unless a method keeps the state's structure, shapes and types, as `lax.scan` needs."""
+    """Raises ValueError unless a method keeps the state's structure, shapes and dtypes, as `lax.scan` needs."""
     old, new = (dict(jax.tree_util.tree_leaves_with_path(state)) for state in (before, after))
     structure: Any = jax.tree.structure(before)
     if structure != jax.tree.structure(after):
@@ -135,12 +135,12 @@ def check_same_shapes(before: Any, after: Any, method: str = "step") -> None:
 
 
 def check_with_goal(env: Any) -> None:
-    """Raises ValueError for an environment whose goals cannot be set."""
+    """Raises ValueError if the environment's goals cannot be set."""
     if not callable(getattr(env, "with_goal", None)):
         raise ValueError(f"a goal generator needs an environment with with_goal(state, goal) -> state; {env!r} has none")
 
 
 def check_steps(env: Env) -> None:
-    """Calls `env.check()`, where the environment has one: it raises if steps so far were silently wrong."""
+    """Calls `env.check()` if it exists. It raises ValueError if steps so far were silently wrong."""
     if (check := getattr(env, "check", None)) is not None:
         check()

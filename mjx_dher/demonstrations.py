@@ -1,7 +1,7 @@
 """Demonstrations: episodes from a file that fill the replay ring before the first cycle.
 
-A file is an .npz with the arrays of an `Episode` of N episodes, or a Minari data set. An .npz names the leaves of a tree of
-observations "observation/NAME".
+A file is a Minari data set, or an .npz with the arrays of a batched `Episode`. Leaves of an observation tree are named
+"observation/NAME".
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ _OPTIONAL = ("length", "terminal")
 
 
 def write_demonstrations(path: Path, episodes: Episode) -> None:
-    """Writes N episodes, as `rollout` returns them, to an .npz."""
+    """Writes N episodes from `rollout` to an .npz file."""
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named(episodes).items()}
     np.savez_compressed(path, **arrays)
 
 
 def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
-    """Reads N episodes for `env`, padded to its episode length.
+    """Reads N episodes, padded to the environment's episode length.
 
     Args:
-      source: an .npz, or the folder or the name of a Minari data set.
-      env: the environment that they are for.
-      max_episodes: most episodes that the ring holds.
+      source: an .npz file, or the folder or name of a Minari data set.
+      env: environment of the episodes.
+      max_episodes: number of episodes that the ring holds.
 
     Raises:
-      ValueError: the file cannot be read, or its episodes do not fit the environment; names each array at fault.
+      ValueError: the file cannot be read, or its episodes do not fit the environment. The message names each invalid array.
     """
     path, template = find_demonstrations(source), episode_template(env)
     names = _named(template)
@@ -72,7 +72,7 @@ def _read_minari(path: Path, names: Mapping[str, Any], num_steps: int) -> dict[s
 
 
 def _minari_row(episode: Any, names: Mapping[str, Any], num_steps: int) -> dict[str, np.ndarray]:
-    """Arrays of one episode; raises ValueError for one that is too long or changes its goal."""
+    """Arrays of one episode. Raises ValueError if it is too long or its goal changes."""
     length, goals = len(episode.actions), np.asarray(episode.observations["desired_goal"])
     if length > num_steps:
         raise ValueError(
@@ -91,14 +91,14 @@ def _minari_row(episode: Any, names: Mapping[str, Any], num_steps: int) -> dict[
 
 
 def _check_arrays(arrays: Mapping[str, Any], names: Mapping[str, Any], env: Env, max_episodes: int) -> None:
-    """Raises ValueError with a line for each array that is missing, unknown, or does not fit the environment."""
+    """Raises ValueError with one line per array that is missing, unknown or does not fit the environment."""
     action, num_steps = arrays.get("action"), env.episode_length
     if action is None or action.ndim != 3 or not 1 <= action.shape[1] <= num_steps:
         given = "none" if action is None else f"{action.dtype}{list(action.shape)}"
         raise ValueError(f"action must have shape [N, T, A] with T at most {num_steps}; got {given}")
     played = action.shape[:2]
     if not 1 <= played[0] <= max_episodes:
-        raise ValueError(f"it must have 1 to {max_episodes} episodes, as many as replay_size holds; it has {played[0]}")
+        raise ValueError(f"must have 1 to {max_episodes} episodes, the capacity of replay_size; got {played[0]}")
     problems = [f"{name} is not an array of an episode: {', '.join(names)}" for name in arrays if name not in names]
     for name, leaf in names.items():
         lead = (played[0], *((played[1] + leaf.shape[0] - num_steps,) if name not in ("desired_goal", *_OPTIONAL) else ()))
@@ -130,7 +130,7 @@ def _check_values(arrays: dict[str, np.ndarray], names: Mapping[str, Any], env: 
 
 
 def _padded(arrays: dict[str, np.ndarray], template: Episode, num_steps: int) -> Episode:
-    """Pads episodes to `num_steps`: the last observation repeats, and actions are 0."""
+    """Pads episodes to `num_steps` by repeating the last observation, with actions 0."""
     number, own_steps = arrays["action"].shape[:2]
     length = np.asarray(arrays.get("length", np.full(number, own_steps)), np.int32)
     rows, steps = np.arange(number)[:, None], np.minimum(np.arange(num_steps + 1), length[:, None])

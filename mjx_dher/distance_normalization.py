@@ -1,13 +1,12 @@
 """Normalizations and kernels of the sampler `weighted`: readings of the paper's "normalized distance values".
 
-A normalization maps the distances of one episode's achieved goals to the desired one to relative distances. It sees which goals
-are candidates, and a length in metres (`weight_scale`). A kernel maps a relative distance to a log weight, which is 0 at 1 for
-every kernel and temperature. docs/samplers.md has the formulas.
+A normalization maps the distances between achieved goals and the desired goal to relative distances. A kernel maps a relative
+distance to a log weight, which is 0 at 1 for any temperature. docs/samplers.md has the formulas.
 
-    normalization(distance [T+1], candidates [T+1], scale []) -> relative distance [T+1]
+    normalization(distance [T+1], candidates [T+1] bool, scale [] in metres) -> relative distance [T+1]
     kernel(relative distance [T+1], temperature []) -> log weight [T+1]
 
-A goal that is no candidate may get any number but NaN. If all candidates are equally far, all get the same number.
+A goal that is not a candidate may get any number except NaN. Equally far candidates get equal numbers.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ NormalizationFn = Callable[[Array, Array, Array | float], Array]
 
 
 def by_mean(distance: Array, candidates: Array, scale: Array | float) -> Array:
-    """d / mean d; 1 if every candidate lies on the goal. `linear` at temperature 1 then is 2 - d / mean d."""
+    """d / mean d, or 1 if every candidate lies on the goal. `linear` at temperature 1 is then 2 - d / mean d."""
     del scale
     distance = jnp.where(candidates, distance, 0.0)
     mean = _sum(distance) / jnp.sum(candidates, dtype=distance.dtype)
@@ -54,12 +53,12 @@ def by_range(distance: Array, candidates: Array, scale: Array | float) -> Array:
 
 
 def by_scale(distance: Array, candidates: Array, scale: Array | float) -> Array:
-    """1 + d / scale, a length in metres: `softmax` at temperature 1 is exp(-d / scale)."""
+    """1 + d / scale, with the scale in metres. `softmax` at temperature 1 is exp(-d / scale)."""
     return _one_and(distance, scale, candidates)
 
 
 def _sum(distance: Array) -> Array:
-    """Sum [] of distances; NaN if it overflows, so that no goal is offered, which training counts."""
+    """Sum [] of distances, or NaN if it overflows, so that no goal is offered."""
     total = jnp.sum(distance)
     return jnp.where(total < jnp.inf, total, jnp.nan)
 
@@ -69,7 +68,7 @@ def _largest(distance: Array, candidates: Array) -> Array:
 
 
 def _one_and(distance: Array, unit: Array | float, candidates: Array) -> Array:
-    """1 + distance / unit for the candidates; 1 if the unit is 0, as when all lie on the goal."""
+    """1 + distance / unit for the candidates, or 1 if the unit is 0."""
     return jnp.where(candidates & (unit != 0), 1.0 + distance / jnp.where(unit != 0, unit, 1.0), 1.0)
 
 

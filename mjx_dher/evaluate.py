@@ -1,7 +1,7 @@
-"""Evaluation of a policy without exploration: episodes, their outcomes, and a summary of these.
+"""Deterministic evaluation of a policy: episodes, their outcomes and a summary.
 
-`evaluate` is traced: the trainer and compiled programs call it. `play_policy` evaluates a trained policy from Python, and
-`summarize` adds confidence intervals. More than `CHUNK` episodes are played one chunk after the other, each with its own key.
+`evaluate` is traced by the trainer and compiled programs. `play_policy` evaluates a trained policy from Python, and
+`summarize` adds confidence intervals. More than `CHUNK` episodes are played in chunks, each with its own key.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ CHUNK = 500  # episodes at once
 
 
 def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
-    """Plays a deterministic policy: `act` takes observations that lead with [num_episodes]. Returns the outcomes."""
+    """Outcomes of a deterministic policy, traced. `act` maps observations with leading [num_episodes] to actions."""
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
 def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:
-    """Plays a trained policy, as `load_policy` returns it; the outcomes [num_episodes] are NumPy arrays."""
+    """Outcomes [num_episodes] of a policy from `load_policy`, as NumPy arrays. `seed` draws the initial states."""
     chunk = min(num_episodes, CHUNK)
 
     @jax.jit
@@ -44,18 +44,22 @@ def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -
 def in_chunks(
     play: Callable[[Any], Outcome], keys: Iterable[Any], num_episodes: int, fetch: Callable[[Any], Any] = jax.device_get
 ) -> Outcome:
-    """Joins the outcomes [..., chunk] that `play` returns for each of `keys` to NumPy arrays [..., num_episodes]."""
+    """Joins the outcomes [..., chunk] of `play(key)` for all `keys` to NumPy arrays [..., num_episodes]."""
     outcomes = [fetch(play(key)) for key in keys]
     return jax.tree.map(lambda *chunks: np.concatenate(chunks, axis=-1)[..., :num_episodes], *outcomes)
 
 
 def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> dict[str, Any]:
-    """Computes the means of outcomes [N], and the 95 % interval of the success rate (Wilson 1927).
+    """Means of outcomes [N], and Wilson's 95 % interval of the success rate.
 
-    An episode that is not `valid` counts as a failure and has no return.
+    Args:
+      success: success at the last step [N], 0 or 1.
+      reset_success: success at the reset [N], 0 or 1.
+      ret: returns [N].
+      valid: mask [N]. Other episodes count as failures and have no return. Default: all.
 
     Raises:
-      ValueError: a success that is neither 0 nor 1.
+      ValueError: a success is neither 0 nor 1.
     """
     if wrong := [float(x) for x in np.ravel((success, reset_success)) if x not in (0.0, 1.0)]:
         raise ValueError(f"success must be 0 or 1; of {np.size(success)} episodes it is {wrong[0]:g} in {len(wrong)}")
@@ -72,7 +76,7 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
 
 
 def summary(outcome: Outcome) -> dict[str, Array]:
-    """Means over the episodes, [] each, traced. An episode that is not valid counts as a failure and has no return."""
+    """Means [] over the episodes, traced. An invalid episode counts as a failure and has no return."""
     return {
         "success_rate": jnp.mean(outcome.success),
         "reset_success_rate": jnp.mean(outcome.reset_success),
@@ -88,7 +92,7 @@ def return_mean(outcome: Outcome) -> Array:
 
 
 def faults(outcome: Outcome) -> dict[str, Array]:
-    """Fractions [] of rewards outside their range, and of successes, at the end and at the reset, other than 0 or 1."""
+    """Fractions [] of rewards outside their range, and of successes other than 0 or 1."""
     successes = jnp.stack([outcome.success, outcome.reset_success])
     return {
         "bad_rewards": jnp.mean(outcome.bad_rewards),

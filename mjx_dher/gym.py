@@ -1,9 +1,9 @@
-"""Gymnasium environments of the tasks: single ones by `gymnasium.make`, vectorised ones by `gymnasium.make_vec`.
+"""Gymnasium environments of the tasks, for `gymnasium.make` and `gymnasium.make_vec`.
 
     gymnasium.make("mjx_dher.gym:mjx_dher/FetchPush-v0")
     gymnasium.make("mjx_dher.gym:mjx_dher/Env-v0", name="my_module:MyTask")
 
-Importing this module registers them. It loads neither JAX nor MuJoCo; making an environment does.
+Importing this module registers them. JAX and MuJoCo are loaded when an environment is made.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ IDS = {
     "mjx_dher/FetchSlide-v0": "slide",
     "mjx_dher/FetchReach-v0": "reach",
 }
-ENV_ID = "mjx_dher/Env-v0"  # of any environment: its `name` is an argument
+ENV_ID = "mjx_dher/Env-v0"  # any environment, by the argument `name`
 HORIZON = 50  # steps; the tasks' default episode_length, which cannot be read without loading JAX
 PICTURE = 480  # width and height of a picture, pixels
 
@@ -47,40 +47,40 @@ Obs = dict[str, Any]
 
 
 def episode_seed(np_random: np.random.Generator) -> int:
-    """Draws the seed of the next episode, which is the pure environment's from `jax.random.key(seed)`."""
+    """Draws the seed of the next episode, which starts from `jax.random.key(seed)`."""
     return int(np_random.integers(2**31))
 
 
 class _GoalApi:
-    """Methods of gymnasium-robotics' goal environments other than `reset` and `step`, for single and vectorised ones."""
+    """Goal methods of gymnasium-robotics' environments, for single and vectorized ones."""
 
     _compiled: Programs
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Computes the rewards [...] float32 for `achieved_goal` [..., G] and `desired_goal` [..., G]; ignores `info`.
+        """Rewards float32 [...] of goals [..., G]. Ignores `info`.
 
         Raises:
-          ValueError: the goals do not end in an axis of G, or their shapes cannot be broadcast.
+          ValueError: the last axis of the goals is not G, or their shapes cannot be broadcast.
         """
         achieved, desired = self._goals(achieved_goal, desired_goal)
         flat = achieved.reshape(-1, achieved.shape[-1]), desired.reshape(-1, desired.shape[-1])
-        # Padded to a power of two: a learner may ask for another number of goals each time, and each would be compiled anew.
+        # Padded to a power of two, because each new number of goals would be compiled again.
         num_goals = len(flat[0])
         padding = ((0, (1 << max(num_goals - 1, 0).bit_length()) - num_goals), (0, 0))
         rewards = np.array(self._compiled.reward(*(np.pad(goals, padding) for goals in flat)))
         return rewards[:num_goals].reshape(achieved.shape[:-1])[()]
 
     def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Whether reaching these goals ends an episode, bool [...]; always False unless the task ends at its goal.
+        """Whether reaching these goals ends an episode, bool [...]. Always False unless the task ends at its goal.
 
-        Arguments as in `compute_reward`. A failure, which ends an episode for any goal, is in the `terminated` of `step`.
+        Arguments as in `compute_reward`. The `terminated` of `step` also includes failures that end an episode for any goal.
         """
         goals = self._goals(achieved_goal, desired_goal)
         ends = self._compiled.spec.ends_at_goal
         return np.asarray(self._compiled.reached(*goals) if ends else np.zeros(goals[0].shape[:-1], bool))[()]
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Returns [...] False: truncation does not depend on goals. Arguments as in `compute_reward`."""
+        """False [...], because truncation does not depend on goals. Arguments as in `compute_reward`."""
         return np.zeros(self._goals(achieved_goal, desired_goal)[0].shape[:-1], bool)[()]
 
     def _goals(self, achieved_goal: Any, desired_goal: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -99,15 +99,15 @@ class _GoalApi:
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
     """A single environment. `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
 
-    Observations are float32, as the state is. Actions outside [-1, 1] are clipped. A copy or a pickle opens its own renderer.
+    Observations are float32. Actions outside [-1, 1] are clipped. A copy or pickle opens its own renderer.
 
     Args:
-      name: one of `envs.list_envs()`, or module:attribute.
+      name: a task from `envs.list_envs()`, or module:attribute.
       render_mode: None or "rgb_array".
-      **options: arguments of `envs.make`: `engine`, `reward_type`, ...
+      **options: arguments of `envs.make`, such as `engine` or `reward_type`.
 
     Raises:
-      ValueError: as for `envs.make`.
+      ValueError: as in `envs.make`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 - gymnasium's
@@ -126,10 +126,10 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return {**vars(self), "_painter": None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Starts an episode; returns its first observation and info, with `is_success` as in `step`.
+        """Starts an episode. Returns its first observation and info, with `is_success` as in `step`.
 
         Raises:
-          ValueError: `options` is not empty, or `GoalEnv.check` found a fault in the episodes so far.
+          ValueError: `options` is not empty, or `GoalEnv.check` found a fault in earlier episodes.
         """
         (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
@@ -139,13 +139,14 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return obs, {key: value.item() for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Returns observation, reward, `terminated`, `truncated`, and info: `is_success` (1.0 or 0.0) and `failed`.
+        """Applies an action [A]. Returns observation, reward, `terminated`, `truncated` and info.
 
-        `terminated` means that no future follows, `truncated` that the task ends the episode for another reason.
-        `failed` is True from the step at which the simulation diverged to the end of the episode; do not learn from these.
+        `terminated` means that no future follows. `truncated` means that the task ends the episode for another reason. Info
+        has `is_success` (1.0 or 0.0) and `failed`. `failed` is True from the step at which the simulation diverged until the
+        episode ends; do not learn from these steps.
 
         Raises:
-          ValueError: `action` is not of shape [A], or is not finite.
+          ValueError: `action` does not have shape [A], or is not finite.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         self._state = self._compiled.step(self._state, _checked(action, self.action_space, self._state))
@@ -154,14 +155,14 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return obs, reward.item(), terminated, truncated, {key: value.item() for key, value in info.items()}
 
     def render(self) -> np.ndarray:
-        """Draws a picture [480, 480, 3] uint8 of the state, with the goal as a red ball. The first call opens a renderer.
+        """Picture [480, 480, 3] uint8 of the state, with the goal as a red ball. The first call opens a renderer.
 
         Raises:
-          ValueError: the environment was made without render_mode="rgb_array", or cannot be drawn, at all or on this machine.
+          ValueError: the environment was made without render_mode="rgb_array", or cannot be drawn on this machine.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self.render_mode is None:
-            raise ValueError('to be drawn, an environment must be made with render_mode="rgb_array"')
+            raise ValueError('render_mode must be "rgb_array" to draw the environment; got None')
         if self._state is None:
             raise gymnasium.error.ResetNeeded("reset must be called before render")
         if self._painter is None:
@@ -173,37 +174,37 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return self._painter.draw(np.asarray(self._state.physics.qpos), np.asarray(self._state.obs["desired_goal"]))
 
     def close(self) -> None:
-        """Closes the renderer. An environment that was drawn must be closed before the program ends."""
+        """Closes the renderer. Call it before the program ends if the environment was drawn."""
         if self._painter is not None:
             self._painter.close()
             self._painter = None
 
 
 def make_custom(name: str, render_mode: str | None = None, **options: Any) -> gymnasium.Env[Obs, np.ndarray]:
-    """Makes a `GymEnv`, truncated after the environment's own `episode_length`: the entry point of `ENV_ID`."""
+    """Makes a `GymEnv` that is truncated after its `episode_length`: the entry point of `ENV_ID`."""
     env = GymEnv(name, render_mode, **options)
     return TimeLimit(env, env._compiled.spec.episode_length)
 
 
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):
-    """A vectorised environment: N copies of one environment, stepped by one compiled program.
+    """A vectorized environment: N copies of one environment in one compiled program.
 
-    The step after a copy's last one resets it and ignores its action (`AutoresetMode.NEXT_STEP`). Copy i does the
-    same as a single environment with seed + i, up to rounding.
+    The step after an episode's last one resets that copy and ignores its action (`AutoresetMode.NEXT_STEP`). Copy i equals a
+    single environment with seed + i, up to rounding.
 
     Args:
-      name: one of `envs.list_envs()`, or module:attribute.
-      num_envs: number of copies, N.
-      max_episode_steps: length of an episode; None means the environment's `episode_length`.
-      render_mode: must be None; vectorised environments are not drawn.
-      **options: arguments of `envs.make`: `engine`, `reward_type`, ...
+      name: a task from `envs.list_envs()`, or module:attribute.
+      num_envs: number of copies N.
+      max_episode_steps: episode length. Default: the environment's `episode_length`.
+      render_mode: must be None; vectorized environments are not drawn.
+      **options: arguments of `envs.make`, such as `engine` or `reward_type`.
 
     Raises:
-      ValueError: as for `envs.make`; a number is less than 1; or `render_mode` is not None.
+      ValueError: as in `envs.make`, a number is less than 1, or `render_mode` is not None.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - gymnasium's
-    _np_random: Any  # [N] generators; the properties without the underscore return both, as those of `SyncVectorEnv` do
+    _np_random: Any  # [N] generators; `np_random` and `np_random_seed` return both, as in `SyncVectorEnv`
     _np_random_seed: Any  # [N]
 
     def __init__(
@@ -211,7 +212,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
     ):
         check_count("num_envs", num_envs)
         if render_mode is not None:
-            raise ValueError(f"render_mode must be None, because many environments at once are not drawn; got {render_mode!r}")
+            raise ValueError(f"render_mode must be None for a vectorized environment; got {render_mode!r}")
         self._compiled = programs(name, options)
         env = self._compiled.env
         self.num_envs = num_envs
@@ -228,10 +229,10 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Obs, dict[str, Any]]:
-        """Starts N episodes; returns their first observations, and `GymEnv`'s infos as arrays [N], each with a mask.
+        """Starts N episodes. Returns their first observations, and the infos of `GymEnv` as arrays [N], each with a mask.
 
         Args:
-          seed: one seed for each copy, or that of the first: copy i then uses seed + i. None continues the random streams.
+          seed: one seed per copy, or one number: copy i then uses seed + i. None continues the random streams.
           options: must be None or empty.
 
         Raises:
@@ -243,10 +244,10 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, infos
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Returns observations, rewards [N] float64, terminations and truncations [N] bool, and infos; see `GymEnv.step`.
+        """Applies actions [N, A]. Returns arrays with leading [N]; `GymEnv.step` describes them.
 
         Raises:
-          ValueError: `actions` is not of shape [N, A] or is not finite, or `GoalEnv.check` found a fault.
+          ValueError: `actions` does not have shape [N, A] or is not finite, or `GoalEnv.check` found a fault.
           gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         actions = _checked(actions, self.action_space, self._states)
@@ -267,7 +268,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, rewards, terminated, truncated, infos
 
     def _seeds(self, which: np.ndarray) -> np.ndarray:
-        """Seeds [N] int32, drawn for the copies in the mask `which` [N] only."""
+        """Seeds [N] int32. Draws only those of the copies in the mask `which` [N]."""
         drawn = (episode_seed(random) if one else 0 for random, one in zip(self._np_random, which))
         return np.fromiter(drawn, np.int32, self.num_envs)
 
@@ -283,14 +284,14 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
 
 
 def _spaces(spec: EnvSpec) -> tuple[Any, Any]:
-    """Returns the spaces of observations, of which floats have no meaningful bounds, and of actions."""
+    """Observation space, in which floats are unbounded, and action space."""
     goal = gymnasium.spaces.Box(-np.inf, np.inf, (spec.goal_size,), np.float32)
     spaces: dict[str, Any] = {"observation": _space(spec.observation), "achieved_goal": goal, "desired_goal": goal}
     return gymnasium.spaces.Dict(spaces), gymnasium.spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
 
 
 def _space(observation: Any) -> Any:
-    """The space of an observation: a Box for an array, a Dict or a Tuple of them for a tree."""
+    """Space of an observation: a Box for an array, a Dict or Tuple for a tree."""
     if isinstance(observation, Mapping):
         return gymnasium.spaces.Dict({key: _space(value) for key, value in observation.items()})
     if isinstance(observation, (tuple, list)):
@@ -301,7 +302,7 @@ def _space(observation: Any) -> Any:
 
 
 def _to_numpy(state: State) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
-    """Copies observation, reward (float64) and info of one state or a batch to arrays that the caller may write to."""
+    """Copies observation, reward (float64) and info of one state or a batch to writable arrays."""
     obs = {key: _copied(value) for key, value in state.obs.items()}
     failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
     info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
@@ -315,7 +316,9 @@ def _copied(tree: Any) -> Any:
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
-    """Returns `actions` as float32; raises unless they fit `space`, except its bounds, and there is a state to act in."""
+    """Converts `actions` to float32. Raises an error unless they fit `space`, except its bounds, and `reset` has been
+    called.
+    """
     if state is None:
         raise gymnasium.error.ResetNeeded("reset must be called before step")
     actions = np.asarray(actions, np.float32)
@@ -327,7 +330,7 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
 
 
 def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[int | None]:
-    """Returns a seed for each of `count` environments, None if its random stream goes on."""
+    """A seed for each of `count` environments, or None to continue its random stream."""
     if options:
         raise ValueError(f"reset takes no options; got {options!r}")
     seeds = list(seed) if np.iterable(seed) else [seed]
@@ -338,7 +341,7 @@ def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[
         seeds = [None if seed is None else int(seed) + i for i in range(count)]
     if len(seeds) != count:
         raise ValueError(f"seed must be one number or one for each of {count} environments; got {len(seeds)}")
-    return [None if one is None else int(one) for one in seeds]  # gymnasium takes no integers of NumPy's
+    return [None if one is None else int(one) for one in seeds]  # gymnasium rejects NumPy integers
 
 
 _VECTOR: dict[str, Any] = {"vector_entry_point": "mjx_dher.gym:GymVectorEnv"}

@@ -1,4 +1,4 @@
-"""Names that users give: checks with suggestions, import paths "module:attribute", and packages of optional extras.
+"""Names from users: checks with suggestions, import paths "module:attribute", and packages of optional extras.
 
 Loads neither JAX nor MuJoCo.
 """
@@ -20,7 +20,7 @@ from typing import Any
 
 from mjx_dher import trust
 
-# Modules that have no component: of the standard library, and of the libraries that this one is built on.
+# Modules without components: the standard library, and the libraries that this one uses.
 NO_COMPONENTS = frozenset(
     {
         *sys.stdlib_module_names,
@@ -42,7 +42,7 @@ NO_COMPONENTS = frozenset(
         *("setuptools", "tyro", "viser", "warp"),
     }
 )
-current_folder = False  # whether components are searched in the current folder, too, as commands do
+current_folder = False  # whether to search the current folder for components, as commands do
 
 
 def command_name() -> str:
@@ -51,10 +51,13 @@ def command_name() -> str:
 
 
 def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = False) -> None:
-    """Checks that `value` is one of `allowed`, or with `custom` an import path. The module is found, not imported.
+    """Raises ValueError unless a name is allowed. The message lists the allowed names and suggests the nearest.
 
-    Raises:
-      ValueError: lists the allowed names and suggests the nearest.
+    Args:
+      field: setting that the message names.
+      value: name to check.
+      allowed: allowed names.
+      custom: whether "module:attribute" is allowed too. The module must exist; it is not imported.
     """
     allowed = tuple(allowed)
     if value in allowed:
@@ -69,28 +72,28 @@ def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = Fa
 
 
 def is_import_path(name: str) -> bool:
-    """Whether a name is an import path "module:attribute", not a built-in name."""
+    """Whether a name is "module:attribute" and not a built-in name."""
     return ":" in str(name)
 
 
 def load_import_path(field: str, value: str) -> Any:
-    """Imports the module of "module:attribute" and returns the attribute.
+    """Imports "module:attribute".
 
     Raises:
-      ValueError: there is no such module or attribute (the message suggests the nearest), a library has it, a file names it
-        that is not trusted, or the import raises an error.
+      ValueError: the module or attribute does not exist (the message suggests the nearest) or belongs to another library, the
+        name comes from a file that is not trusted, or the import raises an error.
     """
     _check_import_path(field, value)
     trust.check(field, value, module_file(value))
     name, attribute = value.split(":")
     top = name.partition(".")[0]
-    if top not in sys.modules and importlib.util.find_spec(top) is None:  # it is in the current folder
+    if top not in sys.modules and importlib.util.find_spec(top) is None:  # then it is in the current folder
         sys.path.append("")
     try:
         module = importlib.import_module(name)
     except Exception as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None and f"{name}.".startswith(f"{missing}."):  # else the module exists, and imports a missing one
+        if missing is not None and f"{name}.".startswith(f"{missing}."):  # else the module itself imports a missing one
             raise _no_module(field, value, missing) from None
         frames = traceback.extract_tb(error.__traceback__)
         place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
@@ -106,17 +109,17 @@ def load_import_path(field: str, value: str) -> Any:
 
 
 def find_module(top: str) -> ModuleSpec | None:
-    """Finds a top-level module on Python's path, or else in the current folder; does not import it.
+    """Finds a top-level module on Python's path, or in the current folder, without importing it.
 
-    The current folder is on the path only once the user has used a component from there. Else JAX would import plugins, and
-    this library packages of extras that are not installed, from a folder that someone else has made.
+    The current folder joins the path only after the user has used a component from it. Otherwise JAX would import plugins, and
+    this library optional packages, from a folder that someone else may have made.
     """
     spec = importlib.util.find_spec(top)
     return PathFinder.find_spec(top, [""]) if spec is None and current_folder else spec
 
 
 def module_file(value: str) -> Path | None:
-    """File of the module in "module:attribute"; None if there is none. Neither it nor a package around it is imported."""
+    """File of the module in "module:attribute", or None if it does not exist. Imports neither it nor its packages."""
     top, *rest = value.partition(":")[0].split(".")
     try:
         spec = find_module(top)
@@ -128,7 +131,7 @@ def module_file(value: str) -> Path | None:
 
 
 def check_function(field: str, function: Any, parameters: Sequence[str]) -> Callable[..., Any]:
-    """Returns `function`, or raises ValueError unless it can be called with as many arguments as `parameters` names."""
+    """Returns `function`. Raises ValueError unless it can be called with `parameters`."""
     try:
         inspect.signature(function).bind(*parameters)
     except TypeError:
@@ -137,7 +140,7 @@ def check_function(field: str, function: Any, parameters: Sequence[str]) -> Call
 
 
 def require_extra(feature: str, package: str, extra: str) -> None:
-    """Raises ValueError, which names the extra, unless its package is installed. The package is not imported."""
+    """Raises ValueError that names the extra unless `package` is installed. Does not import it."""
     if importlib.util.find_spec(package) is None:
         raise ValueError(missing_extra(feature, package, extra))
 
@@ -150,7 +153,7 @@ def missing_extra(feature: str, package: str, extra: str) -> str:
 def _check_import_path(field: str, value: str) -> None:
     name, _, attribute = value.partition(":")
     if not all(part.isidentifier() for part in (*name.split("."), attribute)):
-        raise ValueError(f"{field} must be module:attribute, the module's name as `import` takes it; got {value!r}")
+        raise ValueError(f"{field} must be module:attribute, with the module's name as in `import`; got {value!r}")
     _check_origin(field, value, name)
     top = name.partition(".")[0]
     if top not in sys.modules and find_module(top) is None:
@@ -159,11 +162,11 @@ def _check_import_path(field: str, value: str) -> None:
 
 def _check_origin(field: str, value: str, module: str) -> None:
     if module.partition(".")[0] in NO_COMPONENTS:
-        raise ValueError(f"{field} must be a component; {value!r} is of {module}, which has none")
+        raise ValueError(f"{field} must be a component; {value!r} is from {module}, which has none")
 
 
 def _no_module(field: str, value: str, missing: str) -> ValueError:
-    """The error for `missing`, the shortest prefix of a module's name that does not exist."""
+    """Error for `missing`, the shortest prefix of a module's name that does not exist."""
     parent = missing.rpartition(".")[0]
     paths = getattr(sys.modules[parent], "__path__", ()) if parent else [".", *sys.path]
     modules = [parent, *(f"{parent}.{module.name}".lstrip(".") for module in pkgutil.iter_modules(paths))]

@@ -1,4 +1,4 @@
-"""Networks of a learner. The default, `mlp`: four linear layers, as the paper has them, ReLU between them."""
+"""Actor and critic networks. The default `mlp` has four linear layers, as in the paper, with ReLU between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _mlp(
 
 
 def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:
-    """Returns the initializers of a layer that takes `x` [..., I]: Xavier's and no bias, or all in +-1/sqrt(I)."""
+    """Initializers of a layer with inputs `x` [..., I]: Xavier's without bias, or uniform in +-1/sqrt(I)."""
     if not fan_in:
         return {"kernel_init": nn.initializers.xavier_uniform()}
     bound = x.shape[-1] ** -0.5
@@ -37,7 +37,9 @@ def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:
 
 
 class Actor(nn.Module):
-    """Deterministic policy: normalized observation and goal to an action in [-1, 1]. Parameters and actions are float32."""
+    """Deterministic policy: maps normalized observation and goal to an action in [-1, 1]. Parameters and actions are
+    float32.
+    """
 
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
@@ -52,7 +54,7 @@ class Actor(nn.Module):
 
 
 class GaussianActor(nn.Module):
-    """Gaussian policy before its tanh: normalized observation and goal to means and log standard deviations, both float32."""
+    """Gaussian policy before tanh: maps normalized observation and goal to means and log standard deviations, in float32."""
 
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
@@ -68,12 +70,12 @@ class GaussianActor(nn.Module):
 
 
 class Critic(nn.Module):
-    """Q value of an action in a state, for a goal, or quantiles of the return. Parameters and values are float32."""
+    """Q value of an action in a state for a goal, or quantiles of the return. Parameters and values are float32."""
 
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
     layer_norm: bool = False  # before each ReLU
-    size: int | None = None  # M, numbers that it gives; one, without an axis, where None
+    size: int | None = None  # outputs M; None: one output without an axis
     fan_in: bool = False  # see the function of that name
 
     @nn.compact
@@ -85,12 +87,12 @@ class Critic(nn.Module):
 
 
 class Networks(NamedTuple):
-    """Modules of actor and critic, as flax modules with `init` and `apply`; static. Their inputs are normalized."""
+    """Flax modules of actor and critic, which are static. Their inputs are normalized."""
 
-    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1], or what `Heads` says
-    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...], or what `Heads` says
-    # Maps an observation tree to a vector [..., D], as a flax module or a function; actor and critic train one each.
-    # Without it, an observation is one float vector, or a tree of float vectors, which are concatenated.
+    actor: Any  # (observation [..., D], goal [..., G]) -> action [..., A] in [-1, 1], or as in `Heads`
+    critic: Any  # (observation [..., D], goal [..., G], action [..., A]) -> value [...], or as in `Heads`
+    # Module or function from an observation tree to a vector [..., D]. Actor and critic train one each.
+    # Without it, observations are float vectors, or trees of float vectors, which are concatenated.
     encoder: Any = None
 
 
@@ -115,85 +117,81 @@ def with_encoder(networks: Networks) -> Networks:
 
 
 class Heads(NamedTuple):
-    """What a learner asks of its networks, where it is not an action and a value."""
+    """Outputs that a learner needs from its networks. The defaults are an action and a value."""
 
-    gaussian: bool = False  # the actor gives (mean [..., A], log standard deviation [..., A]), before tanh
-    critic_size: int | None = None  # M: the critic gives values [..., M]
+    gaussian: bool = False  # the actor returns (mean [..., A], log standard deviation [..., A]), before tanh
+    critic_size: int | None = None  # M: the critic returns values [..., M]
 
 
 PLAIN = Heads()
 
-# make(action_size, hidden_sizes, dtype) -> Networks; those of another dtype have the same parameters. With heads as a fourth
-# argument it serves learners that ask for others than the default.
+# make(action_size, hidden_sizes, dtype) -> Networks; parameters do not depend on the dtype. A fourth argument, heads, is
+# needed by learners with other heads than the default.
 NetworksFn = Callable[..., Networks]
 _PARAMETERS = ("action_size", "hidden_sizes", "dtype")
 
 
 def mlp(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
-    """Makes the default networks."""
+    """The default networks."""
     actor = GaussianActor if heads.gaussian else Actor
     critic = Critic(hidden_sizes, jnp.dtype(dtype), size=heads.critic_size)
     return Networks(actor=actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=critic)
 
 
 def layer_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
-    """Makes the default networks with layer normalization (Ba et al. 2016) in the critic, before each ReLU.
+    """`mlp` with layer normalization (Ba et al. 2016) before each ReLU of the critic.
 
-    It bounds what the critic makes of actions that it never saw (Ball et al. 2023, RLPD).
+    It bounds the critic's values for actions that it never saw (Ball et al. 2023, RLPD).
     """
     networks = mlp(action_size, hidden_sizes, dtype, heads)
     return networks._replace(critic=networks.critic.clone(layer_norm=True))
 
 
 def fan_in(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
-    """Makes the default networks with first weights and biases uniform in +-1/sqrt(inputs of the layer).
+    """`mlp` with initial weights and biases uniform in +-1/sqrt(layer inputs), the default of PyTorch's linear layers.
 
-    So PyTorch's linear layers begin, and with them the code line that the paper's numbers are those of. Xavier's bound,
-    sqrt(6 / (inputs + outputs)), is 1.7 times that in a layer of as many outputs as inputs, and its biases are 0.
+    The code behind the paper's numbers uses PyTorch. Xavier's bound, sqrt(6 / (inputs + outputs)), is 1.7 times as large in a
+    square layer, and its biases are 0.
     """
     networks = mlp(action_size, hidden_sizes, dtype, heads)
     return Networks(actor=networks.actor.clone(fan_in=True), critic=networks.critic.clone(fan_in=True))
 
 
 def make(name: str | NetworksFn) -> NetworksFn:
-    """Returns the function that makes the networks called `name`, of one's own, or named as "module:attribute".
+    """Loads a function that makes networks: a built-in name, "module:attribute", or a function.
 
     Raises:
-      ValueError: no such networks, or no function of (action_size, hidden_sizes, dtype).
+      ValueError: there are no such networks, or it is not a function of (action_size, hidden_sizes, dtype).
     """
     return components.load("networks", name, *_PARAMETERS)
 
 
 def check_heads(make_networks: NetworksFn, learner: str) -> None:
-    """Refuses networks of one's own for a learner that needs other heads than they have.
-
-    Raises:
-      ValueError: they do not take `heads` as a fourth argument.
-    """
+    """Raises ValueError if custom networks do not take `heads` as a fourth argument, which some learners need."""
     try:
         inspect.signature(make_networks).bind(*_PARAMETERS, "heads")
     except TypeError:
         raise ValueError(
-            f"learner {learner} needs networks that are a function ({', '.join(_PARAMETERS)}, heads), with the outputs that"
-            f" networks.Heads says; these are {make_networks!r}"
+            f"networks must be a function ({', '.join(_PARAMETERS)}, heads) for learner {learner}, with the outputs that"
+            f" networks.Heads describes; got {make_networks!r}"
         ) from None
 
 
 def zeros(spec: EnvSpec, networks: Networks, *leading: int) -> tuple[PyTree, Array, Array]:
-    """Inputs of the networks, all zero: observation, goal and action, with leading axes."""
+    """Zero inputs of the networks, with leading axes: observation, goal and action."""
     observation = jax.tree.map(lambda x: jnp.zeros((*leading, *x.shape), x.dtype), spec.observation)
     goal, action = (jnp.zeros((*leading, size)) for size in (spec.goal_size, spec.action_size))
     return concatenated(observation) if networks.encoder is None else observation, goal, action
 
 
 def concatenated(observation: PyTree) -> Array:
-    """One vector [..., D] of a tree of vectors, in the tree's order."""
+    """Concatenates a tree of vectors to one vector [..., D]."""
     leaves = jax.tree.leaves(observation)
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=-1)
 
 
 def check_outputs(learner: str, networks: Networks, spec: EnvSpec, heads: Heads = PLAIN) -> None:
-    """Raises ValueError unless networks `with_encoder` take the observations of `spec` and give what `heads` says."""
+    """Raises ValueError unless networks take the spec's observations and return the outputs in `heads`."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(spec.observation) if networks.encoder is None else ():
         if len(leaf.shape) != 1 or not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(

@@ -1,7 +1,7 @@
 """Running mean and standard deviation, merged batch by batch (Chan, Golub & LeVeque 1983).
 
-Values are one array or a tree of arrays, such as a dict observation. The moments of a tree are a tree of `NormalizerState`s.
-Leaves that are not floats, such as uint8 images, have none (None) and are not normalized.
+Values are an array, or a tree of arrays such as a dict observation; its moments are a tree of `NormalizerState`s. Leaves that
+are not floats, such as uint8 images, are not normalized and have no moments (None).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class NormalizerState:
 
 
 def init(like: PyTree) -> PyTree:
-    """Moments before any value (mean 0, variance 1) for a tree of arrays or `jax.ShapeDtypeStruct`s, without batch axes."""
+    """Initial moments (mean 0, variance 1) for a tree of arrays or `jax.ShapeDtypeStruct`s without batch axes."""
 
     def of(x: Array) -> NormalizerState | None:
         if not jnp.issubdtype(x.dtype, jnp.floating):
@@ -36,14 +36,14 @@ def init(like: PyTree) -> PyTree:
 def update(
     state: PyTree, values: PyTree, clip: Array | float, valid: Array | None = None, axis_name: str | None = None
 ) -> PyTree:
-    """Returns the moments with `values` added, after clipping them to +- `clip`.
+    """Adds values to the moments, after clipping them to +- `clip`.
 
     Args:
       state: moments so far.
-      values: what to add; leaves are [..., D], with any batch axes.
-      clip: bound of the values' magnitudes.
-      valid: bool mask over the first batch axes, at most all of them; the other values are left out, even NaN. None: all count.
-      axis_name: mapped axis of the devices, if each has a part of the values; all devices get the moments of all values.
+      values: values to add; leaves are [..., D], with any batch axes.
+      clip: bound of the magnitudes.
+      valid: bool mask over leading batch axes. Other values are left out, even NaN. Default: all.
+      axis_name: mapped axis of devices that hold parts of the values. Each gets the moments of all values.
     """
     return jax.tree.map(lambda x, moments: _update(moments, x, clip, valid, axis_name), values, state)
 
@@ -76,7 +76,15 @@ def _update(
 
 
 def normalize(state: PyTree, values: PyTree, eps: Array | float, clip: Array | float, input_clip: Array | float) -> PyTree:
-    """`values` clipped to +- `input_clip`, centred, divided by max(std, eps) and clipped to +- `clip`; leaves are [..., D]."""
+    """Normalizes values: clips them to +- `input_clip`, subtracts the mean, divides by max(std, eps) and clips to +- `clip`.
+
+    Args:
+      state: moments.
+      values: values; leaves are [..., D].
+      eps: smallest standard deviation to divide by.
+      clip: bound of the results.
+      input_clip: bound of the values.
+    """
 
     def of(values: Array, state: NormalizerState | None) -> Array:
         if state is None:

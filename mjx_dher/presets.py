@@ -1,4 +1,4 @@
-"""Presets: the tuned settings, and those of the paper. Loads neither JAX nor MuJoCo, except in `machine_preset`."""
+"""Presets: tuned settings, and the paper's. Loads neither JAX nor MuJoCo, except in `machine_preset`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, priority_fr
 
 
 def machine_preset() -> str:
-    """Returns the preset for this machine: gpu where JAX computes on one, else cpu. Loads JAX only where it has a plugin."""
+    """Preset for this machine: gpu if JAX runs on a GPU, else cpu. Loads JAX only if it has a plugin."""
     if importlib.util.find_spec("jax_plugins") is None:
         return "cpu"
     import jax
@@ -27,24 +27,23 @@ def machine_preset() -> str:
 
 
 def preset(name: str, env: str, learner: str | None = None, networks: str | None = None, **changes: Any) -> RunSpec:
-    """Returns the run of a preset in an environment, with `changes` to its fields, such as `sampler` or `seed`.
+    """Run of a preset in an environment.
 
-    `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with
-    warp; `frugal` is tuned for few environment steps, whatever the updates cost (docs/design.md says how). `paper` is the
-    set-up of "Distance Based Replay Sampling in Hindsight Experience Replay", and where that is silent, of the code that its
-    numbers are those of (docs/results.md has a table): its workers' episodes are rolled out side by side, and the gradient of
-    the joint batch stands for the sum of theirs.
+    `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with warp.
+    `frugal` is tuned for few environment steps at any number of updates (docs/design.md). `paper` is the set-up of "Distance
+    Based Replay Sampling in Hindsight Experience Replay", completed from the code behind its numbers (docs/results.md). It
+    rolls out the workers' episodes in parallel and takes the gradient of their joint batch.
 
     Args:
       name: the preset.
       env: the environment.
-      learner: the preset's unless given; `ddpg` and the preset's have numbers of their own, and the preset's may have a
-        priority of its own; others have the numbers of `ddpg`.
-      networks: the preset's for that learner unless given.
-      **changes: other fields of the run.
+      learner: learner. Default: the preset's, which may bring its own numbers and priority. Other learners use the numbers of
+        `ddpg`.
+      networks: networks. Default: the preset's for this learner.
+      **changes: other fields of the run, such as `sampler` or `seed`.
 
     Raises:
-      ValueError: no such preset.
+      ValueError: there is no such preset.
     """
     check_name("preset", name, PRESETS)
     best = _LEARNERS.get((name, env), _DDPG)
@@ -104,15 +103,15 @@ def _paper(env: str) -> tuple[Config, HParams]:
         target_period=40,
         batch_size=256 * workers,
         total_steps=total_steps,
-        # Each worker has a ring of a million; they never hold more than is played.
+        # Each worker has a ring of a million transitions, but cannot fill it with fewer steps.
         replay_size=min(1_000_000 * workers, total_steps),
     )
-    # Adam sees the workers' gradients summed: the mean gradient, with its number to add divided by their number, is the same.
+    # The workers sum their gradients. For Adam, averaging them and dividing its epsilon by their number is the same.
     return config, HParams(random_noise=1.0, adam_eps=1e-8 / workers)
 
 
 def _entropy_pick_and_place(env: str) -> tuple[Config, HParams]:
-    """Returns the settings that the presets of PickAndPlace with `tqc` start from."""
+    """Base settings of the PickAndPlace presets with `tqc`."""
     config, hparams = _gpu(env)
     config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000)
     return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
@@ -125,7 +124,7 @@ def _gpu_slide(env: str) -> tuple[Config, HParams]:
 
 
 def _small(config: Config, hparams: HParams, **sizes: Any) -> tuple[Config, HParams]:
-    """Returns the settings with one critic, two layers and no noise on a target's actions, and with other `sizes`."""
+    """The settings with one critic, two layers, no target noise, and other `sizes`."""
     config = dataclasses.replace(config, num_critics=1, hidden_sizes=(256, 256), **sizes)
     return config, hparams._replace(target_noise=0.0)
 
@@ -148,7 +147,7 @@ def _cpu_slide(env: str) -> tuple[Config, HParams]:
 
 def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
     config, hparams = _entropy_pick_and_place(env)
-    # An epoch a cycle: on two cores a cycle takes some ten seconds.
+    # One cycle per epoch: on two cores it takes some ten seconds.
     config = dataclasses.replace(config, cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000)
     return _small(config, hparams, policy_delay=2)
 
@@ -176,7 +175,7 @@ def _frugal_slide(env: str) -> tuple[Config, HParams]:
 
 
 class _Best(NamedTuple):
-    """A preset's learner for a task; `setup` is None where the settings are those of `ddpg`."""
+    """A preset's learner for a task. Without `setup`, its settings are those for `ddpg`."""
 
     learner: str
     networks: str

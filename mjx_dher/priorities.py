@@ -1,11 +1,11 @@
-"""Priorities: which episodes and transitions are likelier to be learned from, in `priority_fraction` of a batch.
+"""Priorities: episodes and transitions that are drawn more often, for `priority_fraction` of a batch.
 
-A priority of episodes is a pure function of one whole episode to a weight, 0 or more:
+An episode priority is a pure function from one whole episode to a weight, 0 or more:
 
     priority(episode, context) -> []
 
-The ring stores each episode's weight with it; `replay.draw_rows` draws episodes in proportion to their weights. A `Priority`
-can do more: renew the weights of the whole ring at each cycle, and choose among transitions that are drawn and relabelled.
+The ring stores the weight with the episode, and `replay.draw_rows` draws episodes in proportion to it. A `Priority` can also
+renew all weights once per cycle, and choose among relabelled transitions.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mjx_dher.context import Context, of_each_episode, one_of
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
 
-CANDIDATES = 4  # transitions that are drawn for each that a priority of transitions chooses
+CANDIDATES = 4  # transitions drawn per transition that `choose` keeps
 GRAVITY = 9.81  # m/s^2
 
 # priority(episode, context) -> weight [], 0 or more
@@ -35,30 +35,30 @@ ChooseFn = Callable[[PRNGKey, Sample, Batch, int, Context], Array]
 
 @dataclasses.dataclass(frozen=True)
 class Priority:
-    """A priority: any of three ways to prefer, each of them optional."""
+    """A priority. Each of its three functions is optional."""
 
-    weigh: PriorityFn | None = None  # an episode, once, when it is added
-    renew: RenewFn | None = None  # episodes of the ring, at each cycle, before anything is learned
-    choose: ChooseFn | None = None  # among transitions, hindsight goals in place
-    uses_values: bool = False  # of `context.values`
-    by_part: bool = False  # whether `renew` weighs each episode alone, so that it may get a ring of some (`Config.renewals`)
+    weigh: PriorityFn | None = None  # weight of an episode when it is added
+    renew: RenewFn | None = None  # weights of the ring's episodes, once per cycle, before learning
+    choose: ChooseFn | None = None  # choice among relabelled transitions
+    uses_values: bool = False  # whether it reads `context.values`
+    by_part: bool = False  # whether `renew` weighs each episode alone and may get part of the ring (`Config.renewals`)
 
 
 def eventful(episode: Episode, context: Context) -> Array:
-    """1.0 for an episode whose last achieved goal was not yet reached, as a goal, at its start; else 0.0.
+    """1.0 if the last achieved goal was not yet reached at the start of the episode, else 0.0.
 
-    In all other episodes the hindsight goals are much the same, reached from the first step on, and do not show how to reach
-    any. Asking the environment needs no scale and no threshold. Cf. the filter for misleading samples of Manela & Biess 2021
-    and the energy-based prioritization of Zhao & Tresp 2018.
+    In other episodes the hindsight goals are nearly equal, and reached from the first step. They do not show how to reach any
+    goal. The test needs neither scale nor threshold. Compare the filter of Manela & Biess 2021 for misleading samples, and the
+    energy-based prioritization of Zhao & Tresp 2018.
     """
     return (~context.reached(episode.achieved_goal[0], episode.achieved_goal[-1])).astype(jnp.float32)
 
 
 def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
-    """Gives the priority called `name`, a function or `Priority` of your own, or what "module:attribute" names.
+    """Loads a priority: a built-in name, "module:attribute", a function, or a `Priority`.
 
     Raises:
-      ValueError: no such priority, module or attribute, or neither a function of (episode, context) nor a `Priority`.
+      ValueError: there is no such priority, or it is neither a function of (episode, context) nor a `Priority`.
     """
     value = components.load("priority", name)
     if not isinstance(value, Priority):
@@ -77,15 +77,15 @@ def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
 
 
 def whole(priority: Priority | PriorityFn) -> Priority:
-    """Gives a priority as a `Priority`."""
+    """Converts a priority function to a `Priority`."""
     return priority if isinstance(priority, Priority) else Priority(weigh=priority)
 
 
 def weights(priority: PriorityFn | Priority, episodes: Episode, context: Context) -> Array:
-    """Weights [N] of N episodes (leaves lead with [N]), float32; anything but a positive, finite number becomes 0.
+    """Weights [N] of N episodes (leaves lead with [N]), float32. Any weight that is not positive and finite becomes 0.
 
     Raises:
-      ValueError: the priority gives no scalar, or no real number.
+      ValueError: the priority does not return a real number [].
     """
     number, weigh = episodes.action.shape[0], whole(priority).weigh
     if weigh is None:
@@ -95,16 +95,16 @@ def weights(priority: PriorityFn | Priority, episodes: Episode, context: Context
 
 
 def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array | None = None) -> ReplayState:
-    """Renews the ring's weights by `priority.renew`, if it has such a function.
+    """Renews the ring's weights with `priority.renew`, if it exists.
 
     Args:
       priority: the priority.
       ring: the ring.
-      context: what `renew` may look at.
-      rows: [R] rows to renew, passed to `renew` as a ring of their own; None: all. A row may be there twice.
+      context: input of `renew`.
+      rows: rows [R] to renew, which `renew` gets as a ring. They may repeat. Default: all.
 
     Raises:
-      ValueError: the weights are no real numbers [E], or [R].
+      ValueError: `renew` does not return real numbers [E], or [R].
     """
     if priority.renew is None:
         return ring
@@ -118,12 +118,21 @@ def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array |
 def choose(
     priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context
 ) -> tuple[Sample, Batch]:
-    """Chooses `number` of CANDIDATES times as many transitions: a share `priority_fraction` by `priority.choose`.
+    """Chooses transitions among candidates.
 
-    The others are the first of each CANDIDATES, as if no more had been drawn.
+    With probability `priority_fraction`, `priority.choose` picks a transition. Otherwise it is the first of its CANDIDATES, as
+    if no more had been drawn.
+
+    Args:
+      priority: the priority.
+      key: random key.
+      sample: candidates, CANDIDATES * number of them.
+      batch: the candidates after relabelling.
+      number: number of transitions to keep.
+      context: input of the priority.
 
     Raises:
-      ValueError: `priority.choose` does not give integers [number].
+      ValueError: `priority.choose` does not return integers [number].
     """
     choose_key, coin_key = jax.random.split(key)
     indices = _choose(priority, choose_key, sample, batch, number, context)
@@ -134,10 +143,10 @@ def choose(
 
 
 def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
-    """Makes a `choose` that keeps one of each CANDIDATES transitions, in proportion to weights [B'] that `weigh` gives.
+    """Makes a `choose` that keeps one of each CANDIDATES transitions, in proportion to the weights [B'] from `weigh`.
 
-    A weight that is no positive, finite number is 0; if all of a group are 0, any is kept. Raises ValueError unless `weigh`
-    gives one weight for each transition.
+    A weight that is not positive and finite counts as 0. If all candidates have weight 0, the choice is uniform. Raises
+    ValueError unless `weigh` returns one weight per transition.
     """
 
     def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
@@ -155,10 +164,11 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
 
 
 def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
-    """Joins priorities in one compiled program: the traced number `hparams.priority_choice` says which one a lane uses.
+    """Joins priorities in one compiled program, in which the traced number `hparams.priority_choice` selects a lane's
+    priority.
 
     Raises:
-      ValueError: no priority, or something else in its place.
+      ValueError: `choices` is empty, or contains something other than a priority.
     """
     made = [whole(make(choice)) for choice in choices]
     if not made:
@@ -185,7 +195,7 @@ def _renew(priority: Priority, ring: ReplayState, context: Context) -> Array:
 
 
 def _choose(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
-    """Indices [number] of the candidates to keep, int32; without `choose`, the first of each group."""
+    """Indices [number] of the candidates to keep, int32. Without `choose`, they are the first of each group."""
     if priority.choose is None:
         return CANDIDATES * jnp.arange(number, dtype=jnp.int32)
     indices = priority.choose(key, sample, batch, number, context)
@@ -193,12 +203,12 @@ def _choose(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, numb
 
 
 def energy(episode: Episode, context: Context) -> Array:
-    """Energy that the object was given in an episode, J a kg (Zhao & Tresp 2018, "EBP").
+    """Energy given to the object in an episode, in J per kg (Zhao & Tresp 2018, "EBP").
 
     sum_t max(E_t - E_(t-1), 0),  E_t = g (z_t - z_0) + |v_t|^2 / 2,  E_0 = 0
 
-    with v_t from differences of achieved goals. Losses do not count, nor does rotation, which positions do not show. A goal of
-    fewer than three coordinates has no height.
+    where v_t are differences of achieved goals. Energy losses do not count, nor does rotation, which positions do not show. A
+    goal of fewer than three coordinates has no height.
     """
     achieved = episode.achieved_goal
     kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / context.dt), axis=-1)
@@ -208,7 +218,7 @@ def energy(episode: Episode, context: Context) -> Array:
 
 
 def displacements(achieved: Array) -> Array:
-    """Displacements [T+1, G] of achieved goals [T+1, G] in one step; the first is 0."""
+    """Displacements [T+1, G] per step of achieved goals [T+1, G]. The first is 0."""
     return jnp.concatenate([jnp.zeros_like(achieved[:1]), achieved[1:] - achieved[:-1]])
 
 
@@ -218,7 +228,7 @@ def _error_size(sample: Sample, batch: Batch, context: Context) -> Array:
 
 
 def _mean_error(ring: ReplayState, context: Context) -> Array:
-    """Mean size [E] of each episode's one-step errors, for the goal that it was played for."""
+    """Mean absolute one-step error of each episode, for its desired goal, shape [E]."""
 
     def of_episode(episode: Episode) -> Array:
         step = jnp.arange(episode.action.shape[0])

@@ -1,4 +1,4 @@
-"""Hindsight: transitions whose goal is replaced by an achieved one, with the reward recomputed."""
+"""Hindsight relabelling: replaces goals by achieved ones and recomputes the rewards."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from mjx_dher.replay import Cumulative, Pool, ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey
 
-_CHOOSE = 0x43686F69  # folded into a draw's key, for a choice among transitions; no index of `jax.random.split`
+_CHOOSE = 0x43686F69  # folded into the key that chooses among transitions; no index of `jax.random.split`
 
 
 class Hindsight(NamedTuple):
-    """Hindsight goals, one for each transition."""
+    """Hindsight goals, one per transition."""
 
     goals: Array  # [B, G]
-    offered: Array  # [B] whether the sampler offered a goal, bool; without one, `goals` has the transition's own
+    offered: Array  # [B] whether the sampler offered a goal, bool; else `goals` has the transition's own
 
 
 def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey) -> Hindsight:
-    """Chooses an achieved goal for each transition of `sample` by `sampler`.
+    """Draws an achieved goal for each transition.
 
     Args:
-      sample: transitions. For a sampler that takes goals of other episodes `sample.pool` must be there, for one with a score
-        `sample.score` (`add_choices` adds both).
+      sample: transitions [B]. Samplers that use goals of other episodes need `sample.pool`, and samplers with a score need
+        `sample.score` (see `add_choices`).
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
       hparams: numbers that the sampler reads.
       key: random key.
 
     Raises:
-      ValueError: log weights that are no floats [T+1], or a sample without what the sampler needs.
+      ValueError: log weights are not floats [T+1], or `sample` lacks a field that the sampler needs.
     """
     sampler = samplers.make(sampler)
     batch_size = sample.step.shape[0]
     goals, length = sample.episode_goals, sample.length
     if sampler.cross_episode:
         if sample.pool is None:
-            raise ValueError("pool is missing: this sampler takes goals of other episodes (relabel.add_choices)")
+            raise ValueError("pool is missing: this sampler uses goals of other episodes (relabel.add_choices)")
         goals, length = _from_pool(sampler, sample, hparams)
     weigh = functools.partial(samplers.weigh, sampler)
     axes = (0, 0, 0, None, None if sample.score is None else 0, 0 if sample.ends else None)
@@ -59,7 +59,7 @@ def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HP
 
 
 def _from_pool(sampler: Sampler, sample: Sample, hparams: HParams) -> Pool:
-    """Goals and lengths of other episodes, or of the transition's own if a traced `cross_episode` says so."""
+    """Goals and lengths of other episodes, or of the transition's own if the traced `cross_episode` is False."""
     pool = sample.pool
     assert pool is not None
     if not callable(sampler.cross_episode):
@@ -69,16 +69,16 @@ def _from_pool(sampler: Sampler, sample: Sample, hparams: HParams) -> Pool:
 
 
 def _keys(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey]:
-    """Keys for which transitions to relabel, for goals of other episodes, and for the choice among goals."""
+    """Keys for the relabelling coin, for goals of other episodes, and for the choice among goals."""
     coin_key, goal_key = jax.random.split(key)
     pool_key, draw_key = jax.random.split(goal_key)
     return coin_key, pool_key, draw_key
 
 
 def add_choices(ring: ReplayState, sample: Sample, sampler: Sampler, scores: Array | None, key: PRNGKey) -> Sample:
-    """Adds to `sample` what `sampler` needs beside its episode's goals: goals of other episodes of `ring`, and scores.
+    """Adds goals of other episodes and scores to a sample, if the sampler uses them.
 
-    `scores` are those of the ring's episodes [E, T+1] (`samplers.score_episodes`), or None. `key` is the key for `relabel`.
+    `scores` has shape [E, T+1] (`samplers.score_episodes`), or None. Pass the same `key` to `relabel`.
     """
     if sampler.cross_episode:
         sample = dataclasses.replace(sample, pool=replay.sample_pool(ring, _keys(key)[1], sample.step.shape[0]))
@@ -86,26 +86,27 @@ def add_choices(ring: ReplayState, sample: Sample, sampler: Sampler, scores: Arr
 
 
 class Relabelled(NamedTuple):
-    """A relabelled batch, and the share of its transitions that should have got a goal and were offered none."""
+    """A relabelled batch, and the fraction of transitions chosen for relabelling that were offered no goal."""
 
     batch: Batch
     no_goal_share: Array  # []
 
 
 def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, key: PRNGKey) -> Relabelled:
-    """Relabels each transition with probability k/(k+1), k = `hparams.her_k`; k may be infinite.
+    """Relabels each transition with probability k/(k+1), where k is `hparams.her_k` and may be infinite.
 
-    The reward is that of the goal achieved at the transition's end, `compute_reward(achieved at step+1, goal)`. The discount is
-    gamma, or 0 where no future follows: after a failure, and after the goal is reached if that ends the episode.
+    Rewards are recomputed for the goal achieved at the end of the transition. The discount is gamma, or 0 if no future
+    follows: after a failure, and after reaching the goal if that ends the episode.
 
     Args:
-      sample: transitions, with what `hindsight_goals` needs.
+      sample: transitions [B], with the fields that `hindsight_goals` needs.
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
-      context: rewards, and numbers: her_k, gamma and whatever the sampler reads. `Context(compute_reward, HParams())` will do.
+      context: reward function and numbers (her_k, gamma and those of the sampler), such as `Context(compute_reward,
+        HParams())`.
       key: random key.
 
     Raises:
-      ValueError: log weights that are not [T+1], or rewards that are not [B].
+      ValueError: log weights are not [T+1], or rewards are not [B].
     """
     hparams = context.hparams
     coin_key, _, goal_key = _keys(key)
@@ -135,7 +136,7 @@ def _gamma(context: Context) -> Array:
 
 
 def _is_terminal(sample: Sample, achieved: Array, desired: Array, context: Context) -> Array:
-    """Whether no future follows transitions [B] that end with `achieved` [B, G], bool [B]."""
+    """Whether no future follows transitions that end with `achieved` [B, G], bool [B]."""
     return sample.terminal | context.reached(achieved, desired) if context.ends_at_goal else sample.terminal
 
 
@@ -150,18 +151,18 @@ def draw_batches(
     scores: Array | None = None,
     priority: Priority | None = None,
 ) -> Batch:
-    """Draws and relabels transitions as the learner takes them, all at once.
+    """Draws and relabels transitions for the learner.
 
     Args:
-      ring: the replay ring, which must not be empty.
+      ring: the replay ring. It must not be empty.
       key: random key.
       shape: leading axes of the batch's leaves.
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
-      context: a fraction `hparams.priority_fraction` of the transitions is from episodes drawn by priority.
+      context: reward function and numbers. Its `hparams.priority_fraction` is the fraction drawn by priority.
       weights: `replay.cumulative(ring)`.
       n_step: steps of a return (`look_ahead`).
-      scores: [E, T+1] `samplers.score_episodes` of the ring's episodes, for a sampler with a score.
-      priority: if it chooses among transitions, several candidates are drawn for each.
+      scores: scores [E, T+1] of the ring's episodes, for a sampler with a score.
+      priority: priority. If it chooses among transitions, several candidates are drawn for each.
     """
     number, sampler = math.prod(shape), samplers.make(sampler)
 
@@ -185,21 +186,21 @@ def draw_batches(
 
 
 def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
-    """Reward factor [B]: `hindsight_reward` if the goal was replaced by another, else 1.
+    """Reward factor, shape [B]: `hindsight_reward` if the goal was replaced by another, else 1.
 
-    Lanka & Wu 2018 (ARCHER): hindsight rewards are numerically greater than real ones. Negative rewards times a factor below 1
-    are greater, and all returns stay in their bounds.
+    In ARCHER (Lanka & Wu 2018), hindsight rewards are greater than real ones. A factor below 1 makes negative rewards greater
+    and keeps all returns in their bounds.
     """
     replaced = jnp.any(batch.desired_goal != sample.desired_goal, axis=-1)
-    dtype = jnp.promote_types(batch.reward.dtype, jnp.float32)  # rewards may be integers, the factor is none
+    dtype = jnp.promote_types(batch.reward.dtype, jnp.float32)  # rewards may be integers
     return jnp.where(replaced, jnp.asarray(hparams.hindsight_reward, dtype), jnp.ones(replaced.shape, dtype))
 
 
 def look_ahead(ring: ReplayState, sample: Sample, batch: Batch, context: Context, n_step: int) -> Batch:
-    """Extends the batch that `relabel` made of `sample` to returns of up to `n_step` steps.
+    """Extends a relabelled batch to returns of up to `n_step` steps. `sample` is the batch before relabelling.
 
-    A return ends with the episode, and when the goal is reached: the actions after that were aimed at another goal. Until then
-    actions are those of the policies that played; as in Hessel et al. 2018, the returns are not corrected for that.
+    A return stops at the end of the episode, or when the goal is reached, because later actions aimed at another goal. As in
+    Hessel et al. 2018, returns are not corrected for older policies.
     """
     last = sample.length if sample.ends else sample.episode_goals.shape[1] - 1
     ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]

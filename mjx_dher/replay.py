@@ -1,8 +1,7 @@
-"""A ring of whole episodes on the device.
+"""Replay ring of whole episodes on the device.
 
-Each observation is stored once (there is no next-observation copy), and a sampled transition looks only at its own episode's
-row, so an index cannot reach into a neighbour. An episode that ended early is padded to T steps; padded steps are never drawn.
-All functions are pure.
+Each observation is stored once, without a next-observation copy. A sampled transition reads only the row of its own episode.
+Episodes that end early are padded to T steps, and padded steps are never drawn. All functions are pure.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from flax import struct
 from mjx_dher.check import array, describe
 from mjx_dher.types import Array, Episode, PRNGKey, PyTree, check_size
 
-HUGE = 2.0**64  # a value above which sums could overflow
+HUGE = 2.0**64  # sums of larger values could overflow
 
 
 @struct.dataclass
@@ -26,7 +25,7 @@ class ReplayState:
     """The ring and its write position."""
 
     episodes: Episode  # every leaf leads with [E]
-    priority: Array  # [E] weight by which `draw_rows` can draw the episode, float32
+    priority: Array  # [E] weight of the episode in `draw_rows`, float32
     cursor: Array  # [] row that is written next, int32
     size: Array  # [] rows that hold an episode, int32
     ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T (`EnvSpec.ends`)
@@ -34,31 +33,31 @@ class ReplayState:
 
 @struct.dataclass
 class Sample:
-    """Transitions drawn from the ring, each with everything that relabelling reads."""
+    """Transitions drawn from the ring, with everything that relabelling reads."""
 
     observation: PyTree  # [B, D]
     next_observation: PyTree  # [B, D]
     action: Array  # [B, A]
     episode_goals: Array  # [B, T+1, G] achieved goals of the transition's episode
-    desired_goal: Array  # [B, G] the goal that the episode was played for
-    step: Array  # [B] the transition leads from `step` to `step + 1`, int32
+    desired_goal: Array  # [B, G] desired goal of the episode
+    step: Array  # [B] index of the transition from `step` to `step + 1`, int32
     row: Array  # [B] ring row of the episode, int32
     length: Array  # [B] steps of the episode, int32
     terminal: Array  # [B] whether no future follows this transition, for any goal, bool
-    pool: Pool | None = None  # goals of other episodes, for a sampler that takes them
-    score: Array | None = None  # [B, T+1] scores of `episode_goals`, for a sampler that has them (`samplers.Sampler`)
+    pool: Pool | None = None  # goals of other episodes, if the sampler uses them
+    score: Array | None = None  # [B, T+1] scores of `episode_goals`, if the sampler has a score
     ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T
 
 
 class Pool(NamedTuple):
-    """Achieved goals of one random episode for each transition."""
+    """Achieved goals of one random episode per transition."""
 
     goals: Array  # [B, T+1, G]
     length: Array  # [B] int32
 
 
 class Cumulative(NamedTuple):
-    """Cumulative weights [E] of the rows, int32, from which `draw_rows` draws. A loop of draws computes them once."""
+    """Cumulative weights [E] of the rows, int32, for `draw_rows`. Computed once per cycle."""
 
     priority: Array  # of priorities (times lengths, if episodes can be shorter than T)
     length: Array | None  # of lengths; None if all are T, and rows are drawn uniformly
@@ -68,12 +67,12 @@ def init(episode: Episode, num_episodes: int, ends: bool = False) -> ReplayState
     """Makes an empty ring.
 
     Args:
-      episode: one unbatched episode whose shapes and dtypes the ring takes (arrays or `jax.ShapeDtypeStruct`s).
+      episode: one unbatched episode with the shapes and dtypes to store (arrays or `jax.ShapeDtypeStruct`s).
       num_episodes: rows E.
       ends: whether episodes can be shorter than T.
 
     Raises:
-      ValueError: fewer than one episode, or leaves whose shapes do not agree.
+      ValueError: `num_episodes` is below 1, or the shapes of the leaves disagree.
     """
     check_size("num_episodes", num_episodes)
     episode = episode.filled()
@@ -88,7 +87,7 @@ def init(episode: Episode, num_episodes: int, ends: bool = False) -> ReplayState
 
 
 def _check_one(episode: Episode) -> None:
-    """Raises ValueError unless one unbatched episode has the shapes that `Episode` documents."""
+    """Raises ValueError unless an unbatched episode has the shapes that `Episode` documents."""
     leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(episode)}
     for name, leaf in leaves.items():
         if not hasattr(leaf, "shape") or 0 in leaf.shape:
@@ -119,16 +118,16 @@ def capacity(state: ReplayState) -> int:
 
 
 def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, valid: Array | None = None) -> ReplayState:
-    """Writes `episodes` (leaves lead with [N]) over the ring's oldest.
+    """Overwrites the oldest episodes of the ring with new ones.
 
     Args:
       state: the ring.
-      episodes: N episodes.
-      priority: [N], or one number for all: weight by which `draw_rows` can draw an episode, as `as_priority` takes it.
-      valid: [N] which of them to write, bool. The others leave no trace. None: all.
+      episodes: N episodes; leaves lead with [N].
+      priority: weights [N] for `draw_rows`, or one number for all (see `as_priority`).
+      valid: mask [N] of the episodes to write, bool. Default: all.
 
     Raises:
-      ValueError: more episodes at once than the ring holds, or arrays of other shapes or dtypes than its own.
+      ValueError: more episodes than the ring holds, or arrays with other shapes or dtypes.
     """
     episodes = episodes.filled()
     num_new, num_rows = _check_new(state, episodes, priority, valid), capacity(state)
@@ -137,7 +136,7 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
     valid = jnp.ones(num_new, bool) if valid is None else jnp.asarray(valid, bool)
     order = jnp.cumsum(valid, dtype=jnp.int32) - 1
     written = order[-1] + 1
-    # Out of bounds where not valid, so that the write is dropped; each its own, because indices are promised to be unique.
+    # Invalid episodes get rows out of bounds, whose writes are dropped. They differ, because indices must be unique.
     rows = jnp.where(valid, (state.cursor + order) % num_rows, num_rows + jnp.arange(num_new, dtype=jnp.int32))
 
     def write(ring: Array, new: Array | float) -> Array:
@@ -153,13 +152,13 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
 
 
 def as_priority(weight: Array | float) -> Array:
-    """Converts weights to float32; anything but a positive, finite number becomes 0. Raises ValueError for other types."""
+    """Converts weights to float32. Any weight that is not positive and finite becomes 0. Raises ValueError for other types."""
     weight = array("priority", weight, np.shape(weight), jnp.number).astype(jnp.float32)
     return jnp.where((weight > 0) & jnp.isfinite(weight), weight, 0.0)
 
 
 def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, valid: Array | None) -> int:
-    """Returns the number of `episodes`, N; raises ValueError for what `state` has no place for, by its name."""
+    """Number N of `episodes`. Raises ValueError for arrays that do not fit `state`."""
     ring = dict(jax.tree_util.tree_leaves_with_path(state.episodes))
     new = dict(jax.tree_util.tree_leaves_with_path(episodes))
     structure: PyTree = jax.tree.structure(state.episodes)
@@ -181,7 +180,7 @@ def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, v
         if value is not None and np.shape(value) not in ((), leading)[name == "valid" :]:
             raise ValueError(f"{name} must be [N] = {list(leading)}, one for each episode; got {list(np.shape(value))}")
     if leading == (0,):
-        raise ValueError("add takes one or more episodes; got none")
+        raise ValueError("episodes must have at least one episode; got none")
     return leading[0]
 
 
@@ -191,15 +190,12 @@ def can_sample(state: ReplayState) -> Array:
 
 
 def sum_factor(values: Array) -> Array:
-    """Power of two []: times it, values can be summed without overflow. It is 1 unless one of them is huge.
-
-    A power of two keeps every digit, so proportions and, divided by it again, means stay what they are.
-    """
+    """Factor [] that lets huge values be summed without overflow: 1, or a small power of two, which keeps every digit."""
     return jnp.where(jnp.max(jnp.abs(values)) > HUGE, 1.0 / HUGE, 1.0)
 
 
 def mean(values: Array, number: Array | int) -> Array:
-    """Mean [] of `number` of the values [E], the others being 0; 0 if there is none. It does not overflow."""
+    """Mean [] of `number` of the values [E], of which the others are 0. It does not overflow, and is 0 if `number` is 0."""
     factor = sum_factor(values)
     return jnp.sum(values * factor) / jnp.maximum(number, 1).astype(jnp.float32) / factor
 
@@ -214,10 +210,9 @@ def cumulative(state: ReplayState) -> Cumulative:
 
 
 def _cumulate(weight: Array) -> Array:
-    """Cumulative sums [E] of weights, int32, in units that make the last about 2^29.
+    """Cumulative sums [E] of weights, int32, in units for which the last is about 2^29.
 
-    Integers make the sums exact and monotone, whatever the order of addition. The unit is a power of two, so that weights of
-    0 and 1 are exact.
+    Integer sums are exact and monotone in any order of addition. The unit is a power of two, so weights of 0 and 1 are exact.
     """
     exponent_bits = 0x7F800000  # of a float32: alone they stand for the largest power of two that is not greater
     total = jnp.maximum(jnp.sum(weight), jnp.finfo(jnp.float32).tiny)
@@ -227,10 +222,15 @@ def _cumulate(weight: Array) -> Array:
 
 
 def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array | float, weights: Cumulative) -> Array:
-    """Draws rows [B] of the ring, so that a uniform step of each row is a transition of the ring.
+    """Draws rows [B] of the ring, int32. A uniform step of each row is a transition drawn from the ring.
 
-    With probability `fraction`, a transition is drawn in proportion to its episode's priority, else uniformly; also uniformly
-    while all priorities are 0. `weights` is `cumulative(state)`. The ring must not be empty.
+    Args:
+      state: the ring. It must not be empty.
+      key: random key.
+      batch_size: number of rows B.
+      fraction: probability of drawing a row by priority instead of uniformly. All draws are uniform while all priorities are
+        0.
+      weights: `cumulative(state)`.
     """
     coin_key, bits_key = jax.random.split(key)
     any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size))
@@ -241,13 +241,13 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array
 
 
 def _row_at(cumulative: Array, bits: Array) -> Array:
-    """Maps random `bits` [B] to rows, in proportion to the weights whose cumulative sums are given."""
+    """Maps random `bits` [B] to rows, in proportion to the weights behind the `cumulative` sums."""
     rank = 1 + randint_from_bits(bits, cumulative[-1])
     return jnp.searchsorted(cumulative, rank).astype(jnp.int32)
 
 
 def take(state: ReplayState, rows: Array) -> ReplayState:
-    """Makes a full ring of the episodes in `rows` [R], with their priorities."""
+    """Full ring of the episodes in `rows` [R], with their priorities."""
     episodes = jax.tree.map(lambda x: x[rows], state.episodes)
     number = jnp.asarray(rows.shape[0], jnp.int32)
     cursor = jnp.zeros_like(number)
@@ -255,21 +255,25 @@ def take(state: ReplayState, rows: Array) -> ReplayState:
 
 
 def newest_and_others(state: ReplayState, key: PRNGKey, newest: int, others: int) -> Array:
-    """Rows [newest + others] of the newest episodes, and of others drawn at random, with replacement.
+    """Rows [newest + others]: the newest, and random others with replacement.
 
-    Rows of `newest` hold no episode while fewer have been written. The ring must not be empty for the others.
+    The newest are partly empty until that many episodes have been written. The ring must not be empty if `others` is positive.
     """
     new = (state.cursor - 1 - jnp.arange(newest, dtype=jnp.int32)) % capacity(state)
     return jnp.concatenate([new, randint_from_bits(jax.random.bits(key, (others,)), state.size)])
 
 
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
-    """Draws `batch_size` transitions with replacement: a uniform step of each of `rows` [B].
+    """Draws transitions with replacement.
 
-    Without `rows`, uniform over all transitions in the ring, which must not be empty.
+    Args:
+      state: the ring. It must not be empty.
+      key: random key.
+      batch_size: number of transitions B.
+      rows: rows [B] from which to draw a uniform step each. Default: uniform over all transitions.
 
     Raises:
-      ValueError: fewer than one transition, or `rows` that are not integers [B].
+      ValueError: `batch_size` is below 1, or `rows` are not integers [B].
     """
     check_size("batch_size", batch_size)
     row_bits, step_bits = jax.random.bits(key, (2, batch_size))
@@ -297,16 +301,15 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
 
 def sample_pool(state: ReplayState, key: PRNGKey, batch_size: int) -> Pool:
-    """Draws one episode for each of `batch_size` transitions, uniformly. The ring must not be empty."""
+    """Draws one uniform episode for each of `batch_size` transitions. The ring must not be empty."""
     rows = randint_from_bits(jax.random.bits(key, (batch_size,)), state.size)
     return Pool(state.episodes.achieved_goal[rows], state.episodes.length[rows])
 
 
 def randint_from_bits(bits: Array, number: Array | int) -> Array:
-    """Maps random `bits`, uint32 of any shape, to int32 in [0, number), by the high word of bits * number (Lemire 2019).
+    """Maps random `bits`, uint32 of any shape, to int32 in [0, number) (Lemire 2019). `number` is a scalar or has their shape.
 
-    `number` is one for all, or of the shape of `bits`; the result is 0 for 0. The bias is at most `number` / 2^32.
-    `jax.random.randint` makes three draws, each of more than a hundred operations to a compiler.
+    The bias is at most `number` / 2^32. This compiles to far fewer operations than `jax.random.randint`.
     """
     number = jnp.asarray(number, jnp.uint32)
     high, low, number_high, number_low = bits >> 16, bits & 0xFFFF, number >> 16, number & 0xFFFF

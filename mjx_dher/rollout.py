@@ -1,4 +1,4 @@
-"""Whole episodes, many at once: a reset and a scan."""
+"""Rollouts of many whole episodes: a reset and a scan."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ GoalsFn = Callable[[GoalObs], Array]
 
 
 class Outcome(NamedTuple):
-    """Outcomes of episodes; all [N]."""
+    """Outcomes of episodes, each [N]."""
 
     success: Array  # 1.0 if the goal is reached at the last step
     reset_success: Array  # 1.0 if it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
     valid: Array  # whether all observations, actions and rewards are finite and the environment is not `failed`, bool
-    bad_rewards: Array  # share of the episode's rewards outside the reward range
+    bad_rewards: Array  # fraction of rewards outside the reward range
     length: Array  # steps that were played, int32
 
 
@@ -42,24 +42,23 @@ class _Playing(NamedTuple):
 def rollout(
     env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None, goals: GoalsFn | None = None
 ) -> tuple[Episode, Outcome]:
-    """Plays `num_envs` episodes side by side.
-
-    An episode that ends early keeps its last state until all of them have had `episode_length` steps.
+    """Plays episodes in parallel. An episode that ends early keeps its last state until the others have ended.
 
     Args:
       env: an unbatched environment.
-      policy: called with one step of `inputs` and the observations of all environments.
-      key: of the first states; or [N], one for each.
-      num_envs: episodes, N.
-      inputs: further arguments of the policy, such as noise, or keys for one that draws; leaves lead with [T]. None for none.
-      goals: maps the observations of the resets to goals [N, G] to play for, set by `env.with_goal`. None: the reset's own.
+      policy: function of one step of `inputs` and the observations of all environments, which returns actions [N, A].
+      key: random key, or keys [N], of the initial states.
+      num_envs: number of episodes N.
+      inputs: other inputs of the policy, such as noise or keys; leaves lead with [T].
+      goals: function from the initial observations to goals [N, G], which `env.with_goal` sets. Default: the goals of the
+        resets.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
 
     Raises:
-      ValueError: actions that are not [N, A], inputs that do not lead with [T], something that is no environment, or states
-        that are not what `types.Env` and its spec say.
+      ValueError: actions are not [N, A], inputs do not lead with [T], `env` is not an environment, or its states violate
+        `types.Env` or its spec.
     """
     return record_rollout(env, policy, key, num_envs, lambda state: (), inputs, goals)[:2]
 
@@ -73,7 +72,7 @@ def record_rollout(
     inputs: PyTree = None,
     goals: GoalsFn | None = None,
 ) -> tuple[Episode, Outcome, PyTree]:
-    """Plays episodes as `rollout` does, and also returns `record(state)` of all states; its leaves lead with [N, T+1]."""
+    """Plays episodes like `rollout`, and also returns `record(state)` of all states; leaves lead with [N, T+1]."""
     spec = env_spec(env)
     check_size("num_envs", num_envs)
     _check_inputs(inputs, spec.episode_length)
@@ -111,11 +110,11 @@ def record_rollout(
 
 
 def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: PyTree) -> tuple[_Playing, tuple[Any, ...]]:
-    """One step of all episodes, and what was played: observation, achieved goal, action and reward, each [N, ...]."""
+    """One step of all episodes, and its observation, achieved goal, action and reward, each [N, ...]."""
     state, num_envs = playing.state, playing.over.shape[0]
     action = policy(inputs, state.obs)
     if np.shape(action) != (num_envs, env.action_size):
-        raise ValueError(f"the policy gives actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
+        raise ValueError(f"policy must return actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
     following = jax.vmap(env.step)(state, action)
     check_same_shapes(state, following)
     reward = following.reward
@@ -129,7 +128,7 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
 
 
 def _whole(steps: Array, end: Array) -> Array:
-    """Joins the arrays of T steps [T, N, ...] and of the last state [N, ...] to [N, T+1, ...]."""
+    """Joins arrays of T steps [T, N, ...] and of the last state [N, ...] to [N, T+1, ...]."""
     return jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1)
 
 
@@ -140,7 +139,7 @@ def _is_finite(arrays: PyTree) -> Array:
 
 
 def _bad_rewards(spec: EnvSpec, reward: Array, length: Array) -> Array:
-    """Share [N] of the played rewards [T, N] that lie outside the reward range."""
+    """Fraction [N] of the played rewards [T, N] outside the reward range."""
     low, high = spec.reward_range
     bad = (reward < low) | (reward > high)
     if not spec.ends:
@@ -150,7 +149,7 @@ def _bad_rewards(spec: EnvSpec, reward: Array, length: Array) -> Array:
 
 
 def ended(env: Any, spec: EnvSpec, state: Any) -> tuple[Array, Array]:
-    """Whether episodes have ended with `state`, bool [...] each: because no future follows, and for another reason."""
+    """Whether episodes have ended, as two bool [...]: terminated, because no future follows, and ended for another reason."""
     none = jnp.zeros(state.reward.shape, bool)
     terminated = none | getattr(state, "terminal", False)
     if spec.ends_at_goal:
@@ -178,7 +177,7 @@ def _check_inputs(inputs: PyTree, num_steps: int) -> None:
 
 
 def _with_goals(env: Any, first: Any, goals: Array) -> Any:
-    """The first states of N episodes with other goals [N, G]."""
+    """Initial states of N episodes with other goals [N, G]."""
     check_with_goal(env)
     changed = jax.vmap(env.with_goal)(first, goals)
     check_same_shapes(first, changed, "with_goal")
@@ -186,6 +185,6 @@ def _with_goals(env: Any, first: Any, goals: Array) -> Any:
 
 
 def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
-    """Returns `num_envs` keys, of one key or as they are given; a key that `jax.random.PRNGKey` made is two numbers."""
+    """Splits one key, or keeps `num_envs` given ones. A raw key of `jax.random.PRNGKey` is two numbers."""
     one = 0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1
     return key if key.ndim > one else jax.random.split(key, num_envs)

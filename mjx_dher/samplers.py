@@ -1,14 +1,14 @@
-"""Goal samplers: which achieved goal takes the place of the desired one.
+"""Goal samplers: distributions over achieved goals for relabelling.
 
-Every sampler is a probability over the T+1 achieved goals of one episode, given as unnormalized log weights: -inf marks a goal
-that it may not choose. `draw` makes a choice from them. So a sampler is a pure function that a test can compare with a table.
+A sampler is a pure function that returns unnormalized log weights of the T+1 achieved goals of one episode. A goal with -inf
+is never chosen. `draw` samples from the weights.
 
     log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
 
-The transition under relabelling leads from `step` to `step + 1`; its *future* is the goals at step+1 ... T, never `step`
-itself. In tasks whose episodes can end early, goals after the end have no weight, and a sampler may take the keyword `length`
-[], the index of the last goal. A transition without any weight, or with a weight of NaN or +inf, keeps its own goal, and
-training counts it (`no_goal_share`).
+The relabelled transition leads from `step` to `step + 1`. Its *future* is the goals at step+1 ... T, without `step` itself. If
+episodes can end early, goals after the end get no weight; a sampler may take the keyword `length` [], the index of the last
+goal. A transition keeps its own goal if it has no weights, or any weight is NaN or +inf. Training reports the fraction of such
+transitions as `no_goal_share`.
 """
 
 from __future__ import annotations
@@ -40,29 +40,29 @@ ScoreFn = Callable[[Episode, Context], Array]
 
 @struct.dataclass
 class Sampler:
-    """A goal sampler: its log weights, and whose achieved goals they choose from."""
+    """A goal sampler: its log weights, and the episodes whose goals it chooses from."""
 
     log_weights: LogWeightsFn = struct.field(pytree_node=False)
-    # Goals of any episode instead of its own. A function of HParams if the answer is traced (`join`).
+    # Whether goals come from any episode instead of the transition's own. A function of HParams if traced (`join`).
     cross_episode: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
-    # Numbers for the goals of each stored episode, computed once a cycle and passed to `log_weights` as its last argument.
+    # Scores of each stored episode's goals, computed once per cycle and passed to `log_weights` as its last argument.
     score: ScoreFn | None = struct.field(pytree_node=False, default=None)
 
 
 @struct.dataclass
 class LearnedMetric:
-    """A distance that the learner knows: those of an episode's achieved goals to its desired one, finite and not negative."""
+    """A distance computed by the learner, between an episode's achieved goals and its desired goal. Finite and not negative."""
 
     score: ScoreFn = struct.field(pytree_node=False)
 
 
 def position(achieved: Array, desired: Array) -> Array:
-    """Euclidean distances [T+1] of `achieved` [T+1, G] to `desired` [G]: the default metric."""
+    """Euclidean distances [T+1] between `achieved` [T+1, G] and `desired` [G]: the default metric."""
     return euclidean(achieved, desired[None])
 
 
 def future_mask(num_goals: int, step: Array, length: Array | None = None) -> Array:
-    """Mask [T+1] of the goals after `step`, up to the index `length` of the last one."""
+    """Mask [T+1] of the goals after `step`, up to index `length`."""
     index = jnp.arange(num_goals)
     return index > step if length is None else (index > step) & (index <= length)
 
@@ -72,33 +72,30 @@ def _uniform(mask: Array) -> Array:
 
 
 def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """Allows any goal of the episode, each with the same probability."""
+    """Any goal of the episode, uniformly."""
     del desired, step, hparams
     return jnp.zeros(achieved.shape[0])
 
 
 def distances(metric: MetricFn, achieved: Array, desired: Array) -> Array:
-    """Distances [T+1] of `achieved` [T+1, G] to `desired` [G] by `metric`; a negative one becomes NaN.
-
-    A sampler whose weights are NaN offers no goal, which training counts.
-    """
+    """Distances [T+1] between `achieved` [T+1, G] and `desired` [G]. A negative one becomes NaN, so that no goal is offered."""
     distance = measure(metric, achieved, desired)
     return distance if metric is position else jnp.where(distance >= 0, distance, jnp.nan)
 
 
 def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
-    """What a metric gives [T+1] for `achieved` [T+1, G] and `desired` [G]. Raises ValueError unless it is numbers [T+1]."""
+    """Result [T+1] of a metric for `achieved` [T+1, G] and `desired` [G]. Raises ValueError unless it is numbers [T+1]."""
     return check.array("metric: distances [T+1]", metric(achieved, desired), achieved.shape[:1], jnp.number)
 
 
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
-    """Allows any goal after the step, each with the same probability (Andrychowicz et al. 2017, the paper's baseline)."""
+    """Any goal after the step, uniformly (Andrychowicz et al. 2017, the paper's baseline). See `weigh` for the arguments."""
     del desired, hparams
     return _uniform(future_mask(achieved.shape[0], step, length))
 
 
 def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
-    """Allows only the episode's last goal."""
+    """The last goal of the episode."""
     del desired, step, hparams
     last = achieved.shape[0] - 1 if length is None else length
     return _uniform(jnp.arange(achieved.shape[0]) == last)
@@ -107,7 +104,7 @@ def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length
 def closest(
     achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
 ) -> Array:
-    """Allows the future goal nearest to the desired one (the paper's method 1); equally near ones share."""
+    """The future goal nearest to the desired one (the paper's method 1). Equally near goals are equally likely."""
     del hparams
     mask = future_mask(achieved.shape[0], step, length)
     distance = jnp.where(mask, distances(metric, achieved, desired), jnp.inf)
@@ -117,7 +114,7 @@ def closest(
 def epsilon_closest(
     achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
 ) -> Array:
-    """Mixes any future goal, with probability `epsilon`, and the closest one (the paper's method 2)."""
+    """Any future goal with probability `epsilon`, else the closest (the paper's method 2)."""
     any_future = jax.nn.softmax(future(achieved, desired, step, hparams, length))
     nearest = jax.nn.softmax(closest(achieved, desired, step, hparams, metric, length))
     return jnp.log(hparams.epsilon * any_future + (1.0 - hparams.epsilon) * nearest)
@@ -133,26 +130,27 @@ def weighted(
     normalization: NormalizationFn = distance_normalization.by_mean,
     length: Array | None = None,
 ) -> Array:
-    """Prefers future goals that are nearer to the desired goal (the paper's method 3).
+    """Future goals, weighted by nearness to the desired goal (the paper's method 3).
 
-    The weight of a candidate depends on its relative distance r, which `normalization` computes from d = metric(achieved,
-    desired) over the candidates of the same transition, those after its step. By default it is
+    The weight depends on the relative distance r. `normalization` computes r from the distances d = metric(achieved, desired)
+    of all goals after the step. By default
 
         r_i = d_i / mean_j d_j,
 
-    so weights do not depend on the scale of the task, and equal distances (r_i = 1 for all) give `future` exactly. With
-    temperature tau the kernels are, in r,
+    so weights do not depend on the scale of the task, and equal distances (r_i = 1) give exactly `future`. The kernels at
+    temperature tau are
 
         linear    w = max(1 - (r - 1) / tau, 0)    at tau = 1: 2 - r, from 2 at the goal to 0 at twice the mean distance
         inverse   w = r^(-1/tau)
         softmax   w = exp(-(r - 1) / tau)
 
-    They agree to first order around r = 1 and differ far from it: `inverse` almost always takes a candidate that lies on the
-    goal, while `linear` at tau = 1 never makes one more than twice as likely as one at the mean distance and drops those
-    beyond twice the mean. The paper gives no formula. This reading has no number to tune, and no single candidate can crowd
-    out the others. `distance_normalization` has other readings; docs/samplers.md compares them.
+    Around r = 1 they agree to first order. `inverse` almost always takes a candidate that lies on the goal. `linear` at tau =
+    1 makes no candidate more than twice as likely as one at the mean distance, and drops those beyond twice the mean.
 
-    If `linear` leaves no candidate a weight, the nearest gets it, as in the limit of a small temperature.
+    The paper gives no formula. This default has no number to tune, and no candidate can crowd out the others. docs/samplers.md
+    compares it with the alternatives in `distance_normalization`.
+
+    If `linear` leaves no candidate with weight, the nearest is chosen, as in the limit of a small temperature.
     """
     mask = future_mask(achieved.shape[0], step, length)
     distance = jnp.where(mask, distances(metric, achieved, desired), 0.0)
@@ -160,7 +158,7 @@ def weighted(
     relative = check.array("normalization: relative distances [T+1]", relative, mask.shape)
     log_weights = check.array("kernel: log weights [T+1]", kernel(relative, hparams.temperature), mask.shape)
     log_weights = jnp.where(mask, log_weights, -jnp.inf)
-    always = (distance_normalization.by_mean, distance_normalization.mirrored)  # some candidate has r <= 1, and a weight
+    always = (distance_normalization.by_mean, distance_normalization.mirrored)  # some candidate always has weight (r <= 1)
     if kernel is not distance_normalization.linear or normalization in always:
         return log_weights
     beyond = jnp.all(log_weights == -jnp.inf)
@@ -181,19 +179,18 @@ def make(
     """Makes the sampler called `name`.
 
     Args:
-      name: a built-in name, "module:attribute", a `Sampler`, or a function like `Sampler.log_weights`. `random` chooses as
-        `episode` does, but from a random episode of the ring.
-      kernel: for `weighted`: linear, inverse, softmax, "module:attribute", or a function (relative distance [T+1],
-        temperature []) -> log weight [T+1].
+      name: a built-in name, "module:attribute", a `Sampler`, or a function like `Sampler.log_weights`. `random` chooses like
+        `episode`, but from a random episode of the ring.
+      kernel: for `weighted`: linear, inverse, softmax, "module:attribute", or a function (relative distance [T+1], temperature
+        []) -> log weight [T+1].
       metric: for closest, epsilon_closest and weighted: position, "module:attribute", or a function (achieved [T+1, G],
         desired [G]) -> distance [T+1].
       normalization: for `weighted`: mean, sum, max, minmax, none, far, "module:attribute", or a function (distance [T+1],
         candidates [T+1], scale []) -> relative distance [T+1].
-      goal_distance: the environment's distance (`Context.goal_distance`), which the metric position computes.
+      goal_distance: distance of the environment (`Context.goal_distance`), used by the metric position.
 
     Raises:
-      ValueError: no such sampler, module, attribute, kernel, metric or normalization (the message names the nearest), or
-        something else in its place.
+      ValueError: an argument is unknown or invalid. The message suggests the nearest name.
     """
     if not isinstance(name, str):
         return _to_sampler(name)
@@ -209,7 +206,7 @@ def make(
 
 
 def make_metric(metric: Any, goal_distance: DistanceFn = euclidean) -> MetricFn | LearnedMetric:
-    """Gives the metric that `metric` names, or is; `make` says what it takes."""
+    """Loads a metric. `make` documents its values."""
     if metric == "position" and goal_distance is not euclidean:
         return lambda achieved, desired: goal_distance(achieved, jnp.broadcast_to(desired, achieved.shape))
     value = components.load("metric", metric)
@@ -254,19 +251,19 @@ def weigh(
     score: Array | None = None,
     length: Array | None = None,
 ) -> Array:
-    """Log weights [T+1] of the goals [T+1, G] of one episode.
+    """Log weights [T+1] of the goals of one episode.
 
     Args:
       sampler: the sampler.
-      achieved: [T+1, G] goals to choose from.
-      desired: [G] the goal that the episode was played for.
-      step: [] of the transition.
+      achieved: achieved goals [T+1, G] to choose from.
+      desired: desired goal [G] of the episode.
+      step: index [] of the transition.
       hparams: numbers that the sampler reads.
-      score: [T+1] scores of the goals, for a sampler with a score.
-      length: [] index of the episode's last goal; None stands for T. Goals after it get no weight.
+      score: scores [T+1] of the goals, for a sampler with a score.
+      length: index [] of the episode's last goal. Default: T. Goals after it get no weight.
 
     Raises:
-      ValueError: they are no floats [T+1], or a score is missing.
+      ValueError: the sampler does not return floats [T+1], or `score` is missing.
     """
     if sampler.score is not None and score is None:
         raise ValueError("score is missing: this sampler needs Sample.score (samplers.score_episodes)")
@@ -278,7 +275,7 @@ def weigh(
 
 
 def score_episodes(sampler: Sampler, episodes: Episode, context: Context) -> Array | None:
-    """Scores [E, T+1] of episodes (leaves lead with [E]); None for a sampler without a score."""
+    """Scores [E, T+1] of episodes (leaves lead with [E]), or None if the sampler has no score."""
     if sampler.score is None:
         return None
     return of_each_episode(lambda episode: _score(sampler, episode, context), episodes)
@@ -290,12 +287,12 @@ def _score(sampler: Sampler, episode: Episode, context: Context) -> Array:
 
 
 def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
-    """Joins samplers in one compiled program: the traced number `hparams.choice` says which of them a lane uses (`one_of`).
+    """Joins samplers in one compiled program, in which the traced number `hparams.choice` selects a lane's sampler (`one_of`).
 
-    `choice` is no field of `HParams`; `runs.program` adds it.
+    `choice` is not a field of `HParams`; `runs.program` adds it.
 
     Raises:
-      ValueError: no sampler, or something else in its place.
+      ValueError: `choices` is empty, or contains something other than a sampler.
     """
     samplers = [make(choice) for choice in choices]
     if not samplers:
@@ -328,16 +325,16 @@ def probabilities(log_weights: Array) -> Array:
 
 
 def draw(key: PRNGKey, log_weights: Array) -> Array:
-    """Draws an index [B] from each row of log weights [B, T+1], by inverting the cumulative distribution.
+    """Draws one index [B] per row of log weights [B, T+1], by inverting the cumulative distribution.
 
-    This takes one random number a row. A goal without weight is never drawn, whatever the rounding of the cumulative sum. A row
-    without any weight, or with NaN or +inf among its log weights, gives T+1, which is no index.
+    A goal without weight is never drawn, despite rounding. A row without weights, or with NaN or +inf, gives T+1, which is not
+    an index.
     """
     num_goals = log_weights.shape[-1]
     weights = jnp.exp(log_weights - jnp.max(log_weights, axis=-1, keepdims=True))
     possible = weights > 0
-    # A product with a triangle of ones is a faster prefix sum than a scan, at such lengths. It may fail to be monotone in the
-    # last bit; hence the mask, and the total taken where an index can be drawn.
+    # At these lengths, a product with a triangle of ones is a faster prefix sum than a scan. Its last bit may not be monotone,
+    # so only possible indices count in the total and in the result.
     cumulative = jnp.matmul(weights, jnp.triu(jnp.ones((num_goals, num_goals))), precision=jax.lax.Precision.HIGHEST)
     total = jnp.max(jnp.where(possible, cumulative, 0.0), axis=-1)
     threshold = jax.random.uniform(key, log_weights.shape[:-1]) * total

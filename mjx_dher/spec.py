@@ -1,4 +1,4 @@
-"""A run's description: components by name, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
+"""`RunSpec`, the description of a run: components by name, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ def _doc(field: str, text: str) -> Doc:
 
 @dataclasses.dataclass(frozen=True)
 class RunSpec:
-    """Everything that decides what a run computes. Components are built-in names or module:attribute."""
+    """Everything that decides the result of a run. Components are built-in names or module:attribute."""
 
     env: Annotated[str, _doc("env", "Environment")] = "push"
     engine: Annotated[
-        Engine, Doc("Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto, which picks.")
+        Engine, Doc("Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto.")
     ] = "auto"
     env_kwargs: Annotated[
         tuple[str, ...],
-        Doc("Arguments of the environment, NAME=VALUE each: reward_type=dense distance_threshold=0.03 episode_length=80."),
+        Doc("Arguments of the environment as NAME=VALUE, such as reward_type=dense distance_threshold=0.03."),
     ] = ()
     sampler: Annotated[str, _doc("sampler", "Sampler of hindsight goals")] = "future"
-    weight_kernel: Annotated[str, _doc("weight_kernel", "Fall of the weights with distance")] = "linear"
+    weight_kernel: Annotated[str, _doc("weight_kernel", "Kernel that maps distances to weights")] = "linear"
     weight_normalization: Annotated[str, _doc("weight_normalization", "Normalization of distances")] = "mean"
     metric: Annotated[str, _doc("metric", "Distance between an achieved and a desired goal")] = "position"
     priority: Annotated[str, _doc("priority", "Priority of episodes or transitions, for priority_fraction of each batch")] = (
@@ -50,7 +50,7 @@ class RunSpec:
     learner: Annotated[str, _doc("learner", "Learner")] = "ddpg"
     networks: Annotated[str, _doc("networks", "Networks of the learner")] = "mlp"
     demonstrations: Annotated[
-        str | None, Doc("Episodes that fill the replay ring first: an .npz, or a Minari data set by folder or name.")
+        str | None, Doc("Episodes to fill the replay ring with at the start: an .npz, or a Minari data set by folder or name.")
     ] = None
     seed: int = 0
     """Random seed."""
@@ -75,14 +75,14 @@ class RunSpec:
 
     @property
     def program(self) -> RunSpec:
-        """Description of the compiled program that the run can share: the settings in which all its lanes must agree."""
+        """The settings that all runs in one compiled program must share; all other fields have their defaults."""
         table, default = COMPONENTS["priority"], RunSpec(env=self.env)
         group = table[self.priority].group if self.priority in table else None
         alike = next((name for name, component in table.items() if component.group == group), self.priority)
         return dataclasses.replace(self, priority=alike, **{name: getattr(default, name) for name in _LANE_FIELDS})
 
 
-# Fields in which runs that share a compiled program can differ. Priorities can differ within a group.
+# Fields that can differ between runs of one compiled program. Priorities can differ within a group.
 _LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "generator", "seed", "hparams")
 
 
@@ -92,20 +92,20 @@ def custom_components(spec: RunSpec) -> dict[str, str]:
 
 
 def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
-    """Parses "NAME=VALUE" texts; a value is true, false, a number, or else a text, which can have quotation marks ("007").
+    """Parses "NAME=VALUE" texts. A value is true, false, a number, or a string. Quote strings that look like numbers ("007").
 
     Raises:
-      ValueError: not such a text, a number that is not finite, or a name that is repeated or has its own option.
+      ValueError: invalid text, a number that is not finite, or a name that is repeated or has its own option.
     """
     arguments: dict[str, Argument] = {}
     for text in texts:
         name, _, value = str(text).partition("=")
         if not (isinstance(text, str) and name.isidentifier() and value):
-            raise ValueError(f"env_kwargs must be NAME=VALUE each, such as reward_type=dense; got {text!r}")
+            raise ValueError(f"env_kwargs must be NAME=VALUE, such as reward_type=dense; got {text!r}")
         if name in arguments:
             raise ValueError(f"env_kwargs has {name} twice")
         if name == "engine":
-            raise ValueError("env_kwargs cannot have engine, which is a setting of its own: --engine")
+            raise ValueError("env_kwargs cannot have engine; use the setting engine (--engine)")
         arguments[name] = _to_argument(value)
         if arguments[name] in (math.inf, -math.inf) or arguments[name] != arguments[name]:
             raise ValueError(f"env_kwargs: {name} must be finite; got {value}")
@@ -113,7 +113,7 @@ def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
 
 
 def to_texts(arguments: Mapping[str, Argument]) -> tuple[str, ...]:
-    """Formats arguments as texts "NAME=VALUE" in the order of their names, the inverse of `to_arguments`."""
+    """Formats arguments as "NAME=VALUE" texts, sorted by name. Inverse of `to_arguments`."""
     return tuple(f"{name}={_to_text(value)}" for name, value in sorted(arguments.items()))
 
 
@@ -136,10 +136,10 @@ def _to_argument(value: str) -> Argument:
 
 
 def validate_values(spec: RunSpec) -> None:
-    """Checks each value alone, whatever the environment and the components are.
+    """Checks each value on its own, for any environment and any components.
 
     Raises:
-      ValueError: names every invalid field, its value and what is allowed.
+      ValueError: names each invalid field, its value and the allowed values.
     """
     validation.check_all(
         *((_check_text, name, getattr(spec, name)) for name in COMPONENTS),
@@ -149,15 +149,15 @@ def validate_values(spec: RunSpec) -> None:
 
 
 def validate(spec: RunSpec, episode_length: int | None = None) -> None:
-    """Checks that a run is possible, without importing a component.
+    """Checks that a run is possible. Imports no component.
 
     Args:
       spec: the run.
-      episode_length: of the environment, if it exists already; its name is not checked then. By default 50 or the argument of
-        that name, and 1 for a custom environment.
+      episode_length: steps of an existing environment, whose name is then not checked. Default: the argument of that name or
+        50, and 1 for a custom environment.
 
     Raises:
-      ValueError: names every invalid field, its value and what is allowed.
+      ValueError: names each invalid field, its value and the allowed values.
     """
     names = [(check_name, field, getattr(spec, field), table, True) for field, table in COMPONENTS.items()]
     if episode_length is None:
@@ -169,7 +169,9 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
 
 
 def find_demonstrations(source: str) -> Path:
-    """Path of an .npz, or folder of a Minari data set. Raises ValueError if there is none, or it is not trusted (`trust`)."""
+    """Path of an .npz file, or folder of a Minari data set. Raises ValueError if it does not exist or is not trusted
+    (`trust`).
+    """
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
     for path in (Path(source), root / source):
         if (source.endswith(".npz") and path.is_file()) or (source and (path / "data").is_dir()):

@@ -1,10 +1,9 @@
-"""Statistics of success rates, and of the scores and learning curves of many seeds.
+"""Statistics of success rates, and of scores and learning curves over seeds.
 
-Scores are arrays [S] with one number per seed, or [S, K] for K pooled tasks. Learning curves are [S, P], at points x [P]
-(epochs, environment steps or seconds). The time to a threshold that a run never reaches is infinite; medians and ranks allow
-for that.
+Scores are arrays [S], one number per seed, or [S, K] for K pooled tasks. Learning curves are [S, P] at points x [P] (epochs,
+environment steps or seconds). A run that never reaches a threshold has an infinite time; medians and ranks allow for that.
 
-scipy.stats takes a second to import, so the functions that need it import it.
+Functions import scipy.stats when called, because that takes a second.
 """
 
 from __future__ import annotations
@@ -20,26 +19,26 @@ Statistic = Callable[..., Any]  # (values, axis=...) -> values without that axis
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Computes Wilson's 95 % score interval of a success rate (Wilson 1927).
+    """Wilson's 95 % score interval of a success rate (Wilson 1927).
 
     Raises:
       ValueError: `trials` is not positive, or `successes` does not lie in [0, trials].
     """
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"need 0 <= successes <= trials and trials > 0; got {successes} of {trials}")
-    z = 1.959963984540054  # scipy.stats would do it, but every run ends with this, and importing that takes a second
+    z = 1.959963984540054  # not from scipy.stats: every run ends here, and that import takes a second
     rate, spread = successes / trials, z * z / trials
     middle = (rate + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(rate * (1 - rate) / trials + spread / 4 / trials)
-    # Without a success the lower bound is 0, and the upper one 1 without a failure; rounding would leave a little of either.
+    # The lower bound is exactly 0 without a success, and the upper one 1 without a failure, despite rounding.
     return max(0.0, middle - half) if successes else 0.0, min(1.0, middle + half) if successes < trials else 1.0
 
 
 def difference_interval(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> tuple[float, float]:
-    """Computes Newcombe's 95 % interval of the difference a - b of two success rates (Newcombe 1998, method 10).
+    """Newcombe's 95 % interval of the difference a - b of two success rates (Newcombe 1998, method 10).
 
     Raises:
-      ValueError: as for `wilson_interval`.
+      ValueError: as in `wilson_interval`.
     """
     low_a, high_a = wilson_interval(successes_a, trials_a)
     low_b, high_b = wilson_interval(successes_b, trials_b)
@@ -48,10 +47,10 @@ def difference_interval(successes_a: int, trials_a: int, successes_b: int, trial
 
 
 def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:
-    """Computes the mean of the middle half of the scores; a quarter, rounded down, is dropped at each end.
+    """Mean of the middle half of the scores. A quarter, rounded down, is dropped at each end.
 
-    It is less sensitive to outliers than the mean and uses more of the data than the median (Agarwal et al. 2021, "Deep
-    Reinforcement Learning at the Edge of the Statistical Precipice"). By default it reduces all axes, which pools the tasks.
+    It is less sensitive to outliers than the mean and uses more data than the median (Agarwal et al. 2021, "Deep Reinforcement
+    Learning at the Edge of the Statistical Precipice"). By default it reduces all axes, which pools the tasks.
 
     Raises:
       ValueError: there are no scores, or some are NaN.
@@ -69,14 +68,14 @@ def bootstrap_interval(
     repeats: int = 10_000,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Computes a stratified percentile bootstrap interval: seeds are resampled within each task.
+    """Stratified percentile bootstrap interval: seeds are resampled within each task.
 
     Args:
-      scores: [S] or [S, K].
-      statistic: function of (values, axis=...) that reduces one axis, such as np.mean; tasks are pooled.
+      scores: scores [S] or [S, K].
+      statistic: function (values, axis=...) that reduces one axis, such as np.mean. Tasks are pooled.
       level: coverage of the interval.
       repeats: number of resamples.
-      seed: seed of the resampling; the same scores always have the same interval.
+      seed: seed of the resampling.
 
     Raises:
       ValueError: there are no scores, or `level` does not lie between 0 and 1.
@@ -92,9 +91,16 @@ def bootstrap_interval(
 def curve_interval(
     curves: ArrayLike, level: float = 0.95, repeats: int = 2_000, seed: int = 0
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Computes the interquartile mean of learning curves [S, P] at each point, and its percentile bootstrap interval.
+    """Pointwise interquartile mean of learning curves, and its percentile bootstrap interval. Whole curves are resampled.
 
-    Whole curves are resampled. Returns three arrays [P]: the mean, and the lower and upper ends of the pointwise interval.
+    Args:
+      curves: learning curves [S, P].
+      level: coverage of the interval.
+      repeats: number of resamples.
+      seed: seed of the resampling.
+
+    Returns:
+      Three arrays [P]: the mean, and the lower and upper ends of the interval.
 
     Raises:
       ValueError: `curves` is not [S, P], or `level` does not lie between 0 and 1.
@@ -110,7 +116,12 @@ def curve_interval(
 
 
 def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
-    """Returns for each curve [S, P] the first point of x [P] at which it is at or above the threshold, infinity if none is.
+    """First point at which each curve is at or above a threshold, shape [S], or infinity if it never is.
+
+    Args:
+      x: points [P].
+      curves: curves [S, P].
+      threshold: the threshold.
 
     Raises:
       ValueError: x is not [P], or `curves` is not [S, P].
@@ -121,10 +132,10 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
 
 
 def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
-    """Computes the mean height [S] of the curves [S, P] over the points x [P], by the trapezoidal rule.
+    """Mean height [S] of curves [S, P] over points x [P], by the trapezoidal rule.
 
     Raises:
-      ValueError: x is not [P], has fewer than two points or does not increase; or `curves` is not [S, P].
+      ValueError: x is not [P], has fewer than two points or does not increase, or `curves` is not [S, P].
     """
     x, curves = _curves(x, curves)
     if len(x) < 2 or (np.diff(x) <= 0).any():
@@ -133,11 +144,10 @@ def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
 
 
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
-    """Estimates the probability that a score of `a` exceeds one of `b`, with ties counting half, averaged over tasks.
+    """Probability that a score of `a` exceeds one of `b`, averaged over tasks. Ties count half.
 
-    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). scipy's
-    `mannwhitneyu` also computes a p-value, which takes 45 times as long.
-    The shapes are [S] or [S, K]; the numbers of seeds may differ.
+    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). The shapes are [S]
+    or [S, K]; the numbers of seeds may differ.
 
     Raises:
       ValueError: there are no scores, or `a` and `b` have different numbers of tasks.
@@ -152,14 +162,21 @@ def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
 def improvement_interval(
     a: ArrayLike, b: ArrayLike, level: float = 0.95, repeats: int = 2_000, seed: int = 0
 ) -> tuple[float, float]:
-    """Computes a stratified percentile bootstrap interval of `probability_of_improvement`.
+    """Stratified percentile bootstrap interval of `probability_of_improvement`.
+
+    Args:
+      a: scores [S] or [S, K].
+      b: scores to compare with.
+      level: coverage of the interval.
+      repeats: number of resamples.
+      seed: seed of the resampling.
 
     Raises:
-      ValueError: as for that function, or `level` does not lie between 0 and 1.
+      ValueError: as in `probability_of_improvement`, or `level` does not lie between 0 and 1.
     """
     a, b = _scores(a), _scores(b)
     rng = np.random.default_rng(seed)
-    probability_of_improvement(a, b)  # raises where they cannot be compared
+    probability_of_improvement(a, b)  # raises if they cannot be compared
     a, b = (scores[:, None] if scores.ndim == 1 else scores for scores in (a, b))  # [A, K], [B, K]
     wins = np.greater(a[:, None], b[None]) + np.equal(a[:, None], b[None]) / 2  # [A, B, K]
     of_a, of_b = np.zeros((repeats, *a.shape)), np.zeros((repeats, *b.shape))  # how often a score was drawn
@@ -173,10 +190,16 @@ def improvement_interval(
 
 
 def paired_p_value(a: ArrayLike, b: ArrayLike, repeats: int = 100_000, seed: int = 0) -> float:
-    """Computes the two-sided p-value of the mean difference of paired scores [S], by a sign-flip permutation test.
+    """Two-sided p-value of the mean difference of paired scores, by a sign-flip permutation test.
 
-    Under the null hypothesis, each pair's difference is as likely to have the opposite sign (Fisher 1935). The test is exact
-    if 2^S is at most `repeats`, else it draws that many random sign flips.
+    Under the null hypothesis, the sign of each difference is random (Fisher 1935). The test is exact if 2^S is at most
+    `repeats`; otherwise that many random sign flips are drawn.
+
+    Args:
+      a: scores [S].
+      b: paired scores [S].
+      repeats: largest number of sign flips.
+      seed: seed of the flips.
 
     Raises:
       ValueError: the shapes differ or are not [S], or some scores are not finite.
@@ -199,12 +222,11 @@ def holm(p_values: Sequence[float], tests: int | None = None) -> list[float]:
     """Adjusts the p-values of several comparisons by Holm's method, which controls the familywise error rate (Holm 1979).
 
     Args:
-      p_values: of the comparisons that have been made.
-      tests: how many belong together; those beyond `p_values` count with a p of 1. So no result becomes larger once they have
-        been made.
+      p_values: p-values of the comparisons made so far.
+      tests: number of planned comparisons. Missing ones count as p = 1, so later results never increase earlier ones.
 
     Raises:
-      ValueError: a p-value does not lie in [0, 1], or there are more of them than tests.
+      ValueError: a p-value does not lie in [0, 1], or there are more than `tests`.
     """
     tests = len(p_values) if tests is None else tests
     if not all(0 <= p <= 1 for p in p_values):

@@ -1,8 +1,8 @@
-"""The training loop as two pure functions, `init` and `epoch`, that compile and vmap.
+"""The training loop as pure functions `init` and `epoch`, which compile and vmap.
 
 epoch = scan over cycles, then an evaluation
 cycle = roll out -> add to the ring, with priorities -> update the normalizers -> learn
-learn = scan over draws of many batches at once: update, and move the targets every `target_period` updates
+learn = scan over draws of many batches: update, and move the targets every `target_period` updates
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from mjx_dher.rollout import rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGKey, PyTree
 
-# Upper bound of the transitions drawn at once, but never less than one target period. Larger draws fall out of a CPU's cache.
+# Most transitions per draw, but at least one target period. Larger draws do not fit into a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
-# Folded into a cycle's key, for its goals, renewed rows and added episodes; no indices of `jax.random.split`.
+# Folded into a cycle's key for goals, renewed rows and added episodes; no indices of `jax.random.split`.
 GENERATE, RENEW, ADD = 0x476F616C, 0x52656E65, 0x44656D6F
 
 
@@ -45,29 +45,29 @@ GoalsFn = Callable[[PRNGKey, GoalObs, ReplayState, Context], Array]
 
 @struct.dataclass
 class TrainState:
-    """A run in progress, whole: the next epoch depends on nothing else."""
+    """Complete state of a run. The next epoch depends on nothing else."""
 
     learner: PyTree  # of the learner
     replay: ReplayState
     hparams: HParams
     key: PRNGKey
-    env_steps: Array  # [] int32; of a run on several devices those of one device
+    env_steps: Array  # [] int32, per device
 
 
 class Train(NamedTuple):
-    """What `make_train` returns."""
+    """Functions and properties of a training loop, from `make_train`."""
 
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
-    add: Callable[[TrainState, Episode], TrainState]  # adds N demonstrations to the ring, and shows them to the normalizers
+    add: Callable[[TrainState, Episode], TrainState]  # adds N demonstrations to the ring and the normalizers
     learner: Learner
-    replay_bytes: int  # memory of one run's ring on a device
+    replay_bytes: int  # size of one run's ring on a device
     axis_name: AxisName = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """Components of a training loop; static."""
+    """Components of a training loop. Static."""
 
     env: Env
     spec: EnvSpec
@@ -81,33 +81,32 @@ class Loop:
 
     @property
     def num_episodes(self) -> int:
-        """Episodes that the ring holds, E."""
+        """Episodes E that the ring holds."""
         return config_lib.episodes_capacity(self.config, self.spec.episode_length)
 
     @property
     def uses_values(self) -> bool:
-        """Whether a component needs the learner's values."""
         generator = getattr(self.generator, "uses_values", False)
         return self.sampler.score is not None or self.priority.uses_values or generator
 
     @property
     def steps_per_cycle(self) -> int:
-        """Environment steps of a cycle, if no episode ends early."""
+        """Environment steps per cycle, if no episode ends early."""
         return self.config.num_envs * self.spec.episode_length
 
     @property
     def policy_delay(self) -> int:
-        """Updates of the critics for one of the actor."""
+        """Critic updates per actor update."""
         return learners.policy_delay(self.learner)
 
     @property
     def updates_per_round(self) -> int:
-        """Updates until both the targets and the actor have moved."""
+        """Updates until both targets and actor have moved."""
         return max(self.config.target_period, self.policy_delay)
 
     @property
     def rounds_per_draw(self) -> int:
-        """Rounds whose batches are drawn at once: as many as MAX_TRANSITIONS_PER_DRAW allows, at least one."""
+        """Rounds whose batches are drawn together: as many as MAX_TRANSITIONS_PER_DRAW allows, at least one."""
         rounds = self.config.updates_per_cycle // self.updates_per_round
         most = max(1, MAX_TRANSITIONS_PER_DRAW // (self.updates_per_round * self.config.batch_size))
         return next(divisor for divisor in range(min(rounds, most), 0, -1) if rounds % divisor == 0)
@@ -123,23 +122,23 @@ def make_train(
     learner: Learner | None = None,
     axis_name: AxisName = None,
 ) -> Train:
-    """Makes the training loop for an environment: pure functions, to be compiled and, over seeds and HParams, vmapped.
+    """Makes the training loop of an environment: pure functions to compile, and to vmap over seeds and HParams.
 
     `init(key, hparams)` makes a TrainState. `epoch(train_state)` plays and learns for `cycles_per_epoch` cycles, evaluates,
-    and returns the next TrainState with metrics, [] each; docs/logs.md lists them.
+    and returns the next TrainState and scalar metrics, which docs/logs.md lists.
 
     Args:
       env: the environment.
-      config: sizes; of a run on several devices, those of one device.
-      sampler: of hindsight goals, or a function like `Sampler.log_weights`. None: `future`.
-      priority: of episodes or transitions, for `hparams.priority_fraction` of each batch. None: `eventful`.
-      generator: gives the goals that training episodes are played for. None: those of the reset.
-      learner: None: DDPG, made of `config`.
-      axis_name: of the devices that share the run, which call `init` and `epoch` inside `jax.shard_map` over that axis with the
-        same key. They average gradients and metrics; each has its own environments, ring and batches.
+      config: sizes, per device if several devices share the run.
+      sampler: sampler of hindsight goals, or a function like `Sampler.log_weights`. Default: `future`.
+      priority: priority, for `hparams.priority_fraction` of each batch. Default: `eventful`.
+      generator: generator of the goals of training episodes. Default: the reset's goals.
+      learner: the learner. Default: DDPG, made from `config`.
+      axis_name: axis of the devices that share the run. They call `init` and `epoch` inside `jax.shard_map` over it with the
+        same key, and average gradients and metrics. Each has its own environments, ring and batches.
 
     Raises:
-      ValueError: an argument that cannot be used; from `epoch`, as soon as it is traced, an array of the wrong shape.
+      ValueError: invalid argument. `epoch` raises it for arrays of the wrong shape while it is traced.
     """
     spec = env_spec(env)
     if not isinstance(config, Config):
@@ -186,7 +185,7 @@ def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
 
 
 def _add_episodes(loop: Loop, state: TrainState, episodes: Episode) -> TrainState:
-    """Adds an equal share of the episodes on each device."""
+    """Adds an equal number of the episodes on each device."""
     rows = split.own_rows(episodes.action.shape[0], loop.axis_name)
     episodes = jax.tree.map(lambda x: jnp.asarray(x)[rows], episodes)
     context = _context(loop, state.learner, state.hparams, jnp.zeros(()))
@@ -212,7 +211,7 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
 
 def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
-    """Rolls out, adds to the ring, updates the normalizers, learns."""
+    """Rolls out, adds to the ring, updates the normalizers and learns."""
     env, config, hparams = loop.env, loop.config, state.hparams
     key, *keys = jax.random.split(state.key, 5)
     rollout_key, noise_key, normalizer_key, learn_key = (split.own_key(own, loop.axis_name) for own in keys)
@@ -256,7 +255,7 @@ def _context(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> 
 
 
 def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState) -> Array | None:
-    """Rows whose priorities are renewed after a cycle's episodes were added; None for all of them."""
+    """Rows whose priorities to renew after a cycle's episodes were added, or None for all."""
     new = loop.config.num_envs
     number = loop.config.renewals * new
     if loop.priority.renew is None or not loop.priority.by_part or not 0 < number < replay.capacity(ring):
@@ -266,7 +265,7 @@ def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState) -> Array | 
 
 
 def _goals(loop: Loop, state: TrainState, context: Context) -> Callable[[GoalObs], Array] | None:
-    """Maps a rollout's first observations to the goals to play for. None, and goals that are not finite: the reset's own."""
+    """Function from a rollout's initial observations to its goals. Goals that are not finite are replaced by the reset's."""
     generator = loop.generator
     if generator is None:
         return None
@@ -283,7 +282,7 @@ def _goals(loop: Loop, state: TrainState, context: Context) -> Callable[[GoalObs
 def _update_normalizers(
     loop: Loop, learner: PyTree, episodes: Episode, valid: Array, context: Context, key: PRNGKey
 ) -> tuple[PyTree, Metrics]:
-    """Updates the normalizers; goals are relabelled first, so that their statistics match those of training batches."""
+    """Updates the normalizers with relabelled goals, so that the statistics match training batches."""
     num_new, num_steps = episodes.action.shape[:2]
     fresh = replay.add(replay.init(loop.template, num_new, loop.spec.ends), episodes, valid=valid)
     sample_key, relabel_key = jax.random.split(key)
@@ -297,16 +296,16 @@ def _update_normalizers(
 
 
 def _relabel_metrics(context: Context, goal: Array, hindsight: Array) -> Metrics:
-    """Fraction of goals [B, G] that were replaced, and the mean distance to their hindsight goals."""
+    """Fraction of goals [B, G] that were replaced, and their mean distance to the hindsight goals."""
     replaced = jnp.any(hindsight != goal, axis=-1).astype(jnp.float32)
     distance = jnp.sum(context.goal_distance(hindsight, goal)) / jnp.maximum(jnp.sum(replaced), 1.0)
     return {"relabelled_share": jnp.mean(replaced), "relabel_distance": distance}
 
 
 def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key: PRNGKey) -> tuple[PyTree, Metrics]:
-    """Makes a cycle's updates. The ring does not change meanwhile, so batches are drawn many at once.
+    """Makes a cycle's updates. Because the ring does not change, many batches are drawn together.
 
-    On a GPU, drawing one batch takes twice as long as learning from it, and drawing 40 hardly longer.
+    On a GPU, drawing one batch takes twice as long as learning from it, and drawing 40 takes hardly longer.
     """
     config, weights = loop.config, replay.cumulative(ring)
     scores = samplers.score_episodes(loop.sampler, ring.episodes, context)
@@ -325,7 +324,7 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
 def evaluate_state(
     env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int, axis_name: AxisName = None
 ) -> evaluate.Outcome:
-    """Plays the learner's policy without exploration; returns the outcomes [num_episodes] of this device."""
+    """Outcomes [num_episodes] of the learner's deterministic policy on this device."""
 
     def act(obs: GoalObs) -> Array:
         return learner.act(state.learner, obs, state.hparams)
@@ -334,17 +333,17 @@ def evaluate_state(
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:
-    """Numbers after a fraction `progress` of the run's updates: step sizes fall linearly to `lr_end`."""
+    """Numbers after a fraction `progress` of the run's updates: learning rates fall linearly to `lr_end`."""
     left: Any = 1.0 - (1.0 - hparams.lr_end) * jnp.minimum(progress, 1.0)
     return hparams._replace(actor_lr=hparams.actor_lr * left, critic_lr=hparams.critic_lr * left)
 
 
 def as_arrays(hparams: HParams) -> HParams:
-    """The numbers as float32 arrays."""
+    """Converts the numbers to float32 arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hparams)
 
 
 def is_finite(learner: PyTree) -> Array:
-    """Whether all of a learner's numbers are finite, bool []; once they are not, no epoch changes that."""
+    """Whether all floats of a learner's state are finite, bool []. Otherwise the run has diverged for good."""
     floats = [leaf for leaf in jax.tree.leaves(learner) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))

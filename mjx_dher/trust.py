@@ -1,7 +1,7 @@
-"""Names that a file gives: of code to import and of data to read. They are used only if the user has named them before.
+"""Trust in names that a file gives, of code to import or data to read. They are used only if the user has used them before.
 
-Training records the names that the user typed or passed, in the user's state folder, with the file that each stands for. A
-name from a file is used if it has such a record, or with `--trust` (`trust=True` in Python).
+Training records the names that the user typed or passed, with their files, in the user's state folder. A name from a file
+needs such a record, or `--trust` (`trust=True` in Python).
 """
 
 from __future__ import annotations
@@ -31,10 +31,15 @@ class FromFile(str):
 
 
 def check(field: str, name: str, place: Path | None) -> None:
-    """Checks that a name may be used; `place` is the file that it stands for, or None.
+    """Checks that a name may be used.
+
+    Args:
+      field: setting that the message names.
+      name: the name. Only a `FromFile` is checked.
+      place: file of the module or data, or None.
 
     Raises:
-      ValueError: the name comes from a file, and the user has neither trained with it nor given `--trust`.
+      ValueError: the name comes from a file, and the user has neither trained with it nor passed `--trust`.
     """
     if everything or not isinstance(name, FromFile):
         return
@@ -52,7 +57,14 @@ def check(field: str, name: str, place: Path | None) -> None:
 
 
 def record(field: str, name: str, place: Path | None, arguments: Sequence[str] = ()) -> None:
-    """Records a name that the user has typed or passed. Does nothing if there is no state folder."""
+    """Records a name that the user typed or passed. Does nothing if there is no state folder.
+
+    Args:
+      field: setting of the name.
+      name: the name. A `FromFile` is not recorded.
+      place: file of the module or data, or None.
+      arguments: arguments of the environment.
+    """
     if isinstance(name, FromFile):
         return
     with contextlib.suppress(OSError, RuntimeError):
@@ -66,7 +78,7 @@ def _record(field: str, name: str, place: Path | None, arguments: Sequence[str])
 
 
 def _folder(make: bool = False) -> Path:
-    """Folder of the records. Raises OSError if others can write to it, or if it would depend on the current folder."""
+    """Folder of the records. Raises OSError if others can write to it, or its path is relative."""
     folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "mjx-dher" / "trusted"
     if not folder.is_absolute():
         raise OSError(f"{folder} is not an absolute path")

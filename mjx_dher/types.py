@@ -1,6 +1,6 @@
-"""The vocabulary of the library: the data that its parts hand to each other.
+"""Shared types: the data that the library's modules exchange.
 
-Dimension letters, used in every shape comment:
+Shape comments use these dimension letters:
 
     B  batch of transitions      E  episodes in the replay ring     A  action size
     N  environments in parallel  T  steps of an episode             D  observation size
@@ -24,7 +24,7 @@ PyTree = Any
 
 
 class GoalObs(TypedDict):
-    """What a goal-conditioned agent sees; the keys are those of gymnasium-robotics' goal environments."""
+    """Observation of a goal-conditioned environment, with the keys of gymnasium-robotics."""
 
     observation: PyTree  # [..., D], or a pytree of arrays
     achieved_goal: Array  # [..., G]
@@ -33,7 +33,7 @@ class GoalObs(TypedDict):
 
 @struct.dataclass
 class Episode:
-    """A whole episode: every observation once, the last one included. Batched forms lead with [N] or [E].
+    """A whole episode with T+1 observations. Batched forms lead with [N] or [E].
 
     An episode that ended early is padded: its last observation and goal repeat up to T, and its actions are 0.
     """
@@ -42,8 +42,8 @@ class Episode:
     achieved_goal: Array  # [T+1, G]
     desired_goal: Array  # [G]
     action: Array  # [T, A]
-    length: Array = None  # type: ignore[assignment]  # [] steps that were played, int32; None stands for T (`filled`)
-    terminal: Array = None  # type: ignore[assignment]  # [] whether no future follows, for any goal; None stands for False
+    length: Array = None  # type: ignore[assignment]  # [] steps played, int32; None means T (`filled`)
+    terminal: Array = None  # type: ignore[assignment]  # [] whether no future follows, for any goal; None means False
 
     def filled(self) -> Episode:
         """Fills in `length` and `terminal` if they are None. Arrays may be `jax.ShapeDtypeStruct`s."""
@@ -64,30 +64,30 @@ class Episode:
 
 @struct.dataclass
 class Batch:
-    """Transitions as the learner takes them, hindsight goals already in place."""
+    """Transitions for the learner, with hindsight goals in place."""
 
     observation: PyTree  # [B, D]
     next_observation: PyTree  # [B, D]
     desired_goal: Array  # [B, G]
     action: Array  # [B, A]
-    reward: Array  # [B] with n-step returns the discounted sum of m rewards
-    # [B] factor of the value of the next observation: gamma, 0 after a terminal transition. With n-step returns it is gamma^m,
+    reward: Array  # [B] with n-step returns, the discounted sum of m rewards
+    # [B] factor of the next observation's value: gamma, or 0 after a terminal transition. With n-step returns it is gamma^m,
     # and the next observation is m steps ahead.
     discount: Array
-    row: Array  # [B] ring row of the transition's episode, int32: equal rows are one episode
+    row: Array  # [B] ring row of the transition's episode, int32
 
 
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
-    """The contract of a task as data. `contract.env_spec` gives an environment's."""
+    """Contract of a task as data. `contract.env_spec` returns the one of an environment."""
 
-    observation: PyTree  # tree of `jax.ShapeDtypeStruct`s of one observation
+    observation: PyTree  # shapes and dtypes of one observation (`jax.ShapeDtypeStruct`s)
     goal_size: int  # G
     action_size: int  # A
     episode_length: int  # T, the maximum
-    reward_range: tuple[float, float] = (-1.0, 0.0)  # lowest and highest reward; infinite where there is no bound
-    ends: bool = False  # whether an episode can end before T: its state has `done`, `terminal` or both
-    ends_at_goal: bool = False  # whether reaching the goal ends the episode, so that no future follows for this goal
+    reward_range: tuple[float, float] = (-1.0, 0.0)  # lowest and highest reward; may be infinite
+    ends: bool = False  # whether episodes can end before T; the state has `done`, `terminal` or both
+    ends_at_goal: bool = False  # whether reaching the goal ends the episode; no future follows for this goal
 
     def __post_init__(self) -> None:
         for name in ("goal_size", "action_size", "episode_length"):
@@ -96,7 +96,7 @@ class EnvSpec:
         if not low < high:
             raise ValueError(f"reward_range must be (low, high) with low < high; got {self.reward_range}")
         if self.ends_at_goal and not self.ends:
-            raise ValueError("ends must be True where ends_at_goal is")
+            raise ValueError("ends must be True if ends_at_goal is True; got False")
 
     @property
     def observation_size(self) -> int:
@@ -108,7 +108,7 @@ class EnvSpec:
 
     @property
     def sizes(self) -> tuple[Any, int, int]:
-        """Sizes D, G and A. If the observation is no vector, the tree of its leaves' sizes, or shapes, replaces D."""
+        """Sizes D, G and A. D is a tree of sizes or shapes if the observation is not one vector."""
         observation = jax.tree.map(lambda x: x.shape[0] if len(x.shape) == 1 else x.shape, self.observation)
         return observation, self.goal_size, self.action_size
 
@@ -127,12 +127,13 @@ DistanceFn = Callable[[Array, Array], Array]
 
 
 class EnvState(Protocol):
-    """What the trainer reads of an environment's state; the rest belongs to the environment.
+    """Environment state, as far as the trainer reads it. It may hold more.
 
     Optional fields, all [] bool:
-      failed: the physics blew up; nothing is learned from the episode.
+      failed: the simulation diverged. Nothing is learned from the episode.
       done: the episode ends here (needs `EnvSpec.ends`).
-      terminal: the episode ends here and no future follows, for any goal, as after a dropped object (needs `EnvSpec.ends`).
+      terminal: the episode ends here and no future follows for any goal, for example after an object was dropped (needs
+        `EnvSpec.ends`).
     """
 
     @property
@@ -146,17 +147,17 @@ class EnvState(Protocol):
 
 
 class Env(Protocol):
-    """An unbatched, pure, goal-conditioned environment; `jax.vmap` is the batch. `testing.check_env` tries one out.
+    """A pure, unbatched, goal-conditioned environment; `jax.vmap` makes batches. Test yours with `testing.check_env`.
 
     `step` takes an action [A]. `compute_reward` maps goals [..., G] to rewards [...]. Optional members:
 
       spec: an `EnvSpec`. Without it, rewards lie in [-1, 0] and every episode has `episode_length` steps.
       reached(achieved_goal, desired_goal): whether the goal is reached, bool [...]. Default: the reward is at its maximum.
       goal_distance(achieved_goal, desired_goal): distance [...] for metrics, `weighted` and logs. Default: Euclidean.
-      dt: seconds that a step takes, for videos, the viewer, gymnasium and `energy`. Default: 0.04.
-      rest_action: action [A] that keeps the start, which delays and filters of actions begin with. Default: 0.
-      with_goal(state, goal): a first state with another desired goal [G]; goal generators need it.
-      check(): called on the host after each epoch; raises ValueError if steps were silently wrong.
+      dt: seconds per step, for videos, the viewer, Gymnasium and `energy`. Default: 0.04.
+      rest_action: action [A] that holds the start pose; action delays and filters begin with it. Default: 0.
+      with_goal(state, goal): initial state with another desired goal [G]. Goal generators need it.
+      check(): called on the host after each epoch. Raises ValueError if steps were silently wrong.
     """
 
     @property
@@ -173,6 +174,6 @@ class Env(Protocol):
 
 
 def check_size(name: str, value: Any) -> None:
-    """Raises ValueError unless `value` is an integer of at least 1, of Python or NumPy."""
+    """Raises ValueError unless `value` is a Python or NumPy integer of at least 1."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name} must be an integer of at least 1; it is {value!r}")

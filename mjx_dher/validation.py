@@ -1,4 +1,4 @@
-"""Validation of settings: an error names the field, its value and what is allowed. Loads neither JAX nor MuJoCo."""
+"""Validation of settings. Errors name the field, its value and the allowed values. Loads neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MAX_DEVICES = 1_000_000
 
 
 def check_devices(devices: Any) -> None:
-    """Raises ValueError unless `devices` is a number of devices, or "all"; whether they are there, JAX knows."""
+    """Raises ValueError unless `devices` is a number of devices or "all". JAX checks later that they exist."""
     if devices != "all":
         is_number = isinstance(devices, int) and not isinstance(devices, bool)
         if not is_number or not 1 <= devices <= _MAX_DEVICES:
@@ -21,10 +21,15 @@ def check_devices(devices: Any) -> None:
 
 
 def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[str, int]:
-    """Returns the host, without brackets, and the port of an address.
+    """Splits an address into a host, without brackets, and a port.
+
+    Args:
+      name: setting that the error message names.
+      value: HOST:PORT, such as "[::1]:8000".
+      allowed: valid form in the error message.
 
     Raises:
-      ValueError: the address is invalid; the message has its `name` and what is `allowed`.
+      ValueError: `value` is invalid.
     """
     host, _, port = value.rpartition(":")
     if not host or "/" in host or not (port.isascii() and port.isdecimal()) or not 0 < int(port[:6]) < 1 << 16:
@@ -33,10 +38,8 @@ def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[st
 
 
 def check_parts(config: Config, episode_length: int, parts: int) -> None:
-    """Refuses sizes that cannot be divided among the devices that share one run.
-
-    Raises:
-      ValueError: names every field at fault, its value and the nearest that can be.
+    """Raises ValueError for sizes that cannot be divided among `parts` devices. It names each field and the nearest valid
+    values.
     """
     episodes = episodes_capacity(config, episode_length)
     problems = []
@@ -58,11 +61,7 @@ def check_parts(config: Config, episode_length: int, parts: int) -> None:
 
 
 def check_all(*calls: tuple[Any, ...]) -> None:
-    """Makes calls, (function, *arguments) each.
-
-    Raises:
-      ValueError: the messages of all calls that raise one.
-    """
+    """Calls each (function, *arguments) and raises one ValueError with the messages of all that failed."""
     messages = []
     for function, *arguments in calls:
         try:
@@ -74,31 +73,33 @@ def check_all(*calls: tuple[Any, ...]) -> None:
 
 
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
-    """Refuses what is not a number of `kind` (int or float) in `interval`.
+    """Raises ValueError unless `value` is a number in an interval.
 
-    Raises:
-      ValueError: names the field, the interval and the value.
+    Args:
+      field: setting that the message names.
+      value: value to check.
+      interval: such as "[0, 1)".
+      kind: int, or float, which also allows integers.
     """
     if problem := _number_problem(field, value, Number(interval), kind):
         raise ValueError(problem)
 
 
 def check_count(field: str, value: Any) -> None:
-    """Refuses what is not an integer of at least 1 (and at most a million).
-
-    Raises:
-      ValueError: names the field, the interval and the value.
-    """
+    """Raises ValueError unless `value` is an integer from 1 to a million."""
     check_number(field, value, "[1, 1000000]")
 
 
 def validate(config: Config, hparams: HParams, episode_length: int) -> None:
-    """Refuses what cannot run in an environment whose episodes have `episode_length` steps.
+    """Checks sizes and numbers of a run.
 
-    Arrays among `hparams` are not looked at: they are one value a seed, made by a program.
+    Args:
+      config: sizes.
+      hparams: numbers. Arrays, one value per seed, are not checked.
+      episode_length: steps of the environment's episodes.
 
     Raises:
-      ValueError: names every field at fault, its value and what is allowed.
+      ValueError: names each invalid field, its value and the allowed values.
     """
     check_count("episode_length", episode_length)
     problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
@@ -108,7 +109,7 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
 
 
 def delay_problem(config: Config, delay: int) -> str | None:
-    """Error message if `target_period` or a learner's `policy_delay` does not fit the updates of a cycle, or None."""
+    """Error message if `target_period` or a learner's `policy_delay` does not fit the updates of a cycle, else None."""
     period, updates = config.target_period, config.updates_per_cycle
     if updates % period:
         divisors = [str(n) for n in range(1, updates + 1) if updates % n == 0]
@@ -122,7 +123,7 @@ def delay_problem(config: Config, delay: int) -> str | None:
 
 
 def _choice_problems(settings: Any) -> Iterator[str]:
-    """Yields the problems of fields that take one of a closed set of names (`Literal`)."""
+    """Problems of fields that take one of a fixed set of names (`Literal`)."""
     for name, hint in get_type_hints(type(settings)).items():
         if get_origin(hint) is Literal:
             try:
@@ -132,7 +133,7 @@ def _choice_problems(settings: Any) -> Iterator[str]:
 
 
 def _field_problems(settings: Config | HParams) -> Iterator[str]:
-    """Yields what is wrong with single fields."""
+    """Problems of single fields."""
     hints = get_type_hints(type(settings))
     for name, number in metadata(type(settings), Number).items():
         value = getattr(settings, name)
@@ -155,7 +156,7 @@ def _number_problem(field: str, value: Any, number: Number, kind: type) -> str |
 
 
 def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
-    """Yields what is wrong with sizes that depend on one another."""
+    """Problems of sizes that depend on each other."""
     if problem := delay_problem(c, c.policy_delay):
         yield problem
     cycle = c.num_envs * episode_length
