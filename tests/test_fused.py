@@ -14,6 +14,7 @@ from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
 from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps
+from mjx_dher.envs.engines.fused.sparse import sparse_of
 from mjx_dher.envs.engines.fused.support import unsupported
 from mjx_dher.system.warp_setup import wp
 
@@ -158,18 +159,17 @@ def test_fields_of_memory_follow_one_another():
     assert fields == sorted(fields)
     assert numbers == sorted(numbers)
     model = envs.make("push", engine="native").model
-    contacts, dofs = setup.contacts_of(model), setup.dofs_of(model)
+    contacts, dofs, sparse = setup.contacts_of(model), setup.dofs_of(model), sparse_of(model)
     for rows in (10, 96):
-        layout = setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs)
+        layout = setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs, sparse)
         begin = dict(zip(names, layout.begin.numpy()))
-        passing = [begin[name] for name in ("moment", "inertia", "force", "turning", "momentum")]
-        stay = [begin[name] for name in names if name not in ("moment", "inertia", "force", "turning", "momentum", "jacobian")]
-        assert passing == sorted(passing)
-        assert stay == sorted(stay)
-        assert begin["jacobian"] == passing[0] == 0
+        own = [begin[name] for name in names if name not in ("factor", "jacobian")]
+        assert own == sorted(own)
+        assert begin["jacobian"] == own[0] == 0
         assert begin["inertia"] == 3 * model.nbody  # moments, three numbers each
-        assert stay[0] == max(6 * model.nv + begin["momentum"], rows * model.nv)  # neither reaches into what stays
-        assert layout.size == begin["change"] + rows
+        assert begin["factor"] == begin["pos"] == max(6 * model.nv + begin["momentum"], rows * model.nv)
+        assert begin["mass"] >= begin["pos"] + model.nv**2  # neither of them reaches into what stays
+        assert 0 <= layout.size - begin["change"] - rows <= 1
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
 
 
@@ -180,7 +180,10 @@ SHAPES = (
 
 
 def robot(seed):
-    """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random."""
+    """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random.
+
+    Half of them have friction, tendons, and equalities of joints and tendons.
+    """
     rng = np.random.default_rng(seed)
 
     def numbers(size, low=-1.0, high=1.0):
@@ -189,16 +192,19 @@ def robot(seed):
     def some(text):
         return text if rng.random() < 0.5 else ""
 
-    chain, motors = "", ""
+    chain, motors, names = "", "", []
+    few = seed % 2 == 0  # whether there are rows with few terms
     for link in range(4):
         joints = ""
         for j in range(rng.integers(1, 4)):
             name, kind = f"j{link}{j}", rng.choice(["hinge", "hinge", "slide"])
+            names.append(name)
             joints += (
                 f'<joint name="{name}" type="{kind}" axis="{numbers(3)}" pos="{numbers(3, -0.1, 0.1)}"'
                 f' damping="{numbers(1, 0.1, 1)}" armature="{numbers(1, 0.05, 0.1)}"'
                 f" {some(f'stiffness={chr(34)}{numbers(1, 0, 2)}{chr(34)}')}"
-                f" {some(f'range={chr(34)}-0.3 0.3{chr(34)}')} {some(f'actuatorfrcrange={chr(34)}-0.5 0.7{chr(34)}')}/>"
+                f" {some(f'range={chr(34)}-0.3 0.3{chr(34)}')} {some(f'actuatorfrcrange={chr(34)}-0.5 0.7{chr(34)}')}"
+                f" {some(f'frictionloss={chr(34)}{numbers(1, 0, 0.3)}{chr(34)}') if few else ''}/>"
             )
             motors += rng.choice(
                 [
@@ -214,8 +220,17 @@ def robot(seed):
         f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'
         for _ in range(2)
     )
+    tendons, equal = "", ""
+    for number in range(4):
+        terms = "".join(f'<joint joint="{name}" coef="{numbers(1)}"/>' for name in rng.permutation(names)[: 1 + number])
+        friction = some('frictionloss="0.2" solreffriction="0.03 1.5"')
+        tendons += f'<fixed name="t{number}" range="-0.05 0.1" margin="0.01" {friction}>{terms}</fixed>'
+    first, second, third = rng.permutation(names)[:3]
+    equal += f'<joint joint1="{first}" joint2="{second}" polycoef="{numbers(5, -0.1, 0.1)}" solref="0.05 1"/>'
+    equal += f'<joint joint1="{third}" polycoef="0.05 0 0 0 0"/><tendon tendon1="t0" tendon2="t2" polycoef="{numbers(5)}"/>'
+    few_terms = f"<tendon>{tendons}</tendon><equality>{equal}</equality>" if few else ""
     return mujoco.MjModel.from_xml_string(
-        f'''<mujoco><option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12"/><worldbody>
+        f'''<mujoco>{few_terms}<option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12"/><worldbody>
 <body name="t" mocap="true"/><geom type="plane" size="2 2 0.1"/>{boxes}<body pos="0 0 0.3">{chain}{"</body>" * 5}</worldbody>
 <actuator>{motors}</actuator></mujoco>'''
     )

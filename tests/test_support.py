@@ -11,6 +11,7 @@ from mjx_dher import envs
 from mjx_dher.envs import engines
 from mjx_dher.envs.engines.features import fields
 from mjx_dher.envs.engines.fused import setup
+from mjx_dher.envs.engines.fused.sparse import sparse_of
 from mjx_dher.envs.engines.fused.support import has_default, is_read, unsupported
 from mjx_dher.envs.engines.pairs import all_pairs
 
@@ -24,6 +25,17 @@ contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" conty
 OFF_CENTRE = """
 <mujoco><option integrator="implicitfast"/><worldbody><body><freejoint name="f"/><geom type="box" size="1 1 1" pos="1 0 0"/>
 </body></worldbody></mujoco>
+"""
+
+
+SPATIAL = """
+<worldbody><site name="s"/><site name="u" pos="1 0 0"/></worldbody>
+<tendon><spatial name="far"><site site="s"/><site site="u"/></spatial></tendon>
+"""
+FEW = """
+<default><joint frictionloss="1" range="-1 1"/></default>
+<tendon><fixed name="f" range="0 1" frictionloss="1"><joint joint="j" coef="1"/></fixed></tendon>
+<equality><joint joint1="j"/><tendon tendon1="f"/></equality>
 """
 
 
@@ -43,7 +55,8 @@ def test_unsupported_features_are_named_with_their_elements():
         (welded('<option solver="CG"/>'), ["solver"]),
         (welded('<option><flag gravity="disable"/></option>'), ["options disabled"]),
         (welded('<option density="1.2"/>'), ["medium"]),
-        (welded('<default><joint frictionloss="1"/></default>'), ["friction in joints", "'j'"]),
+        (welded(SPATIAL), ["tendons that are not fixed", "'far'"]),
+        (welded('<tendon><fixed name="f" damping="1"><joint joint="j" coef="1"/></fixed></tendon>'), ["tendon_damping", "'f'"]),
         (welded('<default><joint stiffness="1 2"/></default>'), ["springs", "'j'"]),
         (welded('<option noslip_iterations="3"/>'), ["noslip"]),
         (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints"]),
@@ -78,22 +91,24 @@ class Recorded:
 def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
     """A field that a newer MuJoCo adds, too."""
     seen = set()
-    model = envs.make("slide", engine="native").model
-    recorded = Recorded(model, seen)
-    contacts, dofs = setup.contacts_of(recorded), setup.dofs_of(recorded)
-    setup.bodies_of(recorded)
-    setup.layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs)
+    model = welded(FEW)
+    assert unsupported(model) == []
+    for each in (model, envs.make("slide", engine="native").model):
+        recorded = Recorded(each, seen)
+        contacts, dofs, sparse = setup.contacts_of(recorded), setup.dofs_of(recorded), sparse_of(recorded)
+        setup.bodies_of(recorded)
+        setup.layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs, sparse)
     read = {name for name, _ in fields(model) if is_read(name)}
     # What decides whether a model is taken, and what only contacts of geoms that no pair lists have.
-    decides = {"actuator_biastype", "eq_data", "eq_objtype", "eq_type"}
+    decides = {"actuator_biastype", "eq_objtype", "wrap_type"}
     mixed = {f"geom_{name}" for name in ("condim", "friction", "margin", "priority", "solimp", "solmix", "solref")}
     assert read - seen == decides | mixed
     assert not any(map(has_default, seen - {"stat.meaninertia"}))  # which follows from the masses
-    model = welded('<actuator><motor name="m" joint="j"/></actuator>')
+    model = welded('<actuator><motor name="m" joint="j"/></actuator>' + FEW)
     checked = [name for name, _ in fields(model) if has_default(name)]
     assert len(checked) > 30
     assert {
-        "dof_frictionloss",
+        "tendon_stiffness",
         "geom_gap",
         "geom_surfacevel",
         "actuator_armature",
@@ -101,7 +116,7 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
         "opt.disableactuator",
     } <= {*checked}
     for name in checked:
-        if name in ("na", "nflex", "nhistory", "nplugin", "ntendon"):
+        if name in ("na", "nflex", "nhistory", "nplugin"):
             continue  # cannot be set
         changed = copy.copy(model)
         holder, field = (changed.opt, name[4:]) if name.startswith("opt.") else (changed, name)

@@ -17,7 +17,6 @@ _CURES = {
     "solver": 'solver="Newton"',
     "nativeccd": '<flag nativeccd="disable"/>',
     "stand_in": "add the geom that it names",
-    "friction in joints": 'frictionloss="0"',
 }
 
 

@@ -40,15 +40,15 @@ def memory_for(model: mujoco.MjModel) -> tuple[int, int]:
     """
     contacts, rows = pairs.most(model)
     if contacts > _FEW_CONTACTS or rows > _FEW_ROWS:
-        seen_contacts, seen_rows = _probe(model)
+        seen_contacts, seen_rows, _ = probe(model)
         contacts = min(contacts, max(1.5 * seen_contacts, _FEW_CONTACTS))
         rows = min(rows, max(1.5 * seen_rows, _FEW_ROWS))
     return max(1, round(contacts)), max(1, round(rows))
 
 
-def _probe(model: mujoco.MjModel) -> tuple[int, int]:
-    """The most contacts and rows under random controls, from the default and from keyframes."""
-    data, rng, contacts, rows = mujoco.MjData(model), np.random.default_rng(0), 0, 0
+def probe(model: mujoco.MjModel) -> tuple[int, int, int]:
+    """The most contacts, rows, and rows of contacts under random controls, from the default and from keyframes."""
+    data, rng, most = mujoco.MjData(model), np.random.default_rng(0), (0, 0, 0)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     for warning in data.warning:
         warning.number = 1  # else MuJoCo writes a log
@@ -59,8 +59,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
             if step % 20 == 0:
                 data.ctrl[:] = rng.uniform(low, high)
             mujoco.mj_step(model, data)
-            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
-    return contacts, rows
+            of_contacts = int(np.count_nonzero(data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)))
+            most = tuple(map(max, most, (data.ncon, data.nefc, of_contacts)))
+    return most
 
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")

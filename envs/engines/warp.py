@@ -76,7 +76,7 @@ class WarpEngine:
             most = graph.memory_for(model)
             defaults = (model.opt.iterations, model.opt.ls_iterations)
         else:
-            most = 0, simulation.most_rows(model)
+            most = 0, simulation.rows_for(model, simulation.shared_memory())
             defaults = (simulation.ITERATIONS, simulation.LS_ITERATIONS)
         self._contacts, self._constraints = contacts or most[0], constraints or most[1]
         self._most = most
@@ -152,7 +152,9 @@ class WarpEngine:
         if not lost:
             return
         if self.path == "fused":
-            cure = f"constraints={self._constraints}; constraints={self._most[1]} are always enough"
+            enough = simulation.most_rows(self._model) <= self._most[1]
+            most = f"constraints={self._most[1]} are always enough" if enough else "path='graph' has room for more"
+            cure = f"constraints={self._constraints}; {most}"
         else:
             cure = f"contacts={self._contacts} and constraints={self._constraints}; try twice as many"
         raise ValueError(f"the warp engine left out contacts that there was no room for: it was made with {cure}")
@@ -199,7 +201,7 @@ def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[
             raise ValueError(f"engine warp: {reason}")
     if path != "graph" and not left_out:
         try:
-            simulation.check_fits(model, constraints or simulation.most_rows(model))
+            simulation.check_fits(model, constraints or simulation.rows_for(model, simulation.shared_memory()))
             return "fused", "the fused kernel"
         except ValueError as error:
             if path == "fused":

@@ -50,11 +50,19 @@ def _impedance(soft: Softness, depth: float) -> float:
 
 
 @wp.func
+def asked(soft: Softness, residual: float, depth: float, inverse_inertia: float, velocity: float) -> wp.vec2:
+    """Weight and reference acceleration of a row."""
+    imp = _impedance(soft, depth)
+    weight = 1.0 / wp.max(inverse_inertia * (1.0 - imp) / imp, _TINY)
+    return wp.vec2(weight, -soft[0] * imp * residual - soft[1] * velocity)
+
+
+@wp.func
 def _ask(memory: Memory, row: int, soft: Softness, residual: float, depth: float, inverse_inertia: float, velocity: float):
     """Sets a row's weight and reference acceleration."""
-    imp = _impedance(soft, depth)
-    memory.weight[row] = 1.0 / wp.max(inverse_inertia * (1.0 - imp) / imp, _TINY)
-    memory.residual[row] = -soft[0] * imp * residual - soft[1] * velocity
+    asks = asked(soft, residual, depth, inverse_inertia, velocity)
+    memory.weight[row] = asks[0]
+    memory.residual[row] = asks[1]
 
 
 @wp.func

@@ -17,10 +17,12 @@ from mjx_dher.envs.engines.fused.model import (
     Dofs,
     Layout,
     Memory,
+    Sparse,
     World,
 )
 from mjx_dher.envs.engines.fused.round import collide_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
+from mjx_dher.envs.engines.fused.sparse import ask_sparse
 from mjx_dher.envs.engines.fused.threads import gather, sync
 from mjx_dher.system.warp_setup import wp
 
@@ -39,6 +41,21 @@ def _begin(
     copy(qvel, memory.qvel, thread, threads)
     copy(guess, memory.qacc, thread, threads)
     sync(threads)
+
+
+@wp.func
+def _end(
+    memory: Memory,
+    qpos: wp.array(dtype=float),  # type: ignore[valid-type]
+    qvel: wp.array(dtype=float),  # type: ignore[valid-type]
+    guess: wp.array(dtype=float),  # type: ignore[valid-type]
+    thread: int,
+    threads: int,
+):
+    """Copies an environment's state out of its memory."""
+    copy(memory.qpos, qpos, thread, threads)
+    copy(memory.qvel, qvel, thread, threads)
+    copy(memory.qacc, guess, thread, threads)
 
 
 @wp.func
@@ -98,30 +115,36 @@ def _go_on(
     world: World,
     bodies: Bodies,
     dofs: Dofs,
+    sparse: Sparse,
     memory: Memory,
     given: wp.array(dtype=float),  # type: ignore[valid-type]
+    has_sparse: bool,
     nv: int,
     warps: int,
     thread: int,
     threads: int,
 ):
     """Advances velocities and places."""
+    if has_sparse:
+        gather(warps)
+        ask_sparse(sparse, memory, thread, threads)
     gather(warps)
-    solve(world, memory, nv, thread, threads)
+    solve(world, sparse, memory, has_sparse, nv, thread, threads)
     gather(warps)
-    accelerate(world, bodies, dofs, memory, given, nv, thread, threads)
+    accelerate(world, bodies, dofs, sparse, memory, given, has_sparse, nv, thread, threads)
     gather(warps)
     integrate(world, bodies, memory, thread, threads)
 
 
 @functools.cache
-def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...]) -> Any:
+def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...], has_sparse: bool) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
 
     Args:
       floats: memory of an environment.
       threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
       kinds: kinds of geom pairs in the model; code for other kinds is left out.
+      has_sparse: whether the model has rows of `Sparse`.
     """
     shared = warps * (32 // threads_per_env) * floats
     capsules, round_ones = PLANE_CAPSULE in kinds, any(kind >= PLANE_SPHERE for kind in kinds)
@@ -132,6 +155,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
         bodies: Bodies,
         dofs: Dofs,
         contacts: Contacts,
+        sparse: Sparse,
         layout: Layout,
         spare: wp.array2d(dtype=float),  # type: ignore[valid-type]
         substeps: int,
@@ -154,9 +178,8 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
         memory = carve(layout, spare[env % spare.shape[0]], threads)
         _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], thread, threads)
-        given = inputs[env]
         for _substep in range(substeps):
-            _forces(world, bodies, dofs, memory, given, wp.static(warps), thread, threads)
+            _forces(world, bodies, dofs, memory, inputs[env], wp.static(warps), thread, threads)
             gather(wp.static(warps))
             collide_with_planes(contacts, memory, thread, threads)
             if wp.static(BOX_BOX in kinds):
@@ -168,10 +191,9 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
             if wp.static(round_ones):
                 gather(wp.static(warps))
                 collide_round(contacts, memory, thread, threads)
+            has = wp.static(has_sparse)
             _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(capsules), wp.static(warps), thread, threads)
-            _go_on(world, bodies, dofs, memory, given, wp.static(nv), wp.static(warps), thread, threads)
-        copy(memory.qpos, qpos[env], thread, threads)
-        copy(memory.qvel, qvel[env], thread, threads)
-        copy(memory.qacc, guess[env], thread, threads)
+            _go_on(world, bodies, dofs, sparse, memory, inputs[env], has, wp.static(nv), wp.static(warps), thread, threads)
+        _end(memory, qpos[env], qvel[env], guess[env], thread, threads)
 
     return advance

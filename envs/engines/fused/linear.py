@@ -17,9 +17,9 @@ _ON_A_GPU = """
         for (int r = 0; r < R; ++r) {
             const int i = thread + r * L;
             const bool is_row = thread < L && i < n;
-            b[r] = is_row ? right.data[i] : 0.0f;
+            b[r] = is_row ? solution.data[i] : 0.0f;
             #pragma unroll
-            for (int j = 0; j < N; ++j) h[r * N + j] = is_row && j <= i ? matrix.data[i * n + j] : 0.0f;
+            for (int j = 0; j < N; ++j) h[r * N + j] = is_row && j <= i ? (summed ? factor : matrix).data[i * n + j] : 0.0f;
         }
         for (int row = 0; row < rows; ++row) {
             const float lacks = residual.data[row];
@@ -106,8 +106,7 @@ _ON_A_GPU = """
 _ON_A_CPU = """
     float gain = 0.0f;
     for (int i = 0; i < n; ++i) {
-        solution.data[i] = right.data[i];
-        for (int j = 0; j <= i; ++j) factor.data[i * n + j] = matrix.data[i * n + j];
+        for (int j = 0; j <= i && !summed; ++j) factor.data[i * n + j] = matrix.data[i * n + j];
     }
     for (int row = 0; row < rows; ++row) {
         const float lacks = residual.data[row], w = weight.data[row], left = w * lacks;
@@ -148,7 +147,6 @@ _ON_A_CPU = """
 """)
 def direction(
     matrix: wp.array(dtype=float),
-    right: wp.array(dtype=float),
     jacobian: wp.array(dtype=float),
     weight: wp.array(dtype=float),
     residual: wp.array(dtype=float),
@@ -157,20 +155,20 @@ def direction(
     n: int,
     rows: int,
     stiff: int,
+    summed: int,
     thread: int,
     threads: int,
 ) -> float:
-    """Solves (M + J' D J) x = right - J' D residual, without J' D J where `stiff` is 0.
+    """Solves (M + J' D J) x = right - J' D residual, without J' D J if `stiff` is 0.
 
     D is the weight of rows that act: the first six, and those whose residual is below 0.
 
     Args:
       matrix: M [n * n], symmetric.
-      right: [n].
       jacobian: J [rows * n].
       weight, residual: [rows].
-      factor: [n * n] to compute in.
-      solution: x [n] is written here.
+      factor: [n * n] to compute in; if `summed` is 1, it holds M.
+      solution: the right side [n], in whose place x is written.
 
     Returns:
       x' (M + J' D J) x.

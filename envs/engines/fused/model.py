@@ -9,6 +9,7 @@ STILL, HINGE, SLIDE, FREE, MOCAP = range(5)
 # Pairs of geoms; those from PLANE_SPHERE on are of spheres and capsules.
 PLANE_BOX, PLANE_CYLINDER, BOX_BOX, CYLINDER_BOX = range(4)
 PLANE_SPHERE, PLANE_CAPSULE, SPHERE_SPHERE, SPHERE_CAPSULE, SPHERE_BOX, CAPSULE_CAPSULE, CAPSULE_BOX = range(4, 11)
+Polynomial = wp.types.vector(length=5, dtype=float)
 Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
 
 _ints, _floats, _vec3s, _quats = wp.array(dtype=int), wp.array(dtype=float), wp.array(dtype=wp.vec3), wp.array(dtype=wp.vec4)
@@ -91,6 +92,30 @@ class Contacts:
 
 
 @wp.struct
+class Sparse:
+    """Rows of constraints with few terms [rows]: friction, then equalities, then limits. A term is a coefficient of a joint."""
+
+    rows: int
+    frictions: int
+    limits: int  # number of the first limit
+    begin: _ints  # [rows + 1] first term of a row
+    dof: _ints  # [terms]
+    qpos: _ints  # [terms] index of the coordinate
+    coef: _floats  # [terms]
+    sloped: _ints  # [terms] 1 if the row's slope multiplies the coefficient, else 0
+    rest: _floats  # [terms] coordinate from which an equality counts
+    row: _ints  # [terms]
+    dof_begin: _ints  # [nv + 1] first one in `dof_term` of a degree of freedom
+    dof_term: _ints  # [terms] sorted by degrees of freedom
+    soft: _soft
+    inverse: _floats  # inverse inertia
+    loss: _floats  # greatest force of friction
+    span: wp.array(dtype=wp.vec2)
+    margin: _floats
+    poly: wp.array(dtype=Polynomial)  # of an equality
+
+
+@wp.struct
 class World:
     """The rest of a model."""
 
@@ -123,32 +148,37 @@ class Memory:
     force: _spatial  # that `bias` needs
     turning: _spatial  # [nv] acceleration for one unit of qvel
     momentum: _spatial  # [nv] of the body and what is below it, for one unit of qvel
-    # Those that stay.
+    # These are of no use once the rows of constraints are known: `factor` takes their place.
     pos: _vec3s  # [nbody]
     quat: _quats
     mat: _matrices
     velocity: _spatial
     bias: _spatial  # acceleration without qacc and gravity
     motion: _spatial  # [nv] velocity for one unit of qvel
-    mass: _floats  # [nv * nv]
-    smooth: _floats  # [nv] forces except those of constraints
-    qacc: _floats  # [nv]
-    inert: _floats  # [nv] mass matrix times qacc
-    search: _floats  # [nv] direction of Newton's method
-    step: _floats  # [nv] mass matrix times search
-    factor: _floats  # [nv * nv] Cholesky factor
-    qpos: _floats  # [nq]
-    qvel: _floats  # [nv]
     distance: _floats  # [nslot]
     place: _vec3s  # [nslot]
     normal: _vec3s  # [nslot] from the first geom to the second
     touching: _ints  # [nslot] slots of the contacts that there are
     slot: _ints  # [nslot] first row of each of those contacts
     limited: _ints  # [nlimit] row of each joint at its limit, or -1
+    # Those that stay.
+    mass: _floats  # [nv * nv]
+    smooth: _floats  # [nv] forces except those of constraints
+    qacc: _floats  # [nv]
+    inert: _floats  # [nv] mass matrix times qacc
+    search: _floats  # [nv] direction of Newton's method
+    step: _floats  # [nv] mass matrix times search
+    qpos: _floats  # [nq]
+    qvel: _floats  # [nv]
     counts: _ints  # [2] how many contacts, how many rows
     weight: _floats  # [rows] D, the inverse of a row's softness
     residual: _floats  # [rows] aref, and from the solver on J qacc - aref
     change: _floats  # [rows] J search
+    sparse_weight: _floats  # [sparse rows] as above; 0 if a row does not act
+    sparse_residual: _floats
+    sparse_change: _floats
+    sparse_slope: _floats  # side of a limit, and minus the derivative of an equality's polynomial
+    factor: _floats  # [nv * nv] Cholesky factor
     jacobian: _floats  # [rows * nv]
 
 

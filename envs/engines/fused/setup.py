@@ -30,7 +30,7 @@ _JOINTS = {
 }
 
 
-def _fill(struct: Any, **values: Any) -> Any:
+def fill(struct: Any, **values: Any) -> Any:
     """Makes a struct: array fields are converted to Warp arrays."""
     made = struct()
     for name, value in values.items():
@@ -54,7 +54,7 @@ def _matrices(quats: np.ndarray) -> np.ndarray:
     return matrices.reshape(-1, 3, 3)
 
 
-def _softness(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> Any:
+def softness(model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray) -> Any:
     """Returns k, b and the impedance's five numbers, from a constraint's solref and solimp."""
     least, most, width, middle, power = solimp
     least, most, middle = (float(np.clip(x, 1e-4, 0.9999)) for x in (least, most, middle))
@@ -117,7 +117,7 @@ def bodies_of(model: mujoco.MjModel) -> Any:
     begins, ends = links.first[body] == number, links.last[body] == number
     parent = np.where(begins, links.last[model.body_parentid[body]], number - 1)
     parent[0] = 0
-    return _fill(
+    return fill(
         Bodies,
         number=len(body),
         parent=parent,
@@ -133,19 +133,25 @@ def bodies_of(model: mujoco.MjModel) -> Any:
     )
 
 
+def is_sparse(model: mujoco.MjModel) -> bool:
+    """Whether the model has rows of `Sparse`. Limits of joints are then among them."""
+    equal = np.isin(model.eq_type, [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)])
+    return bool(np.any(model.dof_frictionloss > 0) or model.ntendon or np.any(equal))
+
+
 def dofs_of(model: mujoco.MjModel) -> Any:
     """Returns `Dofs` of a model."""
     joints = model.dof_jntid
     scalar = np.isin(model.jnt_type[joints], [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
     qpos = np.where(scalar, model.jnt_qposadr[joints], 0)
-    limited = np.flatnonzero(model.jnt_limited)
+    limited = np.flatnonzero(model.jnt_limited if not is_sparse(model) else [])
     driven = model.actuator_trnid[:, 0]
     gear, gain, bias = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
     everything = np.array([-np.inf, np.inf])
     links = links_of(model)
     link_of_joint = np.flatnonzero(links.joint >= 0)  # in the order of joints
     drive = np.where(model.jnt_actfrclimited[joints, None], model.jnt_actfrcrange[joints], everything)
-    return _fill(
+    return fill(
         Dofs,
         number=model.nv,
         body=link_of_joint[joints],
@@ -161,7 +167,7 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         limit_dof=model.jnt_dofadr[limited],
         limit_range=model.jnt_range[limited],
         limit_margin=model.jnt_margin[limited],
-        limit_soft=[_softness(model, *soft) for soft in zip(model.jnt_solref[limited], model.jnt_solimp[limited])],
+        limit_soft=[softness(model, *soft) for soft in zip(model.jnt_solref[limited], model.jnt_solimp[limited])],
         limit_weight=model.dof_invweight0[model.jnt_dofadr[limited]],
         actuators=model.nu,
         actuator_dof=model.jnt_dofadr[driven],
@@ -191,7 +197,7 @@ def contacts_of(model: mujoco.MjModel) -> Any:
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
     slide = pairs.friction[:, 0]
     weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
-    return _fill(
+    return fill(
         Contacts,
         geom_body=links_of(model).last[model.geom_bodyid],
         geom_pos=model.geom_pos,
@@ -207,7 +213,7 @@ def contacts_of(model: mujoco.MjModel) -> Any:
         margin=pairs.margin,
         dim=pairs.dim,
         friction=pairs.friction[:, [0, 1, 2]],
-        soft=[_softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
+        soft=[softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
         weight=weight * np.where(pairs.dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
         slots=int(most.sum()),
         pair=np.repeat(np.arange(len(kind)), most),
@@ -221,25 +227,30 @@ def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]
     return mujoco.mjtGeom(first).name[len("mjGEOM_") :], mujoco.mjtGeom(second).name[len("mjGEOM_") :]
 
 
+def other_rows(model: mujoco.MjModel) -> int:
+    """The most rows of `Memory.jacobian` that are not of contacts."""
+    return 6 + (0 if is_sparse(model) else int(np.count_nonzero(model.jnt_limited)))
+
+
 def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     """Returns `World` of a model, with room for up to `most_rows` rows of constraints."""
     welds = {}
-    if model.neq:
-        body, target = int(model.eq_obj2id[0]), int(model.eq_obj1id[0])
+    for eq in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
+        body, target = int(model.eq_obj2id[eq]), int(model.eq_obj1id[eq])
         welds = {
-            "weld_soft": _softness(model, model.eq_solref[0], model.eq_solimp[0]),
+            "weld_soft": softness(model, model.eq_solref[eq], model.eq_solimp[eq]),
             "weld_weight": wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
         }
     links = links_of(model)
     dims = contacts.dim.numpy()[contacts.pair.numpy()]
-    return _fill(
+    return fill(
         World,
         timestep=model.opt.timestep,
         gravity=wp.vec3(*model.opt.gravity),
         weld_body=int(links.last[body]) if welds else -1,
         weld_target=int(links.last[target]) if welds else -1,
         **welds,
-        rows=min(most_rows, 6 + int(np.count_nonzero(model.jnt_limited)) + int(np.where(dims == 1, 1, 2 * dims - 2).sum())),
+        rows=min(most_rows, other_rows(model) + int(np.where(dims == 1, 1, 2 * dims - 2).sum())),
         tolerance=model.opt.tolerance,
         iterations=model.opt.iterations,
         ls_iterations=model.opt.ls_iterations,
@@ -247,8 +258,11 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     )
 
 
-def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any) -> Any:
-    """Returns `Layout` for a model."""
+def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, sparse: Any) -> Any:
+    """Returns `Layout` for a model.
+
+    `jacobian` begins with the first fields, whose place it takes, and `factor` with `pos`.
+    """
     nb, nv, rows = len(links_of(model).body), model.nv, world.rows
     lengths = {
         **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
@@ -262,15 +276,16 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any) -> An
         "counts": 2,
         "jacobian": rows * nv,
         **dict.fromkeys(("weight", "residual", "change"), rows),
+        **{f"sparse_{name}": sparse.rows for name in ("weight", "residual", "change", "slope")},
     }
     fields: dict[str, Any] = Memory.vars  # type: ignore[attr-defined]
     length = np.array([lengths[name] for name in fields])
     floats = length * [np.prod(getattr(field.type.dtype, "_shape_", ()), dtype=int) for field in fields.values()]
-    end = np.cumsum(floats)
-    begin, names = end - floats, list(fields)
-    # The last field begins with the first ones, whose place it takes.
-    passing, stays, jacobian = begin[names.index("pos")], slice(names.index("pos"), -1), floats[-1]
-    begin[stays] += max(0, jacobian - passing)
-    size = int(end[-2] + max(0, jacobian - passing))
-    begin[-1] = 0
-    return _fill(Layout, size=size, begin=begin, length=length)
+    begin, names = np.cumsum(floats) - floats, list(fields)
+    pos, mass, factor = (names.index(name) for name in ("pos", "mass", "factor"))
+    passing, known = begin[pos], begin[mass] - begin[pos]  # floats of the fields whose place is taken
+    begin[pos:] += max(0, floats[-1] - passing)
+    begin[mass:] += max(0, floats[factor] - known)
+    size = 2 * ((int(begin[factor]) + 1) // 2)  # so that `jacobian` can be read in pairs
+    begin[factor], begin[-1] = begin[pos], 0
+    return fill(Layout, size=size, begin=begin, length=length)

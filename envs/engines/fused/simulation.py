@@ -4,13 +4,16 @@ from typing import Any
 
 import mujoco
 
+from mjx_dher.envs.engines import graph
 from mjx_dher.envs.engines.fused import kernel, setup
+from mjx_dher.envs.engines.fused.sparse import sparse_of
 from mjx_dher.system.warp_setup import load, wp
 
-# Threads that share an environment, and the most warps of 32 threads that a block has. Measured on an H100 (docs/design.md).
+# Threads that share an environment of few degrees of freedom, and the most warps of 32 threads in a block: measured on an H100.
 THREADS, WARPS = 16, 8
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
+_FEW_ROWS = 64  # memory for fewer is not worth an overflow
 
 
 class Simulation:
@@ -27,17 +30,16 @@ class Simulation:
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = 10**6):
-        bodies, dofs, contacts = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model)
-        world = setup.world_of(model, contacts, rows)
-        layout = setup.layout_of(model, world, contacts, dofs)
+        structs = _structs(model, rows)
+        size, contacts, sparse = structs[-1].size, structs[3], structs[4]
         device = wp.get_device()
-        self._threads = 1 if device.is_cpu else THREADS
-        warps = 0 if device.is_cpu else most_warps(layout.size, device.max_shared_memory_per_block)
+        self._threads = 1 if device.is_cpu else threads_for(model)
+        warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block, self._threads)
         self._block = max(1, 32 * warps)
         kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
-        self._kernel = kernel.make(layout.size, self._threads, warps, model.nv, kinds)
-        memory = wp.zeros((num_envs, layout.size) if device.is_cpu else (1, 1), dtype=float)
-        self._kept = (world, bodies, dofs, contacts, layout, memory)
+        self._kernel = kernel.make(size, self._threads, warps, model.nv, kinds, sparse.rows > 0)
+        memory = wp.zeros((num_envs, size) if device.is_cpu else (1, 1), dtype=float)
+        self._kept = (*structs, memory)
         self._lost = wp.zeros(1, dtype=int)
         self._substeps, self._num_envs = substeps, num_envs
 
@@ -63,25 +65,36 @@ class Simulation:
         return lost
 
 
+def _structs(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
+    """The kernel's structs for a model, with room for `rows` rows of constraints."""
+    bodies, dofs, contacts, sparse = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model), sparse_of(model)
+    world = setup.world_of(model, contacts, rows)
+    return world, bodies, dofs, contacts, sparse, setup.layout_of(model, world, contacts, dofs, sparse)
+
+
 def shared_memory() -> int | None:
     """Bytes of shared memory of a block on the first GPU; None without a GPU."""
     return wp.get_device("cuda:0").max_shared_memory_per_block if wp.is_cuda_available() else None
 
 
+def threads_for(model: mujoco.MjModel) -> int:
+    """Threads that share an environment: a warp if half of one would have two rows of the mass matrix each."""
+    return THREADS if model.nv <= THREADS else 2 * THREADS
+
+
 def check_fits(model: mujoco.MjModel, rows: int) -> None:
     """Raises ValueError if the GPU's shared memory does not suffice for an environment with `rows` rows of constraints."""
     if (shared := shared_memory()) is not None:
-        contacts, dofs = setup.contacts_of(model), setup.dofs_of(model)
-        most_warps(setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs).size, shared)
+        most_warps(_structs(model, rows)[-1].size, shared, threads_for(model))
 
 
-def most_warps(size: int, shared: int) -> int:
+def most_warps(size: int, shared: int, threads: int = THREADS) -> int:
     """Number of warps of a block, if an environment takes `size` floats and a block has `shared` bytes.
 
     Raises:
       ValueError: not even one warp fits.
     """
-    a_warp = 4 * size * (32 // THREADS)
+    a_warp = 4 * size * (32 // threads)
     if a_warp > shared:
         raise ValueError(
             f"the warp engine needs {a_warp:,} bytes of a GPU's shared memory and has {shared:,}; fewer constraints take less"
@@ -90,5 +103,21 @@ def most_warps(size: int, shared: int) -> int:
 
 
 def most_rows(model: mujoco.MjModel) -> int:
-    """The most constraint rows that an environment can have."""
+    """The most constraint rows that an environment can have, without those that are sparse."""
     return int(setup.world_of(model, setup.contacts_of(model), 10**6).rows)
+
+
+def rows_for(model: mujoco.MjModel, shared: int | None) -> int:
+    """Constraint rows to have memory for: all that can occur, if a block's shared memory suffices for them.
+
+    For large models it must suffice for half of the most warps. Else memory is for half as many again as random controls cause,
+    and for as many more as fit beside as many environments.
+    """
+    most, threads = most_rows(model), threads_for(model)
+    least_warps = 1 if threads == THREADS else WARPS // 2
+    if shared is None or 4 * _structs(model, most)[-1].size * (32 // threads) * least_warps <= shared:
+        return most
+    least = max(_FEW_ROWS, setup.other_rows(model) + round(1.5 * graph.probe(model)[2]))
+    size = _structs(model, least)[-1].size
+    room = shared // (8 * (32 // threads) * most_warps(size, shared, threads)) * 2
+    return min(most, least + (room - size) // (model.nv + 3))

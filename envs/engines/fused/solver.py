@@ -7,7 +7,8 @@ E. Todorov, Convex and analytically-invertible dynamics with contacts and constr
 
 from mjx_dher.envs.engines.fused.dynamics import damping
 from mjx_dher.envs.engines.fused.linear import direction
-from mjx_dher.envs.engines.fused.model import FREE, Bodies, Dofs, Memory, World
+from mjx_dher.envs.engines.fused.model import FREE, Bodies, Dofs, Memory, Sparse, World
+from mjx_dher.envs.engines.fused.sparse import add_sparse, begin_sparse, change_sparse, slopes_sparse, take_sparse
 from mjx_dher.envs.engines.fused.threads import sync, total
 from mjx_dher.system.warp_setup import wp
 
@@ -35,7 +36,17 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 
 @wp.func
-def _slopes(memory: Memory, rows: int, at: float, slope: float, curve: float, thread: int, threads: int) -> wp.vec2:
+def _slopes(
+    sparse: Sparse,
+    memory: Memory,
+    has_sparse: bool,
+    rows: int,
+    at: float,
+    slope: float,
+    curve: float,
+    thread: int,
+    threads: int,
+) -> wp.vec2:
     """First and second derivative of the cost at a step along the search direction."""
     d1 = float(0.0)
     d2 = float(0.0)
@@ -45,12 +56,25 @@ def _slopes(memory: Memory, rows: int, at: float, slope: float, curve: float, th
         pull = _pull(row, left, memory.weight[row]) * change
         d1 += pull * left
         d2 += pull * change
+    if has_sparse:
+        more = slopes_sparse(sparse, memory, at, thread, threads)
+        d1 += more[0]
+        d2 += more[1]
     return wp.vec2(total(d1, threads) + slope + at * curve, total(d2, threads) + curve)
 
 
 @wp.func
 def _how_far(
-    memory: Memory, rows: int, slope: float, curve: float, gain: float, attempts: int, thread: int, threads: int
+    sparse: Sparse,
+    memory: Memory,
+    has_sparse: bool,
+    rows: int,
+    slope: float,
+    curve: float,
+    gain: float,
+    attempts: int,
+    thread: int,
+    threads: int,
 ) -> float:
     """Returns the step along the search direction that minimizes the cost.
 
@@ -62,7 +86,7 @@ def _how_far(
     high = float(-1.0)
     step = float(1.0)
     for _ in range(attempts):
-        d = _slopes(memory, rows, step, slope, curve, thread, threads)
+        d = _slopes(sparse, memory, has_sparse, rows, step, slope, curve, thread, threads)
         if wp.abs(d[0]) <= _SLOPE * gain:
             break
         if d[0] < 0.0:
@@ -76,7 +100,9 @@ def _how_far(
 
 
 @wp.func
-def _take(memory: Memory, far: float, rows: int, size: int, thread: int, threads: int) -> float:
+def _take(
+    sparse: Sparse, memory: Memory, has_sparse: bool, far: float, rows: int, size: int, thread: int, threads: int
+) -> float:
     """Takes a step along the search direction. Returns the number of rows that begin or cease to act."""
     changed = float(0.0)
     for i in range(thread, size, threads):
@@ -88,13 +114,15 @@ def _take(memory: Memory, far: float, rows: int, size: int, thread: int, threads
         memory.residual[row] = after
         if row >= _EQUALITIES and (before < 0.0) != (after < 0.0):
             changed += 1.0
+    if has_sparse:
+        changed += take_sparse(sparse, memory, far, thread, threads)
     changed = total(changed, threads)
     sync(threads)
     return changed
 
 
 @wp.func
-def _begin(memory: Memory, rows: int, nv: int, thread: int, threads: int) -> float:
+def _begin(sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int, thread: int, threads: int) -> float:
     """Initializes the solver at the first guess. Returns the energy that single precision leaves uncertain.
 
     Rounding J a - aref causes it: at the minimum, a step cannot gain more than the sum of D times the squared error.
@@ -109,26 +137,30 @@ def _begin(memory: Memory, rows: int, nv: int, thread: int, threads: int) -> flo
         memory.residual[row] = residual
         size = wp.abs(has) + wp.abs(asked)
         unsure += _pull(row, residual, memory.weight[row]) * size * size
+    if has_sparse:
+        unsure += begin_sparse(sparse, memory, thread, threads)
     unsure = total(unsure, threads)
     sync(threads)
     return _UNSURE * unsure
 
 
 @wp.func
-def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
-    """Computes `qacc`, starting from its present value."""
+def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: int, thread: int, threads: int):
+    """Computes `qacc`, starting from its present value. `has_sparse` says whether the model has rows of `sparse`."""
     rows = memory.counts[1]
-    unsure = _begin(memory, rows, nv, thread, threads)
+    unsure = _begin(sparse, memory, has_sparse, rows, nv, thread, threads)
     for _ in range(world.iterations):
         energy = float(0.0)
         for i in range(thread, nv, threads):
             energy += memory.qacc[i] * memory.inert[i]
             memory.step[i] = memory.smooth[i] - memory.inert[i]
+            memory.search[i] = memory.step[i]
         least = wp.max(wp.max(world.tolerance / world.scale, unsure), _ROUNDING * total(energy, threads))
+        if has_sparse:
+            add_sparse(sparse, memory, nv, 1, thread, threads)
         sync(threads)
         gain = direction(
             memory.mass,
-            memory.step,
             memory.jacobian,
             memory.weight,
             memory.residual,
@@ -137,6 +169,7 @@ def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
             nv,
             rows,
             1,
+            wp.where(has_sparse, 1, 0),
             thread,
             threads,
         )  # the cost's decrease if all of it were one piece, twice
@@ -151,10 +184,12 @@ def solve(world: World, memory: Memory, nv: int, thread: int, threads: int):
             memory.step[i] = step_i
         for row in range(thread, rows, threads):
             memory.change[row] = _dot(memory.jacobian, row, memory.search, nv)
+        if has_sparse:
+            change_sparse(sparse, memory, thread, threads)
         slope = total(slope, threads)
         curve = total(curve, threads)
-        far = _how_far(memory, rows, slope, curve, gain, world.ls_iterations, thread, threads)
-        changed = _take(memory, far, rows, nv, thread, threads)
+        far = _how_far(sparse, memory, has_sparse, rows, slope, curve, gain, world.ls_iterations, thread, threads)
+        changed = _take(sparse, memory, has_sparse, far, rows, nv, thread, threads)
         if changed == 0.0 and wp.abs(far - 1.0) < _WHOLE:
             break
         if far * far * gain <= least:  # rounding lets the search go no further
@@ -166,8 +201,10 @@ def accelerate(
     world: World,
     bodies: Bodies,
     dofs: Dofs,
+    sparse: Sparse,
     memory: Memory,
     inputs: wp.array(dtype=float),
+    has_sparse: bool,
     nv: int,
     thread: int,
     threads: int,
@@ -176,10 +213,12 @@ def accelerate(
     sync(threads)
     for i in range(thread, nv, threads):
         memory.mass[i * nv + i] = memory.mass[i * nv + i] + world.timestep * damping(dofs, memory, inputs, i)
+        memory.search[i] = memory.smooth[i]
+    if has_sparse:
+        add_sparse(sparse, memory, nv, 0, thread, threads)
     sync(threads)
     direction(
         memory.mass,
-        memory.smooth,
         memory.jacobian,
         memory.weight,
         memory.residual,
@@ -187,6 +226,7 @@ def accelerate(
         memory.search,
         nv,
         memory.counts[1],
+        0,
         0,
         thread,
         threads,

@@ -16,12 +16,13 @@ _READ = re.compile(
         [
             r"actuator_(biasprm|biastype|ctrllimited|ctrlrange|forcelimited|forcerange|gainprm|gear|trnid)",
             r"body_(inertia|invweight0|ipos|iquat|jntadr|jntnum|mass|mocapid|parentid|pos|quat|rootid)",
-            r"dof_(armature|damping|invweight0|jntid)|eq_(data|obj1id|obj2id|objtype|solimp|solref|type)",
+            r"dof_(armature|damping|frictionloss|invweight0|jntid|solimp|solref)|eq_(data|obj1id|obj2id|objtype|solimp|solref|type)",
             r"geom_(bodyid|conaffinity|condim|contype|friction|margin|pos|priority|quat|rbound|size|solimp|solmix|solref|type)",
-            r"nbody|nq|nu|nv|qpos0|qpos_spring",
+            r"nbody|neq|nq|ntendon|nu|nv|qpos0|qpos_spring|wrap_(objid|prm|type)",
             r"jnt_(actfrclimited|actfrcrange|axis|dofadr|limited|margin|pos|qposadr|range|solimp|solref|stiffness|type)",
             r"opt\.(disableflags|gravity|impratio|integrator|iterations|ls_iterations|timestep|tolerance)",
             r"pair_(dim|friction|geom1|geom2|margin|solimp|solref)",
+            r"tendon_(adr|frictionloss|invweight0|limited|margin|num|range|solimp_fri|solimp_lim|solref_fri|solref_lim)",
         ]
     )
 )
@@ -32,14 +33,14 @@ _WITHOUT_EFFECT = re.compile(
             # What is seen, named or read alone; and sizes, except those of features that are left out.
             r"(cam|light|mat|mesh|tex|text|tuple|numeric|key|skin|hfield|name|bvh|oct|sensor|site|exclude)_.*",
             r".*_(user|group|rgba|matid)|names|names_map|paths|signature|stat|vis",
-            r"n(?!tendon$|flex$|plugin$|history$|a$)[a-zA-Z0-9]+(_\w+)?",
-            # What follows from other fields, or is empty without tendons, flexes and plugins.
-            r"(ten|tendon|wrap|flex\w*|plugin|efm0|efmC|tree)_.*|plugin",
+            r"n(?!flex$|plugin$|history$|a$)[a-zA-Z0-9]+(_\w+)?",
+            # What follows from other fields, or is empty without flexes and plugins.
+            r"(ten|flex\w*|plugin|efm0|efmC|tree)_.*|plugin|tendon_(actfrcrange|actuatorid|length0|lengthspring|tree\w+|width)",
             r"[BDM]_\w+|map\w+|dof_(M0|Madr|bodyid|length|parentid|simplenum|treeid)|jnt_(bodyid|actuatorid)|pair_signature",
             r"body_(bvh\w+|conaffinity|contype|dofadr|dofnum|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
             r"geom_(aabb|sameframe|dataid)|actuator_(acc0|ctrladr|ctrlnum|ctrlspec|outadr|outnum|length0|lengthrange|historyadr)",
             # What belongs to a feature that is left out.
-            r"dof_sol(imp|ref)|opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
+            r"opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
             r"opt\.(jacobian|ls_tolerance|magnetic|sleep_tolerance|sdf_\w+|ccd_\w+)",
         ]
     )
@@ -74,6 +75,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
         ("jnt", "springs of free joints"): (model.jnt_stiffness != 0) & ~scalar,
         ("jnt", "limits of free joints"): (model.jnt_limited != 0) & ~scalar,
+        ("tendon", "tendons that are not fixed"): _not_fixed(model),
         ("jnt", "free bodies, with implicitfast, that have parts or are not centred on their mass"): _off_centre(model),
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
         ("actuator", "actuators of free or ball joints"): on_joint & ~np.isin(driven, (_HINGE, _SLIDE)),
@@ -87,9 +89,17 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         yield "options disabled"
     if not 0 < model.nv <= 31:
         yield "no degrees of freedom, or more than 31"
-    plain = [_is_plain_weld(model, index) for index in range(model.neq)]
-    if plain not in ([], [True]):
-        yield with_names("equality constraints other than one weld of a mocap body", model, "eq", range(model.neq))
+    welds = [index for index in range(model.neq) if _is_plain_weld(model, index)]
+    few = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
+    others = [index for index in range(model.neq) if int(model.eq_type[index]) not in few and index not in welds[:1]]
+    if others:
+        yield with_names("equality constraints other than one weld of a mocap body", model, "eq", others)
+
+
+def _not_fixed(model: mujoco.MjModel) -> np.ndarray:
+    """Tendons [ntendon] that are not sums of joints."""
+    first = model.wrap_type[model.tendon_adr] if model.ntendon else np.zeros(0, int)
+    return first != int(mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def _off_centre(model: mujoco.MjModel) -> np.ndarray:
