@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.kinematics import Place, names_of, to_quat
+from mjx_dher.envs.kinematics import Numbered, Place, names_of, to_quat
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -26,16 +26,22 @@ _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     """Indices whose name in one of the columns fits one of the patterns, such as "j1 finger*", in the columns' order.
 
+    A `Numbered` name fits only itself and "*".
+
     Raises:
       ValueError: no name fits a pattern; the message lists the names.
     """
     chosen: set[int] = set()
     for pattern in str(patterns).split() or [""]:
-        fitting = {i for names in columns for i, name in enumerate(names) if name and fnmatch.fnmatchcase(name, pattern)}
+        fitting = {i for names in columns for i, name in enumerate(names) if name and _fits(name, pattern)}
         if not fitting:
             check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
         chosen |= fitting
     return sorted(chosen)
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return pattern in ("*", name) if isinstance(name, Numbered) else fnmatch.fnmatchcase(name, pattern)
 
 
 class Control:
@@ -82,7 +88,7 @@ class Actuators(Control):
         own, joints = [""] * model.nu, [""] * model.nu  # names of actuators of this kind, and of their joints
         for i in filter(lambda i: self._suits(model, i), range(model.nu)):
             joints[i] = names_of(model, "joint")[joint] if (joint := _joint(model, i)) >= 0 else ""
-            own[i] = model.actuator(i).name or joints[i] or f"actuator_{i}"
+            own[i] = model.actuator(i).name or joints[i] or Numbered(f"actuator_{i}")
         bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
         bound.moved = [own[i] for i in bound.indices]
         bound.size = 1 if self.together else len(bound.indices)

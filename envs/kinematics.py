@@ -18,10 +18,16 @@ FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for k
 _COUNTS = {"joint": "njnt", "actuator": "nu"}
 
 
+class Numbered(str):
+    """Stands for the name of an object without one. Of patterns, only "*" fits it."""
+
+    __slots__ = ()
+
+
 def names_of(model: Any, kind: str) -> list[str]:
-    """Names of a model's objects of a kind ("site", "body", "joint", "key", ...); the third joint without one is "joint_2"."""
+    """Names of a model's objects of a kind ("site", "body", "joint", "key", ...); "joint_2" if the third joint has none."""
     count = getattr(model, _COUNTS.get(kind, f"n{kind}"))
-    return [getattr(model, kind)(i).name or f"{kind}_{i}" for i in range(count)]
+    return [getattr(model, kind)(i).name or Numbered(f"{kind}_{i}") for i in range(count)]
 
 
 class Place:

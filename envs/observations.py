@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -29,6 +31,7 @@ class Entry:
         if len(set(sizes)) > 1:
             raise ValueError(f"observation {text!r} must subtract as many numbers as there are; the sizes are {sizes}")
         self.size = sizes[0]
+        self.joints = self._parts[0].joints  # names of those whose coordinates it has
 
     def __call__(self, physics: Physics) -> Array:
         value, *others = [part(physics) for part in self._parts]
@@ -38,11 +41,14 @@ class Entry:
 
 
 class _Part:
+    joints: Sequence[str] = ()
+
     def __init__(self, model: mujoco.MjModel, text: str):
         self.kind, _, name = text.partition(":")
         check_name(f"kind of observation {text!r}", self.kind, KINDS)
         if self.kind in ("qpos", "qvel"):
-            joints = pick("joint", name, names_of(model, "joint"))
+            joints = pick("joint", name, names := names_of(model, "joint"))
+            self.joints = [str(names[joint]) for joint in joints]
             self.index = np.concatenate([_indices(model, joint, self.kind) for joint in joints])
             self.size = len(self.index)
         else:

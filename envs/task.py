@@ -128,9 +128,10 @@ class MujocoTask(GoalEnv):
 
     @property
     def robot_interface(self) -> dict[str, Any]:
-        """Controls and observation layout as JSON, for exported policies."""
+        """Controls, observation layout and joint names of its entries as JSON, for policy files."""
         layout = {name: [part.start, part.stop] for name, part in self.layout.items()}
-        return {"controls": [part.describe() for part in self.parts], "layout": layout}
+        joints = {name: entry.joints for name, entry in zip(self.layout, self._entries) if entry.joints}
+        return {"controls": [part.describe() for part in self.parts], "layout": layout, "joints": joints}
 
     @property
     def goal_bounds(self) -> np.ndarray | None:

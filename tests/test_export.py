@@ -149,8 +149,11 @@ def test_a_file_carries_what_a_robot_needs(name, tmp_path):
     env = envs.make("my_arm:Reach", engine="native", obs_noise=0.01)
     started = RunSpec(env="my_arm:Reach", env_kwargs=("obs_noise=0.01",))
     path, out = tmp_path / "run", tmp_path / f"policy.{name}"
-    run_folder.write_config(path, started, "native", {"interface": contract.robot_interface(env)})
-    save_policy(path, random_policy())
+    run_folder.write_config(path, started, "native", {})
+    content = run_folder.read_config(path)
+    identity = run_folder.identity_of(content, run_folder.to_spec(path, content))
+    run_folder.save_policy(path, random_policy(), identity, contract.robot_interface(env))
+    assert mjx_dher.load_policy(path / "policy.npz").interface == contract.robot_interface(env)  # without the folder, too
     assert cli.main(["export", str(path), "--format", name, "--out", str(out)]) == 0
     about = export.FORMATS[name][1](out).about
     (control,) = json.loads(about["controls"])
@@ -158,6 +161,7 @@ def test_a_file_carries_what_a_robot_needs(name, tmp_path):
     assert (control["kind"], control["scale"], control["moves"]) == ("JointDelta", 0.15, [f"j{i}" for i in range(1, 7)])
     assert len(control["low"]) == len(control["high"]) == 6
     assert json.loads(about["layout"])["vel:tip"] == [3, 6]
+    assert json.loads(about["joints"])["qpos:j*"] == control["moves"]  # not the free joint of the box, which has no name
 
 
 def test_a_safetensors_file_holds_the_policy_to_the_bit(run):

@@ -95,6 +95,7 @@ def test_observations():
         "angvel:box": [6, 7, 8],
         "qpos:a c": [0.3, 0.5],
         "qvel:?": [0, 1, 2],
+        "qpos:joint_3": [0, 0, 1, 1, 0, 0, 0],  # of the box
         "qpos:a - qpos:b - qpos:c": [0.3 + 0.2 - 0.5],
     }
     env = make(observations=tuple(parts), control=task.Torque())
@@ -103,6 +104,9 @@ def test_observations():
     assert observed.shape == (env.observation_size,) == (sum(map(len, parts.values())),)
     for text, value in parts.items():
         np.testing.assert_allclose(observed[env.layout[text]], value, atol=1e-6, err_msg=text)
+    assert make(observations=("qpos:*",)).observation_size == env.model.nq
+    with refuses("joint", "'joint_*'"):  # of joints without a name
+        make(observations=("qpos:joint_*",))
 
 
 def turned(angle, axis=2):

@@ -121,6 +121,9 @@ def damage(run_dir, how):
         policy_file.write_bytes(policy_file.read_bytes()[:1000])
     elif how == "foreign policy":
         np.savez(policy_file.open("wb"), other=np.zeros(3))
+    elif how == "interface":
+        arrays = dict(np.load(policy_file))
+        np.savez(policy_file.open("wb"), **arrays, interface=np.frombuffer(b"[1]", np.uint8))
     elif how == "no policy file at all":
         policy_file.write_text("hello")
 
@@ -135,6 +138,7 @@ DAMAGES = {
     "no policy": ["policy.npz", "missing"],
     "truncated policy": ["policy.npz", "damaged"],
     "foreign policy": ["policy.npz", "damaged"],
+    "interface": ["policy.npz", "interface", "[1]"],
     "no policy file at all": ["policy.npz", "damaged"],
 }
 

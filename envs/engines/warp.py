@@ -72,6 +72,7 @@ class WarpEngine:
                 check_count(name, count)
         self._model, self._substeps = copy.copy(model), substeps
         self.path, self.note = _choose(model, path, constraints)
+        self.name = "warp" if self.path == "fused" else "warp graph"  # their numbers differ, so runs name them apart
         if self.path == "graph":
             most = graph.memory_for(model)
             defaults = (model.opt.iterations, model.opt.ls_iterations)

@@ -46,7 +46,9 @@ def export_command(argv: list[str], console: Console) -> int:
     out = args.out or beside
     export.check(args.format, out, args.overwrite)
     policy = load_plain(folder, "export")
-    difference = export.write(policy, run, args.format, out, content.get("interface", {}))
+    if not policy.interface:  # older policy files leave it to the run folder
+        policy = dataclasses.replace(policy, interface=content.get("interface", {}))
+    difference = export.write(policy, run, args.format, out)
     observation_size, goal_size, action_size = export.sizes(policy)
     console.print(
         f"{run.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"

@@ -15,6 +15,7 @@ import numpy as np
 from mjx_dher import learners
 from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
+from mjx_dher.policy.numpy_policy import read_interface
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import atomic_write
 from mjx_dher.types import Array, EnvSpec, PyTree
@@ -28,6 +29,7 @@ class LearnerPolicy:
     state: PyTree  # the learner's
     hparams: HParams
     spec: EnvSpec
+    interface: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # as a `Policy` has it
 
     @property
     def sizes(self) -> tuple[Any, int, int]:
@@ -68,7 +70,8 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolic
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
         raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
-    policy = LearnerPolicy(learner, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored]), spec.hparams, env_spec)
+    state = jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored])
+    policy = LearnerPolicy(learner, state, spec.hparams, env_spec, read_interface(arrays))
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), env_spec.observation)
     if not np.all(np.isfinite(policy({"observation": zeros, "desired_goal": np.zeros(env_spec.goal_size, np.float32)}))):
         raise ValueError("its action for an observation of zeros is not finite")

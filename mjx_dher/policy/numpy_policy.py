@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,6 +22,9 @@ class TrainedPolicy(Protocol):
 
     @property
     def sizes(self) -> tuple[Any, int, int]: ...  # of observations, goals and actions: D, G, A (`EnvSpec.sizes`)
+
+    @property
+    def interface(self) -> Mapping[str, Any]: ...  # `contract.robot_interface` of the run's environment; {} if unknown
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # observations of one state or a batch -> actions [..., A]
 
@@ -44,6 +48,8 @@ class Policy:
     goal_std: Any  # [G]
     norm_clip: float
     obs_clip: float
+    # Seconds of a step `dt`; of a task from an MJCF also `controls`, observation `layout` and names of its `joints`.
+    interface: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -132,7 +138,16 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
         layers=tuple((arrays[f"layer{i}_kernel"], arrays[f"layer{i}_bias"]) for i in range(num_layers)),
         **{field: arrays[field] for field in _VECTORS},
         **{field: float(arrays[field]) for field in _SCALARS},
+        interface=read_interface(arrays),
     )
+
+
+def read_interface(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """The `interface` among the arrays of a policy file, {} if there is none. Raises ValueError if it is no JSON object."""
+    interface = json.loads(arrays["interface"].tobytes()) if "interface" in arrays else {}
+    if not isinstance(interface, dict):
+        raise ValueError(f"interface must be a JSON object; it is {str(interface)[:100]}")
+    return interface
 
 
 def _check_array(name: str, array: Any) -> None:

@@ -194,7 +194,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
             if program.lanes == 1:
                 learner = processes.collect(progress.state.learner)
                 try:
-                    _save_policy(program, learner, specs[0], folders[0], runs[0])
+                    _save_policy(session.env, program, learner, specs[0], folders[0], runs[0])
                 except OSError as error:  # the run can go on without one
                     report_once(f"cannot write the policy ({error})")
             session.on_epoch(specs, progress)
@@ -268,7 +268,7 @@ def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], faile
                 sink.write(row)
 
 
-def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:
+def _save_policy(env: Env, program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:
     """Writes the policy of a run's learner, as NumPy arrays if possible, or else as the learner's state.
 
     The learner is None in processes that do not write.
@@ -280,7 +280,7 @@ def _save_policy(program: Program, learner: Any, spec: RunSpec, folder: Path, ru
         from mjx_dher.policy.learner_policy import LearnerPolicy
 
         policy = LearnerPolicy(program.learner, learner, spec.hparams, program.spec)
-    run_folder.save_policy(folder, policy, run)
+    run_folder.save_policy(folder, policy, run, robot_interface(env))
 
 
 def _finish(
@@ -315,7 +315,8 @@ def _finish(
             content |= evaluate.summarize(*(x[lane] for x in outcome[:4]))
         if processes.leads():
             if not reason:
-                _save_policy(program, program_lib.lane_of(learners, lane, program.lanes), spec, folder, runs[lane])
+                learner = program_lib.lane_of(learners, lane, program.lanes)
+                _save_policy(session.env, program, learner, spec, folder, runs[lane])
                 files.flush(folder / run_folder.POLICY_FILE)
             loggers.flush_logs(folder)
             files.write_json(folder / run_folder.RESULT_FILE, content)

@@ -6,9 +6,8 @@ docs/policies.md describes both files. Neither writing nor reading them needs JA
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,8 +42,8 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
     lookup.require_extra(f"format {file_format}", file_format, "export")
 
 
-def metadata(policy: Policy, run: RunSpec, interface: Mapping[str, Any] = MappingProxyType({})) -> dict[str, str]:
-    """Returns the metadata of an exported file. `interface` is the run's `contract.robot_interface`, as JSON."""
+def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
+    """Returns the metadata of an exported file."""
     observation_size, goal_size, action_size = sizes(policy)
     content = {
         "format": "mjx-dher policy",
@@ -61,7 +60,8 @@ def metadata(policy: Policy, run: RunSpec, interface: Mapping[str, Any] = Mappin
         "norm_clip": policy.norm_clip,
         "obs_clip": policy.obs_clip,
     }
-    about = {name: json.dumps(interface[name]) for name in ("dt", "controls", "layout") if name in interface}
+    names = ("dt", "controls", "layout", "joints")
+    about = {name: json.dumps(policy.interface[name]) for name in names if name in policy.interface}
     return {**about, **{name: str(value) for name, value in content.items()}}
 
 
@@ -70,9 +70,7 @@ def sizes(policy: Policy) -> tuple[int, int, int]:
     return len(policy.observation_mean), len(policy.goal_mean), len(policy.layers[-1][1])
 
 
-def write(
-    policy: Policy, run: RunSpec, file_format: str, out: Path, interface: Mapping[str, Any] = MappingProxyType({})
-) -> float:
+def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
     """Writes the policy to `out`, reads it back, and compares. Unless it passes, an existing file stays as it was.
 
     Args:
@@ -80,7 +78,6 @@ def write(
       run: settings of the run, for the metadata.
       file_format: one of FORMATS.
       out: path of the file; see `check`.
-      interface: of the run, for the metadata.
 
     Returns:
       The largest difference between the actions of the file and of the policy, over CHECKED observations.
@@ -89,7 +86,7 @@ def write(
       ValueError: `out` cannot be written, or the file read back differs from the policy.
     """
     to_bytes, read = FORMATS[file_format]
-    about = metadata(policy, run, interface)
+    about = metadata(policy, run)
     try:
         with files.atomic_write(out) as partial:
             partial.write_bytes(to_bytes(policy, about))
