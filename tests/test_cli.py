@@ -111,7 +111,7 @@ BAD = [
         ["env must be one of pick_and_place, push", ", or module:attribute; got 'pusch' (did you mean 'push'"],
     ),
     (["--env", "not_there:Task"], ["env 'not_there:Task': there is no module 'not_there' in the current folder or on"]),
-    (["--env", "tasks/mine.py:Task"], ["env must be module:attribute, the module's name as `import` takes it; got"]),
+    (["--env", "tasks/mine.py:Task"], ["env must be module:attribute, with the module's name as in `import`; got"]),
     (["--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
     (["sweep", "--out", "x", "--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),
     (["render", "--env", "not_there:Task", "--out", "x.png"], ["env 'not_there:Task': there is no module 'not_there'"]),

@@ -150,12 +150,12 @@ def test_what_is_no_run_is_named(tmp_path, capsys):
     (tmp_path / "sweep" / "cells").mkdir(parents=True)
     (tmp_path / "file").write_text("")
     for folders, message in (
-        ([tmp_path / "none"], "none is neither a run folder nor that of a sweep: no such folder"),
-        ([tmp_path / "file"], "file is neither a run folder nor that of a sweep: no such folder"),
+        ([tmp_path / "none"], "none is neither a run folder nor a sweep: no such folder"),
+        ([tmp_path / "file"], "file is neither a run folder nor a sweep: no such folder"),
         ([tmp_path], "it has neither config.json nor cells/"),
-        ([run, tmp_path / "sweep"], "sweep is a sweep: it is taken alone, not with other folders"),
-        ([tmp_path / "sweep"], "sweep holds no finished run of a sweep"),
-        ([], "name one or more run folders"),
+        ([run, tmp_path / "sweep"], "sweep is a sweep: pass it alone, without other folders"),
+        ([tmp_path / "sweep"], "sweep has no finished run of a sweep"),
+        ([], "pass one or more run folders"),
         ([run, "--out", tmp_path / "file" / "x"], "file"),
         ([run, "--formats", "gif"], "formats must be among png, svg, pdf; got gif"),
         ([run, "--threshold", "nan"], "threshold must lie in (0, 1]; got nan"),
@@ -251,7 +251,7 @@ def test_a_film_that_is_too_large_is_left_out_and_named(tmp_path, monkeypatch):
     monkeypatch.setattr(html, "LARGEST", 4)
     told = []
     assert "data:" not in report.of_run(run, told.append)
-    assert told == [f"{run / 'large.gif'} is larger than 0 MB, and left out"]
+    assert told == [f"{run / 'large.gif'} is left out because it is larger than 0 MB"]
 
 
 @pytest.fixture
@@ -270,13 +270,13 @@ def test_a_page_about_a_sweep_compares_and_names_its_runs(sweep, capsys):
     text, _ = read_page(sweep / "report.html")
     assert text.count("<svg") == 3
     for told in (
-        "4 runs have ended, 1 of them failed",
+        "4 runs have ended, of which 1 failed",
         "2 (1 failed)",
         "the learner is not finite",
         "epochs to a success rate of 0.5",
     ):
         assert told in text
-    assert "What differs between runs: sampler." in text
+    assert "Runs differ in sampler." in text
     assert not (sweep / "comparison.csv").exists()
 
 

@@ -70,7 +70,7 @@ def test_everything_written_is_inside_and_apart(name, env, count):
     assert any("1 of 4 failed" in text.get_text().replace("\n", " ") for text, _ in placed)
 
 
-@pytest.mark.parametrize(("lanes", "label"), [(1, "seconds (of one run)"), (5, "seconds (all runs side by side)")])
+@pytest.mark.parametrize(("lanes", "label"), [(1, "seconds (one run)"), (5, "seconds (parallel runs)")])
 def test_seconds_are_of_what_they_say(lanes, label):
     assert plotting.curves(groups_of(2, lanes=lanes), 0.9).axes[2].get_xlabel() == label
 

@@ -318,6 +318,6 @@ def test_a_policy_of_other_sizes_is_refused_by_eval(runs, tmp_path, capsys):
     arrays["layer0_kernel"] = arrays["layer0_kernel"][:-1]
     np.savez(other / "policy.npz", **arrays)
     assert cli.main(["eval", str(other)]) == 2
-    assert "takes observations of 9 and goals of 3 numbers and gives actions of 4; the environment has 10, 3 and 4" in (
+    assert "needs observations of 9 and goals of 3 numbers and returns actions of 4; the environment has 10, 3 and 4" in (
         capsys.readouterr().err
     )

@@ -1,1 +1,1 @@
-"""Published methods that our own comparison found no use for, with the hooks that only they need (docs/what_helps.md)."""
+"""Published methods that did not help in our comparison, with the hooks that only they need (docs/what_helps.md)."""

@@ -1,4 +1,4 @@
-"""Priorities of whole episodes: by how rare and by how diverse their achieved goals are."""
+"""Episode priorities by rarity and by diversity of achieved goals."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from mjx_dher.replay import ReplayState
 from mjx_dher.types import Array, Episode
 
 COMPONENTS = 3  # Gaussians of the mixture that `max_entropy` fits
-ROUNDS = 10  # of expectation and maximization
+ROUNDS = 10  # of expectation maximization
 
 
 def diversity(episode: Episode, context: Context) -> Array:
     """Diversity of an episode's achieved goals (Dai, Liu & Bharath 2021, "DTGSH").
 
-    The sum over pairs of successive goals of det(X X'), X the pair as unit vectors: 1 - c^2, c the cosine between them. In the
-    form d^2 - d^4 / 4, d the distance of the unit vectors, small angles are not lost in rounding.
+    The sum over pairs of successive goals of det(X X') = 1 - c^2, where X is the pair as unit vectors and c their cosine. It
+    is computed as d^2 - d^4 / 4 from their distance d, which keeps small angles despite rounding.
     """
     del context
     goals = episode.achieved_goal
@@ -28,7 +28,7 @@ def diversity(episode: Episode, context: Context) -> Array:
 
 
 def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Array:
-    """Log densities [E, components] of `rows` [E, K] under each component, its share included."""
+    """Log densities [E, components] of `rows` [E, K] under each component, including its weight."""
     inverse = 1.0 / variances
     constant = jnp.sum(jnp.square(means) * inverse + jnp.log(2.0 * jnp.pi * variances), axis=1)
     squares = jnp.square(rows) @ inverse.T - 2.0 * rows @ (means * inverse).T + constant[None]
@@ -36,10 +36,10 @@ def _log_parts(rows: Array, means: Array, variances: Array, shares: Array) -> Ar
 
 
 def fit_mixture(rows: Array, counted: Array) -> Array:
-    """Log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to those that are `counted` [E].
+    """Log densities [E] of `rows` [E, K] under a mixture of Gaussians fitted to the rows in `counted` [E]. Deterministic.
 
-    Three components with diagonal covariances, by ten rounds of expectation and maximization, begun with means spread along the
-    first principal axis that power iteration finds. Deterministic.
+    Three components with diagonal covariances are fitted by ten rounds of expectation maximization. Their means start along
+    the first principal axis, which power iteration finds.
     """
     weight = counted.astype(rows.dtype)[:, None]
     total = jnp.maximum(jnp.sum(weight), 1.0)
@@ -68,16 +68,16 @@ def fit_mixture(rows: Array, counted: Array) -> Array:
 
 
 def _by_rarity(ring: ReplayState, context: Context) -> Array:
-    """Ranks [E] of episodes by the rarity of their achieved goals, from 0 for the most common.
+    """Ranks [E] of episodes by the rarity of their achieved goals. The most common has rank 0.
 
-    Zhao, Sun & Tresp 2019 ("MEP"): a mixture of three Gaussians over whole sequences of achieved goals gives their density; an
-    episode is drawn in proportion to its rank by minus the log density.
+    In Zhao, Sun & Tresp 2019 ("MEP"), a mixture of three Gaussians over sequences of achieved goals gives their density.
+    Episodes are drawn in proportion to their rank by negative log density.
     """
     del context
     goals = ring.episodes.achieved_goal
     filled = jnp.arange(goals.shape[0]) < ring.size
     rows = goals.reshape(goals.shape[0], -1)
-    first = rows[:1]  # near to zero, squares lose less to rounding
+    first = rows[:1]  # near zero, squares lose less to rounding
     rarity = jnp.where(filled, -fit_mixture(jnp.where(filled[:, None], rows - first, 0.0), filled), -jnp.inf)
     order = jnp.argsort(rarity)
     rank = jnp.zeros(rarity.shape, jnp.int32).at[order].set(jnp.arange(rarity.shape[0], dtype=jnp.int32))

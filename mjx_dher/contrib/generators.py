@@ -1,10 +1,10 @@
-"""Goal generators: which goals the episodes of a rollout are played for, in place of those that the reset drew.
+"""Goal generators: goals for the episodes of a rollout, in place of the reset's goals.
 
     generator(key, obs, ring, context) -> goals [N, G]
 
-`obs` are the observations of N resets, with the goals that they drew. `ring` is the replay so far, which may be empty.
-`context` has rewards, numbers and, for a generator with `uses_values`, the learner's values. A goal that is not finite leaves
-the reset's own. Evaluations are always played for the reset's goals.
+`obs` are the observations of N resets with their goals. `ring` is the replay ring, which may be empty. `context` has rewards,
+numbers and, if the generator has `uses_values`, the learner's values. A goal that is not finite is replaced by the reset's.
+Evaluations always use the reset's goals.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ GenerateFn = Callable[[PRNGKey, GoalObs, ReplayState, Context], Array]
 
 @dataclasses.dataclass(frozen=True)
 class Generator:
-    """A goal generator, and whether it asks the learner."""
+    """A goal generator, and whether it uses the learner's values."""
 
     generate: GenerateFn
-    uses_values: bool = False  # of `context.values`
+    uses_values: bool = False  # whether it reads `context.values`
 
     def __call__(self, key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
-        """Goals [N, G] to play for."""
+        """Goals [N, G] for the N episodes of a rollout."""
         return self.generate(key, obs, ring, context)
 
 
 def _own_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
-    """Returns the goals [N, G] that the reset drew."""
+    """Goals [N, G] of the reset."""
     del key, ring, context
     return obs["desired_goal"]
 
@@ -43,10 +43,10 @@ reset = Generator(_own_goals)
 
 
 def make(name: str | Generator | GenerateFn) -> Generator:
-    """Returns the generator called `name`, a function of one's own, or the one that "module:attribute" names.
+    """Loads a generator: a built-in name, "module:attribute", or a function.
 
     Raises:
-      ValueError: no such generator, module or attribute, or no function of (key, obs, ring, context).
+      ValueError: there is no such generator, or it is not a function of (key, obs, ring, context).
     """
     value = components.load("generator", name)
     generator = value if isinstance(value, Generator) else Generator(value)
@@ -55,10 +55,11 @@ def make(name: str | Generator | GenerateFn) -> Generator:
 
 
 def join(choices: Sequence[Generator | GenerateFn]) -> Generator:
-    """Joins generators in one compiled program: the traced number `hparams.generator_choice` says which one a lane uses.
+    """Joins generators in one compiled program, in which the traced number `hparams.generator_choice` selects a lane's
+    generator.
 
     Raises:
-      ValueError: no generator, or something else in its place.
+      ValueError: `choices` is empty, or contains something other than a generator.
     """
     made = [make(choice) for choice in choices]
     if not made:

@@ -1,4 +1,4 @@
-"""Which goals to take in hindsight, and which to play for: Next-Future, and Hindsight Goal Generation."""
+"""Choice of hindsight goals and of rollout goals: Next-Future, and Hindsight Goal Generation."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mjx_dher.types import Array, GoalObs, PRNGKey
 
 _START_WEIGHT = 3.0  # c of HGG
 _LIPSCHITZ = 5.0  # L of HGG
-STILL = 0.01  # m; an episode whose goals end within this of where they began offers none
-_SOFTNESS = 0.05  # of the matching, as a fraction of the mean cost
+STILL = 0.01  # m; an episode offers no goal if its last one is this near to its first
+_SOFTNESS = 0.05  # softness of the matching, as a fraction of the mean cost
 _SINKHORN_ROUNDS = 50
 
 
 def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
-    """Mixes the goal that the step itself achieves, with probability 1/k, and any future one; k is `her_k`, at least 1.
+    """The next goal with probability 1/k, else any future one. k is `her_k`, at least 1.
 
-    Özgür, Zurbrügg & Kumar 2025 ("Next-Future"): of k virtual goals the first is the next achieved one.
+    In Özgür, Zurbrügg & Kumar 2025 ("Next-Future"), the first of k virtual goals is the next achieved one.
     """
     share = 1.0 / jnp.maximum(hparams.her_k, 1.0)
     following = (jnp.arange(achieved.shape[0]) == step + 1).astype(jnp.float32)
@@ -31,11 +31,16 @@ def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) 
 
 
 def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, rounds: int = _SINKHORN_ROUNDS) -> Array:
-    """Returns the log plan [N, P] of a soft matching of N rows to the usable of P columns: how likely a row takes each.
+    """Soft matching of N rows to P columns: log probabilities [N, P] that a row takes a column.
 
-    Every row has the same mass and so has every usable column (Sinkhorn & Knopp 1967; Cuturi 2013), so that the plan makes the
-    total cost small where columns share the rows evenly. The less `softness`, a fraction of the mean cost, the nearer it is to
-    the assignment of least cost. Logarithms keep mass from vanishing. At least one column must be usable.
+    Every row has the same mass, and so has every usable column (Sinkhorn & Knopp 1967; Cuturi 2013). Computed in logarithms,
+    so that no mass vanishes.
+
+    Args:
+      cost: costs [N, P].
+      usable: mask [P] of the columns to use. At least one must be True.
+      softness: fraction of the mean cost. The smaller it is, the nearer the result is to the assignment of least cost.
+      rounds: iterations.
     """
     open_to = jnp.broadcast_to(usable[None], cost.shape)
     mean = jnp.sum(jnp.where(open_to, jnp.abs(cost), 0.0)) / jnp.sum(open_to, dtype=cost.dtype)
@@ -50,7 +55,7 @@ def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, round
 
 
 def _nearest(achieved: Array, easy: Array, desired: Array) -> tuple[Array, Array]:
-    """Returns, for N desired goals and P episodes, the least of |g - a_t| - easy_t over t, and its t; both [N, P].
+    """Minimum over t of |g - a_t| - easy_t, and its t, for N desired goals and P episodes, both [N, P].
 
     `achieved` is [P, T+1, G], `easy` [P, T+1], `desired` [N, G].
     """
@@ -68,15 +73,15 @@ def _nearest(achieved: Array, easy: Array, desired: Array) -> tuple[Array, Array
 
 
 def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
-    """Returns goals [N, G] that were achieved before, each on the way to a desired one (Ren et al. 2019, "HGG").
+    """Previously achieved goals [N, G], each on the way to a desired one (Ren et al. 2019, "HGG").
 
-    N stored episodes, drawn uniformly, are matched to the N resets at the least total cost
+    N uniformly drawn stored episodes are matched to the N resets at the least total cost
 
         w(j, p) = c |a_p0 - a_j| + min_t (|g_j - a_pt| - (1 - gamma) V(s_p0, a_pt) D / L)
 
-    with a_j and g_j the achieved and the desired goal of reset j, D the largest |g_j - a_j|, c = 3 and L = 5; the goal is the
-    a_pt of the minimum. The authors match by a flow of least cost on the host; here the matching is soft (`match`) and each
-    reset draws its episode from its row. Without an episode in which something moved, resets keep their own goals.
+    where a_j and g_j are the achieved and desired goal of reset j, D is the largest |g_j - a_j|, c = 3 and L = 5. The result
+    is the a_pt of the minimum. The authors solve a minimum-cost flow on the host. Here the matching is soft (`match`), and
+    each reset draws an episode from its row. If nothing moved in any of the episodes, resets keep their goals.
     """
     assert context.values is not None
     row_key, match_key = jax.random.split(key)

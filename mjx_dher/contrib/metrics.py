@@ -1,8 +1,8 @@
-"""Distances from achieved goals to a desired one that see more than positions; for closest, epsilon_closest and weighted.
+"""Metrics between achieved and desired goals that use more than positions, for closest, epsilon_closest and weighted.
 
     metric(achieved [T+1, G], desired [G]) -> [T+1]
 
-Velocities are differences of successive achieved goals, in m a step; the first is 0.
+Velocities are differences of successive achieved goals, in m per step. The first is 0.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from mjx_dher.priorities import GRAVITY, displacements
 from mjx_dher.samplers import LearnedMetric, position
 from mjx_dher.types import Array, Episode
 
-_SPEED_STEPS = 5.0  # steps at its present velocity that count as much as the distance
+_SPEED_STEPS = 5.0  # weight of the velocity, in steps
 
 
 def velocity(achieved: Array, desired: Array) -> Array:
-    """Returns the distances [T+1] in position and velocity to rest at the desired goal [G].
+    """Distances [T+1] in position and velocity to rest at the desired goal [G].
 
-    sqrt(|p_i - g|^2 + |5 v_i|^2), v_i the displacement of one step: an object that flies past a goal is not near to it.
+    They are sqrt(|p_i - g|^2 + |5 v_i|^2) with displacements per step v_i, so an object that flies past a goal is not near.
     """
     distance = position(achieved, desired)
     moving = position(_SPEED_STEPS * displacements(achieved), jnp.zeros_like(desired))
@@ -31,10 +31,10 @@ def velocity(achieved: Array, desired: Array) -> Array:
 
 
 def _resting(achieved: Array, desired: Array, friction: float) -> Array:
-    """Returns the distances [T+1] to the desired goal [G] of the points at which the object would come to rest.
+    """Distances [T+1] between the points where the object would come to rest and the desired goal [G].
 
-    An object that slides at v m/s, held back by friction alone, stops after v^2 / (2 friction g): it comes to rest at
-    p_i + v_i |v_i| / (2 friction g). A height among its coordinates is taken as it is.
+    An object that slides at v m/s against friction alone stops after v^2 / (2 friction g), at p_i + v_i |v_i| / (2 friction
+    g). A height among its coordinates is kept.
     """
     velocities = displacements(achieved) / STEP_SECONDS
     if achieved.shape[-1] > 2:
@@ -48,7 +48,7 @@ resting_point_rough = functools.partial(_resting, friction=1.0)  # the cube of P
 
 
 def _steps_left(episode: Episode, context: Context) -> Array:
-    """Returns -V(s_i, g) [T+1], not negative: for rewards of -1 a step, the discounted number of steps to the goal."""
+    """-V(s_i, g) [T+1], at least 0. With rewards of -1 per step it is the discounted number of steps to the goal."""
     assert context.values is not None
     goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal.shape)
     return jnp.maximum(-context.values.of_state(episode.observation, goals), 0.0)

@@ -1,10 +1,10 @@
-"""TD3, SAC, REDQ, TQC and DTQC: one update, with an actor (`actors`) and what is made of several critics (`critics`).
+"""TD3, SAC, REDQ, TQC and DTQC: one update for an actor (`actors`) and several critics (`critics`).
 
     y = clip(r + discount (combine(Q'_1..C(s', a')) - cost(a')))
-    critics: one step of Adam down loss(Q_1..C(s, a), y)
-    actor:   one step of Adam down its own loss, once every `policy_delay` steps of the critics
+    critics: one Adam step on loss(Q_1..C(s, a), y)
+    actor:   one Adam step on its own loss, every `policy_delay` critic steps
 
-Targets, entropy's pay included, are clipped to the bounds of returns (Hiraoka 2023).
+Targets, including the entropy term, are clipped to the bounds of returns (Hiraoka 2023).
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyT
 
 @struct.dataclass
 class ActorCriticState:
-    """Everything that learning changes. The critics' parameters lead with [C]."""
+    """Learner state. The critics' parameters lead with [C]."""
 
     params: Params
-    target: Params  # its actor is () if targets take their actions from the actor itself
+    target: Params  # its actor is () if the target actions come from the actor itself
     actor_moments: PyTree  # Adam's
     critic_moments: PyTree
     observation_norm: PyTree  # NormalizerState [D], or a tree of them
     goal_norm: NormalizerState  # [G]
-    key: Array  # data of the key that updates draw from, with their number
+    key: Array  # key data for updates, into which their number is folded
     num_updates: Array  # [] int32
 
 
 @dataclasses.dataclass(frozen=True)
 class ActorCritic(ActorCriticBase):
-    """The learner: pure functions of an `ActorCriticState`. `learners.Learner` describes the methods."""
+    """Learner with pure functions of an `ActorCriticState`. `learners.Learner` documents the methods."""
 
     critics: Critics = dataclasses.field(kw_only=True)
     policy_delay: int = 1
 
     def init(self, key: PRNGKey) -> ActorCriticState:
-        """Makes fresh networks, targets equal to them, and empty normalizers."""
+        """Fresh networks, equal targets and empty normalizers."""
         actor_key, critic_key, update_key = jax.random.split(key, 3)
         observation, goal, action = zeros(self.spec, self.networks)
         params = Params(
@@ -66,7 +66,7 @@ class ActorCritic(ActorCriticBase):
         )
 
     def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
-        """The critics' judgement [...] of actions [..., A]."""
+        """Value [...] of actions [..., A] by the critics."""
         inputs = *self.normalize(state, obs["observation"], obs["desired_goal"], hparams), action
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[action.ndim - 1 :]), inputs)
         judges = self.critics.judges(state.params.critic)
@@ -75,7 +75,7 @@ class ActorCritic(ActorCriticBase):
     def update(
         self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool = True
     ) -> tuple[ActorCriticState, Metrics]:
-        """Takes one step of Adam for the critics and then, `with_actor`, for the actor, which these critics judge."""
+        """Takes one Adam step for the critics and then, if `with_actor`, for the actor with the updated critics."""
         batch = self.normalize_batch(state, batch, hparams)
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates)
         target_key, actor_key = jax.random.split(key)
@@ -102,7 +102,7 @@ class ActorCritic(ActorCriticBase):
         return state, metrics | more
 
     def target(self, state: ActorCriticState, batch: Batch, hparams: HParams, key: PRNGKey) -> Array:
-        """Atoms [B, K] of the critics' target; `batch` is normalized."""
+        """Atoms [B, K] of the critics' target for a normalized batch."""
         action_key, combine_key = jax.random.split(key)
         params = state.target.actor if self.actor.has_target else state.params.actor
         inputs, normal = (batch.next_observation, batch.desired_goal), self.normal(action_key, batch.action.shape)
@@ -139,7 +139,7 @@ def _make(name: str, config: Config, spec: EnvSpec, networks: NetworksFn, actor:
 
 
 def td3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
-    """TD3 (Fujimoto et al. 2018): two critics whose smaller value is the target, smoothed targets, a delayed actor.
+    """TD3 (Fujimoto et al. 2018): the smaller of two critics as the target, target smoothing, a delayed actor.
 
     y = r + gamma min_i Q'_i(s', clip(pi'(s') + clip(eps, -c, c)))  (equations 10 and 14)
     critics: mean (Q_i(s, a) - y)^2;  actor: -mean Q_1(s, pi(s))
@@ -149,7 +149,7 @@ def td3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
 
 
 def sac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
-    """SAC (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications"): entropy is paid, with a learned weight.
+    """SAC (Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications"), with a learned entropy weight.
 
     y = r + gamma (min_i Q'_i(s', a') - alpha log pi(a'|s')),  a' ~ pi(s')  (equations 2, 3 and 5)
     critics: mean (Q_i(s, a) - y)^2;  actor: mean(alpha log pi(a|s) - min_i Q_i(s, a))
@@ -159,11 +159,11 @@ def sac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
 
 
 def redq(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
-    """REDQ (Chen et al. 2021): SAC with many critics, of which `subset_critics` drawn at random make the target.
+    """REDQ (Chen et al. 2021): SAC with many critics and targets from `subset_critics` random ones.
 
     y = r + gamma (min_{i in M} Q'_i(s', a') - alpha log pi(a'|s'))  (algorithm 1)
     critics: mean (Q_i(s, a) - y)^2;  actor: mean(alpha log pi(a|s) - mean_i Q_i(s, a))
-    The paper has 10 critics, subsets of 2, and 20 updates for each step.
+    The paper uses 10 critics, subsets of 2, and 20 updates per step.
     """
     if config.subset_critics > config.num_critics:
         raise ValueError(f"subset_critics must be at most num_critics ({config.num_critics}); got {config.subset_critics}")
@@ -173,17 +173,17 @@ def redq(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
 
 
 def tqc(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
-    """TQC (Kuznetsov et al. 2020): SAC whose critics give quantiles of the return; the largest are left out of the target.
+    """TQC (Kuznetsov et al. 2020): SAC with quantile critics, whose largest quantiles are dropped from the target.
 
     y_k = r + gamma (z_k(s', a') - alpha log pi(a'|s')),  z_1 <= z_2 <= ... the pooled quantiles without the largest
     critics: the quantile Huber loss (equation 12);  actor: mean(alpha log pi(a|s) - the mean of all quantiles)
-    The paper has 5 critics of 25 quantiles each, and drops 2 of each.
+    The paper uses 5 critics with 25 quantiles each, and drops 2 of each.
     """
     return _make("tqc", config, spec, networks, Gaussian(), _quantiles(config))
 
 
 def dtqc(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
-    """The critics of TQC with TD3's actor, which is deterministic and explores under noise."""
+    """TQC's critics with TD3's deterministic actor and exploration noise."""
     return _make("dtqc", config, spec, networks, Deterministic(), _quantiles(config))
 
 

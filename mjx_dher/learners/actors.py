@@ -1,6 +1,6 @@
-"""Actors: how they act, explore, and learn. Deterministic, and a Gaussian under tanh.
+"""Actors and their exploration and losses: deterministic, and tanh-Gaussian.
 
-`judge` is the critics' value of actions: [B, A] -> [B].
+`judge` maps actions [B, A] to the critics' values [B].
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ _LOG_STD_RANGE = (-20.0, 2.0)  # Haarnoja et al. 2018, their code
 
 
 class Noise(NamedTuple):
-    """What exploration adds to the actions of whole episodes; drawn at once, because it does not depend on them."""
+    """Exploration noise of whole episodes."""
 
     gaussian: Array  # [T, N, A] added to the policy's action
     is_random: Array  # [T, N] whether a uniformly random action replaces the policy's
-    uniform: Array  # [T, N, A] that random action, in [-1, 1]
+    uniform: Array  # [T, N, A] the random action, in [-1, 1]
 
 
 def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-    """Draws noise for `num_envs` episodes of `num_steps` steps: a fraction `random_eps` of the actions is uniformly random.
+    """Draws exploration noise for `num_envs` episodes of `num_steps` steps.
 
-    Random actions have a fraction `random_noise` of the noise of the others.
+    A fraction `random_eps` of the actions is uniformly random. These get a fraction `random_noise` of the Gaussian noise.
     """
     gaussian_key, uniform_key = jax.random.split(key)
     shape = (num_steps, num_envs)
@@ -46,49 +46,53 @@ def exploration_noise(key: PRNGKey, num_steps: int, num_envs: int, action_size: 
 
 
 class ActorKind(Protocol):
-    """What a learner needs of an actor with the module `network` and the parameters `params`; its inputs are normalized."""
+    """An actor of a learner.
+
+    Arguments of the methods: the flax module `network`, its parameters `params`, normalized observations [..., D] and goals
+    [..., G], and standard normal numbers `normal` [B, A].
+    """
 
     @property
-    def is_gaussian(self) -> bool: ...  # whether its network gives moments: `networks.Heads.gaussian`
+    def is_gaussian(self) -> bool: ...  # whether the network returns moments (`networks.Heads.gaussian`)
 
     @property
-    def has_target(self) -> bool: ...  # whether the critics' targets take their actions from a slower copy of it
+    def has_target(self) -> bool: ...  # whether the critics' targets use a slower copy of the actor
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Makes parameters for inputs such as `inputs`: an observation [D] and a goal [G]."""
+        """Parameters for inputs like `inputs`: an observation [D] and a goal [G]."""
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
         """Deterministic actions [..., A]."""
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        """Draws the noise that `explore` takes; leaves lead with [T, N]."""
+        """Draws the noise for `explore`; leaves lead with [T, N]."""
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
-        """Actions [N, A] under the noise of one step."""
+        """Exploring actions [N, A] with the noise of one step."""
 
     def next_action(
         self, network: Any, params: PyTree, observation: Array, goal: Array, normal: Array, hparams: HParams
     ) -> tuple[Array, Array]:
-        """Actions [B, A] for a target, drawn with standard normal numbers [B, A], and the cost [B] taken off their values."""
+        """Actions [B, A] for a target, and a cost [B] to subtract from their values."""
 
     def loss(
         self, network: Any, params: PyTree, observation: Array, goal: Array, judge: Judge, normal: Array, hparams: HParams
     ) -> tuple[Array, Metrics]:
-        """Actor's loss [], and metrics."""
+        """Loss [] of the actor, and metrics."""
 
     def dense(self, network: Any, params: PyTree) -> Any:
-        """Linear layers of the deterministic policy, for `policy.from_mlp`; None for custom networks."""
+        """Linear layers of the deterministic policy, for `policy.from_mlp`, or None for custom networks."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Deterministic:
-    """A deterministic actor: it explores under noise, and a target's actions are smoothed by clipped noise (TD3)."""
+    """A deterministic actor with exploration noise, and clipped noise on target actions (TD3)."""
 
     is_gaussian: ClassVar[bool] = False
     has_target: ClassVar[bool] = True
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Makes parameters."""
+        """Initial parameters."""
         return network.init(key, *inputs)
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
@@ -96,18 +100,18 @@ class Deterministic:
         return cast(Array, network.apply(params, observation, goal))
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        """Draws the noise that `explore` takes; leaves lead with [T, N]."""
+        """Draws the noise for `explore`; leaves lead with [T, N]."""
         return exploration_noise(key, num_steps, num_envs, action_size, hparams)
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
-        """Actions [N, A] with noise added and clipped, or the uniformly random ones of `noise`."""
+        """Actions [N, A] with added noise, clipped, or uniformly random."""
         action = self.act(network, params, observation, goal)
         return jnp.where(noise.is_random[..., None], noise.uniform, jnp.clip(action + noise.gaussian, -1.0, 1.0))
 
     def next_action(
         self, network: Any, params: PyTree, observation: Array, goal: Array, normal: Array, hparams: HParams
     ) -> tuple[Array, Array]:
-        """Smoothed actions [B, A] (Fujimoto et al. 2018, equation 14), without a cost."""
+        """Smoothed actions [B, A] (Fujimoto et al. 2018, equation 14), at no cost."""
         action = self.act(network, params, observation, goal)
         bound = hparams.target_noise_clip
         smoothing = jnp.clip(hparams.target_noise * normal, -bound, bound)
@@ -122,23 +126,23 @@ class Deterministic:
         return -jnp.mean(judge(action)) + hparams.action_l2 * jnp.mean(jnp.square(action)), {}
 
     def dense(self, network: Any, params: PyTree) -> Any:
-        """Linear layers; None for custom networks."""
+        """Linear layers, or None for custom networks."""
         return params["params"] if isinstance(network, Actor) else None
 
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian:
-    """A Gaussian under tanh, which explores by itself and is paid for its entropy (SAC, Haarnoja et al. 2018).
+    """A tanh-Gaussian actor with entropy regularization (SAC, Haarnoja et al. 2018).
 
-    Parameters are {"network", "log_alpha"}. The entropy's weight alpha is `entropy_weight` exp(log_alpha). It is learned so
-    that the mean of log pi becomes -`entropy_target` A.
+    Parameters are {"network", "log_alpha"}. The entropy weight alpha is `entropy_weight` exp(log_alpha). It is learned so that
+    the mean of log pi becomes -`entropy_target` A.
     """
 
     is_gaussian: ClassVar[bool] = True
     has_target: ClassVar[bool] = False
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Makes parameters."""
+        """Initial parameters."""
         return {"network": network.init(key, *inputs), "log_alpha": jnp.zeros(())}
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
@@ -146,11 +150,11 @@ class Gaussian:
         return jnp.tanh(_moments(network, params, observation, goal)[0])
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        """Draws the noise that `explore` takes; leaves lead with [T, N]."""
+        """Draws the noise for `explore`; leaves lead with [T, N]."""
         return exploration_noise(key, num_steps, num_envs, action_size, hparams._replace(noise_std=1.0, random_noise=0.0))
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
-        """Actions [N, A] drawn from the policy, or the uniformly random ones of `noise`."""
+        """Actions [N, A] drawn from the policy, or uniformly random."""
         mean, log_std = _moments(network, params, observation, goal)
         action = jnp.tanh(mean + jnp.exp(log_std) * noise.gaussian)
         return jnp.where(noise.is_random[..., None], noise.uniform, action)
@@ -165,9 +169,9 @@ class Gaussian:
     def loss(
         self, network: Any, params: PyTree, observation: Array, goal: Array, judge: Judge, normal: Array, hparams: HParams
     ) -> tuple[Array, Metrics]:
-        """mean(alpha log pi - Q) plus the loss of alpha; alpha and the entropy as metrics.
+        """Loss mean(alpha log pi - Q) plus the loss of alpha, with alpha and the entropy as metrics.
 
-        Haarnoja et al. 2018 ("Algorithms and Applications"), equations 7 and 18; `action_l2` as in other learners.
+        Haarnoja et al. 2018 ("Algorithms and Applications"), equations 7 and 18. `action_l2` is as in other learners.
         """
         action, log_prob = sample_action(network, params, observation, goal, normal)
         alpha = _alpha(params, hparams)
@@ -178,7 +182,7 @@ class Gaussian:
         return policy_loss + alpha_loss, {"entropy_weight": alpha, "entropy": -jnp.mean(log_prob)}
 
     def dense(self, network: Any, params: PyTree) -> Any:
-        """Linear layers, the last one without its half for standard deviations; None for custom networks."""
+        """Linear layers, without the last layer's outputs for standard deviations, or None for custom networks."""
         if not isinstance(network, GaussianActor):
             return None
         layers = dict(params["network"]["params"])
@@ -188,7 +192,7 @@ class Gaussian:
 
 
 def sample_action(network: Any, params: PyTree, observation: Array, goal: Array, normal: Array) -> tuple[Array, Array]:
-    """Actions tanh(u) [B, A] for u = mean + std `normal` [B, A], and the logarithms of their densities [B].
+    """Actions tanh(u) [B, A] for u = mean + std `normal` [B, A], and their log densities [B].
 
     log pi = log N(u) - sum log(1 - tanh(u)^2) (Haarnoja et al. 2018, equation 21), and 1 - tanh(u)^2 = 4 / (e^u + e^-u)^2.
     """

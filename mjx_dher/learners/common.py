@@ -1,4 +1,4 @@
-"""What the built-in learners share: normalized inputs, acting, moving targets, and exporting the policy."""
+"""Shared parts of the built-in learners: normalization, acting, target updates and export."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Params:
 
 
 class Losses(NamedTuple):
-    """Losses of one update; all []."""
+    """Losses of one update, each []."""
 
     critic_loss: Array  # mean squared Bellman error
     actor_loss: Array  # minus the mean Q value, plus the action penalty
@@ -40,9 +40,9 @@ class Losses(NamedTuple):
 
 
 def adam(learning_rate: Any, eps: Any = 1e-8) -> optax.GradientTransformation:
-    """Adam, with a learning rate that may be traced: one number, or a tree with one for each subtree of the parameters.
+    """Adam with a learning rate that may be traced: one number, or a tree with one per subtree of the parameters.
 
-    Its state is that of `optax.scale_by_adam`; `optax.adam` would wrap it in a tuple, and older checkpoints could not be read.
+    Its state is the one of `optax.scale_by_adam`. `optax.adam` would wrap it in a tuple, which older checkpoints do not have.
     """
     moments = optax.scale_by_adam(eps=eps)
 
@@ -56,13 +56,13 @@ def adam(learning_rate: Any, eps: Any = 1e-8) -> optax.GradientTransformation:
 
 @dataclasses.dataclass(frozen=True)
 class ActorCriticBase(Learner):
-    """A learner with an actor, a critic, their targets and normalizers. Subclasses add `init`, `update` and `value`."""
+    """A learner with actor, critic, targets and normalizers. Subclasses add `init`, `update` and `value`."""
 
     spec: EnvSpec
     networks: Networks  # float32; used to act
     learning: Networks  # in the learner's dtype, with the same parameters; used in updates
     actor: ActorKind = dataclasses.field(default_factory=Deterministic)
-    axis_name: str | None = None  # mapped axis of the devices that one run is split over
+    axis_name: str | None = None  # mapped axis of the devices that share the run
 
     def normalizers(self) -> dict[str, PyTree]:
         """Empty normalizers of observations and goals, by their names in the state."""
@@ -72,7 +72,7 @@ class ActorCriticBase(Learner):
     def update_normalizers(
         self, state: State, observation: PyTree, goal: Array, hparams: HParams, valid: Array | None = None
     ) -> State:
-        """Adds observations [N, T+1, D], where `valid` [N] or [N, T+1] is true, and goals [B, G] to the normalizers."""
+        """Adds goals [B, G], and observations [N, T+1, D] for which `valid` [N] or [N, T+1] is True, to the normalizers."""
         clip, any_valid = hparams.obs_clip, None if valid is None else jnp.any(valid)
         return dataclasses.replace(
             state,
@@ -81,24 +81,24 @@ class ActorCriticBase(Learner):
         )
 
     def normalize(self, state: State, observation: PyTree, goal: Array, hparams: HParams) -> tuple[PyTree, Array]:
-        """Normalized observations [..., D], or trees of them for an encoder, and goals [..., G]: the networks' inputs."""
+        """Inputs of the networks: normalized observations [..., D], or trees for an encoder, and goals [..., G]."""
         numbers = hparams.norm_eps, hparams.norm_clip, hparams.obs_clip
         observation = normalizer.normalize(state.observation_norm, observation, *numbers)
         goal = normalizer.normalize(state.goal_norm, goal, *numbers)
         return concatenated(observation) if self.networks.encoder is None else observation, goal
 
     def normalize_batch(self, state: State, batch: Batch, hparams: HParams) -> Batch:
-        """`batch` with normalized observations and goals."""
+        """Batch with normalized observations and goals."""
         observation, goal = self.normalize(state, batch.observation, batch.desired_goal, hparams)
         next_observation, _ = self.normalize(state, batch.next_observation, batch.desired_goal, hparams)
         return dataclasses.replace(batch, observation=observation, next_observation=next_observation, desired_goal=goal)
 
     def return_bounds(self, hparams: HParams) -> tuple[Array | float, Array | float]:
-        """Lowest and highest return of the task: targets are clipped to them."""
+        """Lowest and highest return of the task, to which targets are clipped."""
         return return_bounds(self.spec.reward_range, hparams.gamma)
 
     def act(self, state: State, obs: GoalObs, hparams: HParams) -> Array:
-        """Deterministic policy's actions [..., A]."""
+        """Actions [..., A] of the deterministic policy."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return self.actor.act(self.networks.actor, state.params.actor, *inputs)
 
@@ -107,16 +107,16 @@ class ActorCriticBase(Learner):
         return self.actor.noise(key, num_steps, num_envs, self.spec.action_size, hparams)
 
     def explore(self, state: State, obs: GoalObs, noise: Noise, hparams: HParams) -> Array:
-        """Exploring policy's actions [N, A]."""
+        """Actions [N, A] of the exploring policy."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return self.actor.explore(self.networks.actor, state.params.actor, *inputs, noise)
 
     def lagging(self, params: Params) -> Params:
-        """Those of `params` that have a target."""
+        """Parameters that have a target."""
         return params if self.actor.has_target else Params(actor=(), critic=params.critic)
 
     def update_target(self, state: State, hparams: HParams) -> State:
-        """Moves the targets softly: they keep a fraction `polyak` of themselves and take the rest from the networks."""
+        """Moves the targets towards the networks. They keep a fraction `polyak` of their values."""
         target = optax.incremental_update(self.lagging(state.params), state.target, 1.0 - hparams.polyak)
         return dataclasses.replace(state, target=target)
 
@@ -125,17 +125,17 @@ class ActorCriticBase(Learner):
         return {"actor_norm": optax.tree.norm(state.params.actor), "critic_norm": optax.tree.norm(state.params.critic)}
 
     def export(self, state: State, hparams: HParams) -> Policy | None:
-        """Deterministic policy as NumPy arrays, or None for custom networks and for observations that are not one vector."""
+        """Deterministic policy as NumPy arrays, or None for custom networks and for observations other than one vector."""
         dense = self.actor.dense(self.networks.actor, state.params.actor)
         one_vector = isinstance(self.spec.observation, jax.ShapeDtypeStruct)
         return None if dense is None or not one_vector else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
 
     def mean(self, gradients: Tree) -> Tree:
-        """Mean of the gradients over the devices of a split run."""
+        """Mean of the gradients over the devices that share the run."""
         return gradients if self.axis_name is None else jax.lax.pmean(gradients, self.axis_name)
 
     def normal(self, key: PRNGKey, shape: tuple[int, ...]) -> Array:
-        """Standard normal numbers of `shape` [B, ...]: in a split run, this device's rows of those for all devices."""
+        """Standard normal numbers of `shape` [B, ...]. Devices that share a run get different rows of one draw."""
         if self.axis_name is None:
             return jax.random.normal(key, shape, jnp.float32)
         whole = jax.random.normal(key, (shape[0] * jax.lax.axis_size(self.axis_name), *shape[1:]), jnp.float32)
@@ -145,10 +145,10 @@ class ActorCriticBase(Learner):
 def make_networks(
     learner: str, config: Config, spec: EnvSpec, networks: NetworksFn, *heads: Heads
 ) -> tuple[Networks, Networks]:
-    """Makes the networks for acting, in float32, and for updates, in the learner's dtype.
+    """Networks for acting, in float32, and for updates, in the learner's dtype.
 
     Raises:
-      ValueError: the networks cannot take the observations of `spec`, or their outputs have the wrong shapes.
+      ValueError: the networks cannot take the observations of `spec`, or their outputs have wrong shapes.
     """
     acting, learning = (
         with_encoder(networks(spec.action_size, config.hidden_sizes, dtype, *heads))

@@ -1,7 +1,7 @@
-"""Pieces for learners with several critics: what their values become as a target, a loss, and the actor's judge.
+"""Functions of several critics' values: the target, the loss, and the value for the actor.
 
-Values of C critics with M numbers each are [C, B, M]. M is 1 for a critic that gives the expected return, and else the number
-of quantiles of its distribution. A target has K numbers: the atoms of a distribution, one for an expected return.
+C critics return values [C, B, M]. M is 1 for an expected return, or the number of quantiles of the return's distribution. A
+target has K atoms, one for an expected return.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ Term = TypeVar("Term", bound=Any)
 
 @dataclasses.dataclass(frozen=True)
 class Critics:
-    """Number of the critics, and what is made of their values."""
+    """Number of critics, and the functions of their values."""
 
     number: int  # C
     size: int  # M
     combine: CombineFn
     loss: LossFn
     judge: JudgeFn
-    num_judges: int | None = None  # of the critics, those that judge the actor's actions; all where None
+    num_judges: int | None = None  # number of critics that judge the actor's actions; None: all
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Makes parameters for an observation [D], a goal [G] and an action [A]; leaves lead with [C]."""
+        """Parameters for an observation [D], a goal [G] and an action [A]; leaves lead with [C]."""
         return jax.vmap(lambda key: network.init(key, *inputs))(jax.random.split(key, self.number))
 
     def judges(self, params: PyTree) -> PyTree:
-        """Returns the parameters of the critics that judge actions."""
+        """Parameters of the critics that judge the actor's actions."""
         return jax.tree.map(lambda x: x[: self.num_judges], params)
 
 
 def values(network: Any, params: PyTree, observation: Array, goal: Array, action: Array) -> Array:
-    """Returns the values [C, B, M] of C critics that give [B, M]."""
+    """Values [C, B, M] of C critics."""
     return cast(Array, jax.vmap(lambda one: network.apply(one, observation, goal, action))(params))
 
 
 def smallest(values: Array, key: PRNGKey) -> Array:
-    """Returns the smallest of the critics' values, as the target [B, M] (Fujimoto et al. 2018, algorithm 1)."""
+    """Smallest of the critics' values, the target [B, M] (Fujimoto et al. 2018, algorithm 1)."""
     del key
     return jnp.min(values, axis=0)
 
 
 def smallest_of(number: int) -> CombineFn:
-    """Returns the rule that takes the smallest value of `number` critics drawn at random (Chen et al. 2021, algorithm 1)."""
+    """Makes the function that takes the smallest value of `number` random critics (Chen et al. 2021, algorithm 1)."""
 
     def combine(values: Array, key: PRNGKey) -> Array:
         drawn = jax.random.choice(key, values.shape[0], (number,), replace=False)
@@ -63,10 +63,7 @@ def smallest_of(number: int) -> CombineFn:
 
 
 def truncated(dropped: int) -> CombineFn:
-    """Returns the rule that pools the quantiles of all critics and drops the `dropped` * C largest.
-
-    Kuznetsov et al. 2020 (TQC), equation 11.
-    """
+    """Makes the function that pools all quantiles and drops the `dropped` * C largest (Kuznetsov et al. 2020, equation 11)."""
 
     def combine(values: Array, key: PRNGKey) -> Array:
         del key
@@ -78,14 +75,14 @@ def truncated(dropped: int) -> CombineFn:
 
 
 def squared_error(values: Array, atoms: Array) -> Array:
-    """Returns the mean squared difference of values [C, B, 1] to the target [B, 1], summed over the critics."""
+    """Mean squared difference between values [C, B, 1] and the target [B, 1], summed over the critics."""
     return jnp.sum(jnp.mean(jnp.square(values - atoms), axis=(1, 2)))
 
 
 def least(numbers: Array, count: int) -> Array:
-    """Returns the `count` smallest of `numbers` [B, K] in rising order, [B, count].
+    """The `count` smallest of `numbers` [B, K] in ascending order, [B, count].
 
-    By comparing each with each, which is an order faster than a sort for as few as they are.
+    It compares all pairs, which is ten times faster than sorting for so few numbers.
     """
     size, order = numbers.shape[-1], jnp.arange(numbers.shape[-1])
 
@@ -99,16 +96,16 @@ def least(numbers: Array, count: int) -> Array:
 
 @jax.custom_vjp
 def quantile_huber(values: Array, atoms: Array) -> Array:
-    """Returns the quantile Huber loss of quantiles [C, B, M] to atoms [B, K], summed over the critics.
+    """Quantile Huber loss between quantiles [C, B, M] and atoms [B, K], summed over the critics.
 
-    Dabney et al. 2018 (QR-DQN), equation 10, with kappa = 1: the mean over samples, quantiles and atoms of
-    |tau_m - [u < 0]| huber(u), where u = atom - quantile and tau_m = (m + 1/2) / M. Atoms, a target, have no gradient.
+    Dabney et al. 2018 (QR-DQN), equation 10, with kappa = 1: the mean over samples, quantiles and atoms of |tau_m - [u < 0]|
+    huber(u), where u = atom - quantile and tau_m = (m + 1/2) / M. Atoms have no gradient.
     """
     return _quantile_huber(values, atoms)[0]
 
 
 def _quantile_huber(values: Array, atoms: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Returns the loss; its gradient in `values`, by the same pass over the atoms; and the atoms."""
+    """The loss, its gradient with respect to `values` from the same pass over the atoms, and the atoms."""
 
     def of_atom(k: Any) -> tuple[Array, Array, Array, Array]:
         u = atoms[:, k, None] - values
@@ -132,17 +129,17 @@ quantile_huber.defvjp(_quantile_huber, _quantile_huber_gradient)
 
 
 def _sum(term: Callable[[Any], Term], number: int) -> Term:
-    """Returns term(0) + ... + term(number - 1), leaf by leaf: a loop on a CPU, whose caches hold it, all at once elsewhere."""
+    """Leaf-wise sum term(0) + ... + term(number - 1): a loop on a CPU, where it stays in cache, else vectorized."""
     if jax.default_backend() != "cpu":
         return jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.vmap(term)(jnp.arange(number)))
     return jax.lax.fori_loop(1, number, lambda j, total: jax.tree.map(jnp.add, total, term(j)), term(0))
 
 
 def lowest(values: Array) -> Array:
-    """Returns the smallest of the critics' values [B]: SAC's judge of actions, and, of the first critic alone, TD3's."""
+    """Smallest of the critics' values [B]. SAC's actor loss uses it, and TD3's with the first critic alone."""
     return jnp.min(jnp.mean(values, axis=-1), axis=0)
 
 
 def mean(values: Array) -> Array:
-    """Returns the mean of all values [B]: the judge of actions of REDQ and TQC."""
+    """Mean of all values [B], for the actor loss of REDQ and TQC."""
     return jnp.mean(values, axis=(0, 2))

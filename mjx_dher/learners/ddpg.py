@@ -1,4 +1,4 @@
-"""DDPG (Lillicrap et al. 2016) as HER uses it (Andrychowicz et al. 2017)."""
+"""DDPG (Lillicrap et al. 2016) as in HER (Andrychowicz et al. 2017)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyT
 
 @struct.dataclass
 class DDPGState:
-    """Everything that learning changes."""
+    """Learner state."""
 
     params: Params
     target: Params
@@ -36,7 +36,7 @@ Bounds = tuple[Array | float, Array | float]  # of returns
 def compute_gradients(
     networks: Networks, params: Params, target: Params, batch: Batch, bounds: Bounds, hparams: HParams
 ) -> tuple[Params, Losses]:
-    """Computes the gradients of both losses, each by its own network's parameters, on a normalized batch.
+    """Gradients of both losses on a normalized batch, each with respect to its own network's parameters.
 
     y = r + discount Q'(s', pi'(s')), clipped to the bounds of returns
     critic: mean (Q(s, a) - y)^2;  actor: -mean Q(s, pi(s)) + action_l2 mean pi(s)^2
@@ -62,10 +62,10 @@ def compute_gradients(
 
 @dataclasses.dataclass(frozen=True)
 class DDPG(ActorCriticBase):
-    """The learner: pure functions of a `DDPGState`. `learners.Learner` describes the methods."""
+    """Learner with pure functions of a `DDPGState`. `learners.Learner` documents the methods."""
 
     def init(self, key: PRNGKey) -> DDPGState:
-        """Makes fresh networks, targets equal to them, and empty normalizers."""
+        """Fresh networks, equal targets and empty normalizers."""
         actor_key, critic_key = jax.random.split(key)
         observation, goal, action = zeros(self.spec, self.networks)
         params = Params(
@@ -81,12 +81,12 @@ class DDPG(ActorCriticBase):
         )
 
     def value(self, state: DDPGState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
-        """Q [...] of actions [..., A]."""
+        """Q value [...] of actions [..., A]."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return cast(Array, self.networks.critic.apply(state.params.critic, *inputs, action))
 
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
-        """Takes one step of Adam for critic and actor, both from the parameters before it."""
+        """Takes one Adam step for critic and actor, both from the old parameters."""
         batch, bounds = self.normalize_batch(state, batch, hparams), self.return_bounds(hparams)
         gradients, losses = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
@@ -97,5 +97,5 @@ class DDPG(ActorCriticBase):
 
 
 def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> DDPG:
-    """Makes the learner. Raises ValueError for networks that give the wrong shapes."""
+    """Makes the learner. Raises ValueError if outputs of the networks have wrong shapes."""
     return DDPG(spec, *common.make_networks("ddpg", config, spec, networks))

@@ -1,4 +1,4 @@
-"""A round of updates: critics, the actor once every `policy_delay` of them, and the targets once every `target_period`."""
+"""A round of updates of the critics, with actor and target updates when they are due."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mjx_dher.types import Batch, Metrics, PyTree
 
 
 def update_round(learner: Learner, period: int, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes an update for each of `batches` and moves the targets when they are due, after every `period` of them.
+    """Makes one update per batch, and moves the targets every `period` updates.
 
     Leaves of `batches` lead with the larger of `period` and the learner's policy_delay.
     """
@@ -27,9 +27,8 @@ def update_round(learner: Learner, period: int, hparams: HParams, state: PyTree,
 
 
 def _delayed_update(learner: Learner, period: int, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes `policy_delay` updates, the last of them of the actor, too; returns the last one's metrics.
-
-    Targets that are due within them are moved.
+    """Makes `policy_delay` updates, of which the last includes the actor, and moves targets that are due. Returns the last
+    metrics.
     """
     delay = learners.policy_delay(learner)
     for number in range(1, delay + 1):

@@ -1,1 +1,1 @@
-"""Several devices, and several processes: a mesh, and functions placed on it."""
+"""Several devices and processes: a mesh, and functions placed on it."""

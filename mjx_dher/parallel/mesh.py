@@ -1,7 +1,7 @@
-"""Devices of a program: a mesh whose axis `lanes` shares out runs side by side, and whose axis `data` shares out each of them.
+"""Devices of a program: a mesh with the axis `lanes` for parallel runs and the axis `data` for the shards of a run.
 
-Runs side by side exchange nothing. The shards of one run have equal parts of its environments, its replay ring and its batches.
-They average gradients (`split`), so their learners stay equal.
+Parallel runs exchange nothing. The shards of a run have equal parts of its environments, replay ring and batches. They average
+gradients (`split`), so their learners stay equal.
 """
 
 from __future__ import annotations
@@ -24,36 +24,36 @@ LANES, DATA = "lanes", "data"
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Devices of a program, and its layout on them. Without devices it runs on the default device."""
+    """Layout of a program on devices. Without devices it runs on the default device."""
 
     devices: tuple[Any, ...] = ()
-    lanes: int = 1  # devices that share out runs side by side
-    shards: int = 1  # devices that share each of them
+    lanes: int = 1  # number of groups of devices, for parallel runs
+    shards: int = 1  # devices that share one run
 
     @property
     def axis_name(self) -> AxisName:
-        """Axis of the devices that share one run; None if each run has one device."""
+        """Axis of the devices that share one run, or None if each run has one device."""
         return DATA if self.shards > 1 else None
 
     @property
     def sharers(self) -> int:
-        """Devices of this process that share one memory: all devices of a CPU, one GPU."""
+        """Number of this process's devices that share one memory: all devices of a CPU, or one GPU."""
         return len(self.own_devices) if self.devices and self.devices[0].platform == "cpu" else 1
 
     @property
     def own_devices(self) -> list[tuple[int, Any]]:
-        """Devices of this process, each with its place along `lanes`."""
+        """Devices of this process, each with its index along `lanes`."""
         rows = [(number, device) for number, row in enumerate(self.mesh.devices) for device in row]
         return [(number, device) for number, device in rows if device.process_index == jax.process_index()]
 
     @functools.cached_property
     def mesh(self) -> jax.sharding.Mesh:
-        """Mesh of JAX."""
+        """JAX mesh of the devices."""
         kinds = (jax.sharding.AxisType.Auto,) * 2
         return jax.make_mesh((self.lanes, self.shards), (LANES, DATA), kinds, devices=self.devices)
 
     def sharding(self, *axes: str) -> NamedSharding:
-        """Sharding of arrays that lead with these axes of the mesh, and are replicated along the other one."""
+        """Sharding of arrays that lead with these mesh axes and are replicated along the other one."""
         return NamedSharding(self.mesh, PartitionSpec(*axes))
 
 
@@ -61,30 +61,31 @@ ONE = Layout()
 
 
 def find(devices: int | str) -> tuple[Any, ...]:
-    """The first `devices` JAX devices, or "all"; empty for one, which means the default device.
+    """The first `devices` JAX devices, or "all". Empty for one, which means the default device.
 
     Raises:
-      ValueError: neither a number nor "all", more than there are, or only some of the devices of several processes.
+      ValueError: it is neither a number nor "all", exceeds the available devices, or selects only some devices of several
+        processes.
     """
     check_devices(devices)
     present = jax.devices()
     number = len(present) if devices == "all" else int(devices)
     if number > len(present):
         kind = present[0].platform.upper()
-        virtual = "; XLA_FLAGS=--xla_force_host_platform_device_count=N makes N of a CPU, to try things out"
+        virtual = "; for tests, XLA_FLAGS=--xla_force_host_platform_device_count=N splits a CPU into N devices"
         raise ValueError(
-            f"devices must lie in [1, {len(present)}], the {kind} devices that JAX has here, or be all; got {devices}"
+            f"devices must lie in [1, {len(present)}], the number of {kind} devices, or be all; got {devices}"
             f"{virtual if kind == 'CPU' else ''}"
         )
-    if jax.process_count() > 1 and devices == 1:  # nobody has said
+    if jax.process_count() > 1 and devices == 1:  # the default
         number = len(present)
     if jax.process_count() > 1 and number != len(present):
-        raise ValueError(f"devices must be all, or {len(present)}, of {jax.process_count()} processes; got {devices}")
+        raise ValueError(f"devices must be all, or {len(present)}, with {jax.process_count()} processes; got {devices}")
     return tuple(present[:number]) if number > 1 else ()
 
 
 def arrange(devices: Sequence[Any], runs: int) -> Layout:
-    """Lays up to `runs` runs side by side on devices. If there are more devices than runs, several share each run."""
+    """Arranges up to `runs` parallel runs on devices. If there are more devices than runs, several share each run."""
     if not devices:
         return ONE
     number = len(devices)
@@ -93,10 +94,10 @@ def arrange(devices: Sequence[Any], runs: int) -> Layout:
 
 
 def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
-    """Most runs side by side: `lanes`. By default one for each CPU, and on GPUs as many as memory holds (None).
+    """Most parallel runs: `lanes`, or by default one per CPU device, and on GPUs as many as fit into memory (None).
 
     Raises:
-      ValueError: neither `lanes` is a multiple of the devices, nor they of `lanes`.
+      ValueError: `lanes` is neither a multiple nor a divisor of the number of devices.
     """
     number = max(1, len(devices))
     if lanes is None:
@@ -108,5 +109,5 @@ def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
 
 
 def to_host(key: PRNGKey, hparams: Any = None) -> tuple[np.ndarray, Any]:
-    """Returns keys, as their data, and numbers as the functions here take them, the same in every process: NumPy arrays."""
+    """Converts keys to their data, and numbers to NumPy arrays, which must be equal in every process."""
     return np.asarray(jax.random.key_data(key)), jax.tree.map(np.asarray, hparams)

@@ -1,6 +1,6 @@
-"""Several processes that run one JAX program, connected by `jax.distributed`; the first process decides and writes files.
+"""Several processes of one JAX program, connected by `jax.distributed`. The first process decides and writes files.
 
-Every process must call each function here at the same point of the program. In a program of one process they do nothing.
+Every process must call each function here at the same point. With one process they do nothing.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from mjx_dher.validation import host_and_port
 
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 TIMEOUTS = {"initialization_timeout": 60, "heartbeat_timeout_seconds": 30, "shutdown_timeout_seconds": 30}
-_PIECE = 1 << 28  # bytes that `fetch` holds on a device at a time
+_PIECE = 1 << 28  # bytes per transfer of `fetch`
 _BLOCK = 1024  # bytes; messages are padded to a multiple, because each size is a compiled program
 
 T = TypeVar("T")
 
 
 def connect() -> None:
-    """Connects this process to the others. Call it before JAX starts its devices.
+    """Connects this process to the others. Call it before JAX initializes its devices.
 
-    JAX finds Slurm, Open MPI and Kubernetes by itself; elsewhere `VARIABLES` name the address of the first process, the number
-    of processes and the number of this one.
+    JAX detects Slurm, Open MPI and Kubernetes. Otherwise `VARIABLES` name the address of the first process, the number of
+    processes and the index of this one.
 
     Raises:
-      ValueError: no cluster was found, or a variable is invalid. (If the other processes do not answer, JAX aborts.)
+      ValueError: no cluster was detected, or a variable is invalid. If other processes do not answer, JAX aborts.
     """
     try:
         size, number = (int(os.environ[name]) if name in os.environ else None for name in VARIABLES[1:])
@@ -46,7 +46,7 @@ def connect() -> None:
 
 
 def _bind_address() -> str | None:
-    """Address that the coordinator listens at: the named one if it is an IP address of this machine; None leaves it to JAX."""
+    """Address for the coordinator to listen at: the given one if it is an IP address of this machine, else None."""
     if VARIABLES[0] not in os.environ:
         return None
     host, _ = host_and_port(VARIABLES[0], address := os.environ[VARIABLES[0]])
@@ -58,7 +58,7 @@ def _bind_address() -> str | None:
 
 
 def is_alone() -> bool:
-    """Whether the program has one process."""
+    """Whether the program has only one process."""
     return not jax.distributed.is_initialized()
 
 
@@ -68,10 +68,10 @@ def leads() -> bool:
 
 
 def broadcast(decide: Callable[[], T]) -> T:
-    """Calls `decide` in the first process; returns its result, as JSON keeps it, in all.
+    """Calls `decide` in the first process. Returns its result, converted by JSON, in all processes.
 
     Raises:
-      ValueError: `decide` raised a ValueError or an OSError. The first process raises that error itself.
+      ValueError: `decide` raised a ValueError or OSError. The first process raises the original error.
     """
     from jax.experimental import multihost_utils
 
@@ -96,7 +96,7 @@ def broadcast(decide: Callable[[], T]) -> T:
 
 
 def highest(number: int) -> int:
-    """The highest `number` of all processes."""
+    """Highest `number` of all processes."""
     from jax.experimental import multihost_utils
 
     return number if is_alone() else int(multihost_utils.process_allgather(np.array(number)).max())
@@ -108,7 +108,7 @@ def any_process(flag: bool) -> bool:
 
 
 def check_equal(described: Mapping[str, Any]) -> None:
-    """Raises ValueError in all processes, naming the fields, unless `described` is the same in each."""
+    """Raises ValueError in all processes, naming the fields, unless `described` is the same in all of them."""
     if is_alone():
         return
     own = json.loads(json.dumps(dict(described), default=str))
@@ -116,16 +116,16 @@ def check_equal(described: Mapping[str, Any]) -> None:
     differing = [name for name in {**first, **own} if first.get(name) != own.get(name)]
     told = [f"{name} is {first.get(name)!r} in process 0 and {own.get(name)!r} here" for name in differing]
     if any_process(bool(told)):
-        raise ValueError(f"all processes must have the same settings: {'; '.join(told) or 'those of another one differ'}")
+        raise ValueError(f"all processes must have the same settings: {'; '.join(told) or 'another process differs'}")
 
 
 def fetch(tree: Any) -> Any:
-    """Returns a tree's arrays, of any devices, as NumPy arrays. No keys."""
+    """Copies a tree's arrays, without keys, from any devices to NumPy arrays."""
     return jax.device_get(tree) if is_alone() else jax.tree.map(_gather, tree)
 
 
 def collect(tree: Any) -> Any:
-    """Returns a tree's arrays as NumPy arrays in the first process, None in the others. No keys."""
+    """Copies a tree's arrays, without keys, to NumPy arrays in the first process. Returns None in the others."""
     if is_alone():
         return jax.device_get(tree)
     leaves, structure = jax.tree.flatten(tree)

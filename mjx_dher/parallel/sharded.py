@@ -1,8 +1,7 @@
-"""Functions of a training loop, placed on the devices of a `Layout`; each is lowered and compiled like one of `jax.jit`.
+"""Functions of a training loop, placed on the devices of a `Layout`. They lower and compile like the ones of `jax.jit`.
 
-Runs side by side, each whole on one device: every device has the program of a single device, so that results are the same to
-the bit. (XLA simplifies a program for several devices in another order, and rounds otherwise.) Runs split over devices: one
-program for the mesh.
+Parallel runs: every device runs the single-device program, so results are bit-identical. (A program for several devices would
+round differently, because XLA simplifies it in another order.) A run on several devices: one program for the mesh.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ EpochFn = Callable[[TrainState], tuple[TrainState, Any, Any]]
 
 
 def place_init(layout: Layout, init: InitFn, batched: bool) -> Any:
-    """Places (key, numbers) -> state; the function that it returns takes what `to_host` gives, [L] runs if `batched`."""
+    """Places (key, numbers) -> state. The placed function takes the arrays from `to_host`, for [L] runs if `batched`."""
 
     def local(key_data: Array, hparams: Any) -> TrainState:
         return init(jax.random.wrap_key_data(key_data), hparams)
@@ -35,13 +34,13 @@ def place_init(layout: Layout, init: InitFn, batched: bool) -> Any:
 
 
 def place_epoch(layout: Layout, epoch: EpochFn, batched: bool) -> Any:
-    """Places state -> (state, metrics, whether it is finite), which takes over the state's memory."""
+    """Places state -> (state, metrics, whether it is finite). The placed function donates the state's memory."""
     state, lane = _state_specs(batched), _lane(batched)
     return _place(layout, epoch, (state,), (state, lane, lane), donate=(0,))
 
 
 def place_evaluate(layout: Layout, evaluate: Callable[[TrainState, PRNGKey], Any], batched: bool) -> Any:
-    """Places (state, key) -> outcomes; the function that it returns takes the key's data."""
+    """Places (state, key) -> outcomes. The placed function takes the key's data."""
 
     def local(state: TrainState, key_data: Array) -> Any:
         return evaluate(state, jax.random.wrap_key_data(key_data))
@@ -58,7 +57,7 @@ def _place(
     of_host: Sequence[int] = (),
     donate: Sequence[int] = (),
 ) -> Any:
-    """Places a function of one device. Arguments `of_host` are NumPy arrays, which every process has whole."""
+    """Places a function of one device. Arguments in `of_host` are NumPy arrays that every process has in full."""
     if layout.shards == 1:
         return _PerDevice(layout, [jax.jit(local, donate_argnums=donate)] * len(layout.own_devices))
 
@@ -71,9 +70,9 @@ def _place(
 
 
 class _PerDevice:
-    """A function of runs side by side as a stage of JAX (jitted, lowered or compiled) for each device of this process.
+    """A function of parallel runs: one JAX stage (jitted, lowered or compiled) per device of this process.
 
-    Arguments and results lead with [L], of which each device has an equal share.
+    Arguments and results lead with [L], of which each device has an equal part.
     """
 
     def __init__(self, layout: Layout, stages: Sequence[Any]):
@@ -81,11 +80,11 @@ class _PerDevice:
         self._pool = concurrent.futures.ThreadPoolExecutor(len(stages))  # a call waits while it calls back to the host
 
     def eval_shape(self, *arguments: Any) -> Any:
-        """Returns the shapes of the results."""
+        """Shapes of the results."""
         return self._stages[0].eval_shape(*arguments)
 
     def lower(self, *arguments: Any) -> _PerDevice:
-        """Lowers it for each device."""
+        """Lowers the function for each device."""
 
         def shape_on(device: Any, x: Any) -> jax.ShapeDtypeStruct:
             shape = (x.shape[0] // self._layout.lanes, *x.shape[1:])
@@ -95,23 +94,23 @@ class _PerDevice:
         return _PerDevice(self._layout, [stage.lower(*own) for stage, own in zip(self._stages, shapes)])
 
     def compile(self, compiler_options: Any = None) -> _PerDevice:
-        """Compiles it for each device. A GPU's second device finds the program of the first in JAX's cache."""
+        """Compiles the function for each device. On GPUs, JAX's cache serves all but the first."""
         return _PerDevice(self._layout, [stage.compile(compiler_options=compiler_options) for stage in self._stages])
 
     def memory_analysis(self) -> Any:
-        """Returns the compiler's figures for one device."""
+        """The compiler's figures for one device."""
         return self._stages[0].memory_analysis()
 
     def __call__(self, *arguments: Any) -> Any:
-        """Calls it on all devices at once; results lie where they were computed."""
+        """Calls the function on all devices at once. Results stay on their devices."""
         places = [functools.partial(_part_of, self._layout, *place) for place in self._layout.own_devices]
-        own = [jax.tree.map(part_of, arguments) for part_of in places]  # all of them before a call takes over its memory
+        own = [jax.tree.map(part_of, arguments) for part_of in places]  # all before any call donates memory
         results = list(self._pool.map(lambda stage, part: stage(*part), self._stages, own))
         return jax.tree.map(lambda *parts: _join(self._layout, parts), *results)
 
 
 def _part_of(layout: Layout, number: int, device: Any, x: Any) -> Any:
-    """Returns the lanes of one device of an array that leads with [L]."""
+    """Lanes of one device of an array that leads with [L]."""
     if isinstance(x, jax.Array):
         return next(shard.data for shard in x.addressable_shards if shard.device == device)
     lanes = len(x) // layout.lanes
@@ -119,7 +118,7 @@ def _part_of(layout: Layout, number: int, device: Any, x: Any) -> Any:
 
 
 def _join(layout: Layout, parts: Sequence[Any]) -> jax.Array:
-    """Returns the array [L, ...] whose lanes lie on the devices as they are."""
+    """Array [L, ...] of the devices' lanes, without copying."""
     shape = (parts[0].shape[0] * layout.lanes, *parts[0].shape[1:])
     return jax.make_array_from_single_device_arrays(shape, layout.sharding(LANES), list(parts))
 
@@ -129,7 +128,7 @@ def _lane(batched: bool) -> PartitionSpec:
 
 
 def _state_specs(batched: bool) -> TrainState:
-    """Returns how a TrainState lies on the mesh, [L] runs if `batched`. Each device of a run has a cursor and a size."""
+    """Layout of a TrainState on the mesh, with [L] runs if `batched`. Each device of a run has its own cursor and size."""
     whole, split = _lane(batched), PartitionSpec(*_lane(batched), DATA)
     return TrainState(learner=whole, replay=split, hparams=whole, key=whole, env_steps=whole)  # type: ignore[arg-type]
 
@@ -140,7 +139,7 @@ def _named(layout: Layout, specs: Any) -> Any:
 
 
 def _counters(tree: Any, change: Callable[[Array], Array]) -> Any:
-    """Changes cursor and size of each TrainState: on the mesh they have an axis, along which those of the devices lie."""
+    """Changes cursor and size of each TrainState. On the mesh they have an additional axis for the devices."""
 
     def changed(x: Any) -> Any:
         if not isinstance(x, TrainState):

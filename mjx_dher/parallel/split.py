@@ -1,4 +1,4 @@
-"""Collectives over the devices that share one run: an axis name of `jax.shard_map`, or None for a run on one device."""
+"""Collectives over the devices that share one run. The axis name is the one of `jax.shard_map`, or None for one device."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ AxisName = str | None
 
 
 def own_key(key: PRNGKey, axis_name: AxisName) -> PRNGKey:
-    """Key of this device alone."""
+    """Key of this device."""
     return key if axis_name is None else jax.random.fold_in(key, jax.lax.axis_index(axis_name))
 
 
 def own_rows(number: int, axis_name: AxisName) -> Array:
-    """Rows of this device, of `number` rows: an equal share, so that some devices may have a row twice."""
+    """Rows of this device, of `number` rows. All devices get equally many, so some rows may repeat."""
     if axis_name is None:
         return jnp.arange(number)
     devices = jax.lax.axis_size(axis_name)
@@ -42,5 +42,5 @@ def all_true(flag: Array, axis_name: AxisName) -> Array:
 
 
 def gather(tree: Tree, axis_name: AxisName) -> Tree:
-    """Arrays [N, ...] of all devices, one device's after the other's: [devices * N, ...]."""
+    """Concatenates the arrays [N, ...] of all devices to [devices * N, ...]."""
     return tree if axis_name is None else jax.lax.all_gather(tree, axis_name, tiled=True)

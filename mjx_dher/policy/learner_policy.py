@@ -1,4 +1,4 @@
-"""Policies of custom learners and networks: the learner's state as a file, played by the learner, with JAX."""
+"""Policies of custom learners and networks: the learner's state in a file. They need JAX and the learner."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ class LearnerPolicy:
 
     @property
     def sizes(self) -> tuple[Any, int, int]:
-        """Sizes of observations, goals and actions, as `EnvSpec.sizes`."""
+        """Sizes of observations, goals and actions, as in `EnvSpec.sizes`."""
         return self.spec.sizes
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Computes the actions [..., A] for observations of one state or a batch."""
+        """Actions [..., A] for observations of one state or a batch."""
         return np.asarray(self.forward(jax.tree.map(jnp.asarray, obs["observation"]), jnp.asarray(obs["desired_goal"])))
 
     def forward(self, observation: Any, goal: Any, xp: Any = jnp) -> Array:
-        """Computes actions for observations [..., D] and goals [..., G]; `xp` is ignored."""
+        """Actions for observations [..., D] and goals [..., G]. Ignores `xp`."""
         del xp
         obs: Any = {"observation": observation, "desired_goal": goal}
         return self.learner.act(self.state, obs, self.hparams)
 
     def save(self, path: Path, **extra: Any) -> None:
-        """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
+        """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, env_spec=np.array(to_json(self.spec)), **arrays, **extra)
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:
-    """Makes the policy of what `LearnerPolicy.save` wrote; `spec` describes its run.
+    """Makes a policy from the arrays of `LearnerPolicy.save`, for the run `spec`.
 
     Raises:
-      ValueError: the arrays are not those of this learner.
+      ValueError: the arrays do not fit this learner.
     """
     if "env_spec" in arrays:
         env_spec = from_json(str(arrays["env_spec"]))
@@ -88,14 +88,14 @@ def to_json(spec: EnvSpec) -> str:
             return {"dict": {name: of(child) for name, child in tree.items()}}
         if type(tree) in (list, tuple):
             return {type(tree).__name__: [of(child) for child in tree]}
-        raise ValueError(f"observation must be made of dicts, lists and tuples of arrays to be stored; it has a {type(tree)}")
+        raise ValueError(f"observation must consist of dicts, lists, tuples and arrays to be saved; it has a {type(tree)}")
 
     fields = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     return json.dumps({**fields, "observation": of(spec.observation)})
 
 
 def from_json(text: str) -> EnvSpec:
-    """Reads what `to_json` wrote."""
+    """Reads a spec written by `to_json`."""
 
     def of(tree: dict[str, Any]) -> Any:
         if "shape" in tree:

@@ -1,4 +1,4 @@
-"""Trained policies from run folders. Needs only NumPy, unless the run had a custom learner or custom networks."""
+"""Loads trained policies. Needs only NumPy, unless the run had a custom learner or custom networks."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from mjx_dher.system.files import FolderError
 
 
 def load_policy(run_dir: str | Path, trust: bool = False) -> TrainedPolicy:
-    """Loads a bundled policy, or that of a run folder. Imports only NumPy: no JAX, no MuJoCo.
+    """Loads a bundled policy, or the policy of a run folder. Imports only NumPy, neither JAX nor MuJoCo.
 
-    Custom learners and networks are an exception: their policy is a `learner_policy.LearnerPolicy`, which needs JAX and the
-    run folder.
+    Policies of custom learners and networks are `learner_policy.LearnerPolicy`s, which need JAX and the run folder.
 
     Args:
       run_dir: a run folder, a policy.npz under any name, or the name of a bundled policy, such as "push". A run folder or file
-        of that name in the current folder comes first.
+        of that name in the current folder takes precedence.
       trust: whether to import a custom learner or networks that the folder names and that you have not trained with here.
 
     Raises:
-      FolderError: no run folder, or a policy that is missing, damaged, of another run, or of a custom learner that cannot be
-        imported, is not trusted or does not fit.
+      FolderError: there is no such folder or file, the policy is missing or damaged or belongs to another run, or its custom
+        learner cannot be imported, is not trusted or does not fit.
     """
     return _load(run_dir, trust, "")
 
 
 def load_plain(run_dir: str | Path, use: str) -> Policy:
-    """Loads a policy of NumPy arrays, as `use` needs, and imports no custom code. Raises ValueError for another policy."""
+    """Loads a policy of NumPy arrays for the feature `use`, without custom code. Raises ValueError for another policy."""
     policy = _load(run_dir, False, use)
     assert isinstance(policy, Policy)
     return policy
@@ -46,11 +45,11 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     with run_folder.checked(path, "is damaged or not a policy of this program"):
         arrays: dict[str, Any] = npz.read(path, ratio=run_folder.POLICY_RATIO)
         if spec and (other := run_folder.foreign(content, spec, run_folder.policy_settings(arrays))):
-            raise FolderError(f"{path} is of a run with other settings: {other}")
+            raise FolderError(f"{path} belongs to a run with other settings: {other}")
         if not {"env_spec", "sizes"} & arrays.keys():
             return from_arrays(arrays)
     if spec is None:
-        raise FolderError(f"{path} is the policy of a custom learner or custom networks: give its run folder instead")
+        raise FolderError(f"{path} is the policy of a custom learner or custom networks: pass its run folder instead")
     if use:
         raise ValueError(f"{use} needs a policy of NumPy arrays; {spec.learner!r} with networks {spec.networks!r} has none")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
@@ -60,12 +59,12 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
 
 
 def check_fits(policy: TrainedPolicy, env: Any) -> None:
-    """Raises ValueError if the sizes of observations, goals or actions of a policy and an environment differ."""
+    """Raises ValueError unless a policy and an environment agree on the sizes of observations, goals and actions."""
     from mjx_dher.contract import env_spec
 
     theirs, own = env_spec(env).sizes, policy.sizes
     if theirs != own:
         raise ValueError(
-            f"the policy takes observations of {own[0]} and goals of {own[1]} numbers and gives actions of {own[2]}; the"
+            f"the policy needs observations of {own[0]} and goals of {own[1]} numbers and returns actions of {own[2]}; the"
             f" environment has {theirs[0]}, {theirs[1]} and {theirs[2]}"
         )

@@ -1,4 +1,4 @@
-"""Trained policies as files and as functions of NumPy arrays. They need only NumPy."""
+"""Trained policies as functions of NumPy arrays, and their files. Needs only NumPy."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _SCALARS = ("norm_clip", "obs_clip")
 
 
 class TrainedPolicy(Protocol):
-    """A deterministic policy, as `load_policy` returns it: a `Policy`, or a `learner_policy.LearnerPolicy`."""
+    """A deterministic policy from `load_policy`: a `Policy` or a `learner_policy.LearnerPolicy`."""
 
     @property
-    def sizes(self) -> tuple[Any, int, int]: ...  # of observations, goals and actions: D, G, A (`EnvSpec.sizes`)
+    def sizes(self) -> tuple[Any, int, int]: ...  # D, G and A (`EnvSpec.sizes`)
 
     @property
     def interface(self) -> Mapping[str, Any]: ...  # `contract.robot_interface` of the run's environment; {} if unknown
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # observations of one state or a batch -> actions [..., A]
 
-    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any: ...  # the same, unchecked, in NumPy or JAX
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any: ...  # the same without checks, in NumPy or JAX
 
     def save(self, path: Path, **extra: Any) -> None: ...
 
@@ -37,8 +37,8 @@ class TrainedPolicy(Protocol):
 class Policy:
     """A deterministic policy: normalization, linear layers with ReLU between them, tanh.
 
-    It is called with a mapping that has "observation" [..., D] and "desired_goal" [..., G], such as the observation of a
-    gymnasium goal environment; other keys are ignored. It returns actions [..., A] float32 in [-1, 1].
+    Call it with a mapping that has "observation" [..., D] and "desired_goal" [..., G], such as the observation of a Gymnasium
+    goal environment. It returns actions [..., A] float32 in [-1, 1].
     """
 
     layers: tuple[tuple[Any, Any], ...]  # (kernel [in, out], bias [out]) of each linear layer
@@ -53,11 +53,11 @@ class Policy:
 
     @property
     def sizes(self) -> tuple[int, int, int]:
-        """Numbers in an observation, a goal and an action: D, G and A."""
+        """Sizes D, G and A of observation, goal and action."""
         return self.observation_mean.shape[0], self.goal_mean.shape[0], self.layers[-1][1].shape[0]
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Computes the actions [..., A] for the observations of one state or a batch.
+        """Actions [..., A] for observations of one state or a batch.
 
         Raises:
           ValueError: a key is missing, a last axis has the wrong size, or a value is not finite.
@@ -68,7 +68,7 @@ class Policy:
                 raise ValueError(f"the policy needs {key!r}; got {sorted(obs)}")
             value = np.asarray(obs[key], np.float32)
             if value.ndim == 0 or value.shape[-1] != mean.shape[0]:
-                raise ValueError(f"{key} must end in an axis of {mean.shape[0]}; got shape {value.shape}")
+                raise ValueError(f"the last axis of {key} must have size {mean.shape[0]}; got shape {value.shape}")
             if not np.all(np.isfinite(value)):
                 raise ValueError(f"{key} must be finite")
             values.append(value)
@@ -77,11 +77,11 @@ class Policy:
         return self.forward(values[0], values[1], np)
 
     def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any:
-        """Computes the actions for observations [..., D] and goals [..., G], in NumPy or, with xp=jax.numpy, in JAX."""
+        """Actions for observations [..., D] and goals [..., G], in NumPy or, with xp=jax.numpy, in JAX. Checks nothing."""
 
         def normalize(value, mean, std):
             value = xp.clip(value, -self.obs_clip, self.obs_clip)
-            rank = (1,) * (value.ndim - 1)  # mean and std get the axes of the batch: JAX may forbid implicit ones
+            rank = (1,) * (value.ndim - 1)  # explicit batch axes, because JAX may forbid implicit ones
             return xp.clip((value - mean.reshape(*rank, -1)) / std.reshape(*rank, -1), -self.norm_clip, self.norm_clip)
 
         x = xp.concatenate(
@@ -98,20 +98,20 @@ class Policy:
         return xp.tanh(x)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Returns the policy's arrays by name, float32: layerI_kernel [in, out] and layerI_bias [out], and the other fields."""
+        """The policy's arrays by name, float32: layerI_kernel [in, out], layerI_bias [out], and the other fields."""
         arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
         arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
         return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
 
     def save(self, path: Path, **extra: Any) -> None:
-        """Writes the policy to `path`; an existing file is replaced only when the new one is complete."""
+        """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = {**self.arrays(), **extra}
         with files.atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> Policy:
-    """Makes a policy of its `Policy.arrays`.
+    """Makes a policy from its `Policy.arrays`.
 
     Raises:
       ValueError: names an array that is missing or invalid.
@@ -151,10 +151,10 @@ def read_interface(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _check_array(name: str, array: Any) -> None:
-    """Raises ValueError for an array of another type or rank, that is not finite, or not positive where it must be."""
+    """Raises ValueError for an array of a wrong type or rank, or with invalid values."""
     ndim = 0 if name in _SCALARS else 2 if name.endswith("_kernel") else 1
     if array.dtype.kind != "f" or array.ndim != ndim or 0 in array.shape:
-        raise ValueError(f"{name} must be floating-point numbers of {ndim} axes; it is {array.dtype}{list(array.shape)}")
+        raise ValueError(f"{name} must be floats with {ndim} axes; got {array.dtype}{list(array.shape)}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} must be finite")
     if (name in _SCALARS or name.endswith("_std")) and not np.all(array > 0):
@@ -162,7 +162,7 @@ def _check_array(name: str, array: Any) -> None:
 
 
 def _check_bounds(layers: Sequence[Sequence[NDArray]], arrays: Mapping[str, Any]) -> None:
-    """Raises ValueError if a hidden unit could overflow, and an action be NaN, for some observation."""
+    """Raises ValueError if a hidden unit could overflow, so that an action could be NaN."""
     most = np.full(len(layers[0][0]), float(arrays["norm_clip"]))
     for number, (kernel, bias) in enumerate(layers):
         with np.errstate(over="ignore"):
@@ -172,7 +172,14 @@ def _check_bounds(layers: Sequence[Sequence[NDArray]], arrays: Mapping[str, Any]
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
-    """Makes a policy of an actor's linear layers, by flax's names, and its normalizers."""
+    """Makes a policy.
+
+    Args:
+      dense: linear layers of the actor, by flax's names.
+      observation_norm: `NormalizerState` of observations [D].
+      goal_norm: `NormalizerState` of goals [G].
+      hparams: numbers of the normalization.
+    """
     layers = tuple(
         (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
     )

@@ -1,1 +1,1 @@
-"""Many runs: the grid, the tables, the comparison and its pictures."""
+"""Sweeps: the grid, tables, comparison and figures of many runs."""

@@ -1,4 +1,4 @@
-"""Comparison of a sweep's settings with one another and with a baseline, with intervals."""
+"""Compares a sweep's settings with each other and with a baseline."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ COMPARISON = "comparison.csv"
 
 
 class Group(NamedTuple):
-    """Results of all seeds of one setting."""
+    """Results of one setting over all seeds."""
 
     env: str
-    label: str  # the sampler, and the other values that differ between the settings of this environment
+    label: str  # the sampler and the other values that differ between settings
     sampler: str
-    others: dict[str, Any]  # the other values that differ and that this sampler reads
+    others: dict[str, Any]  # other values that differ and that the run reads
     seeds: tuple[int, ...]  # S of them
-    failed: int  # runs that failed
-    lanes: int  # most that ran side by side
+    failed: int  # number of failed runs
+    lanes: int  # most parallel runs
     epoch: NDArray  # [P]
     env_steps: NDArray  # [P]
-    seconds: NDArray  # [P] the mean over the seeds
+    seconds: NDArray  # [P] mean over seeds
     success: NDArray  # [S, P] success rate after each epoch
     final: NDArray  # [S] success rate of the last policy
     at_reset: float  # fraction of the final episodes whose goal was reached at the reset
 
 
 def groups(trials: list[dict[str, Any]]) -> dict[str, list[Group]]:
-    """Returns the trials of a sweep, as `tables.read` gives them, by environment and setting."""
+    """Groups the trials from `tables.read` by environment and setting."""
     by_env: dict[str, list[dict[str, Any]]] = {}
     for trial in trials:
         by_env.setdefault(trial["settings"]["env"], []).append(trial)
@@ -59,7 +59,7 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     labels = [label if labels.count(label) == 1 else digits for label, digits in zip(labels, exact)]
     result = [_group(env, label, own, _once_a_seed(alike)) for label, (own, alike) in zip(labels, by_setting.values())]
 
-    def place(group: Group) -> Any:  # numbers in rising order, after None; names of one setting are all strings
+    def place(group: Group) -> Any:  # numbers ascend, after None
         return order.get(group.sampler, len(order)), [(value is not None, value) for value in group.others.values()]
 
     return sorted(result, key=place)
@@ -78,10 +78,10 @@ def _format(name: str, value: Any) -> str:
 
 
 def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns the trials of one setting, each seed once: runs that differ in what they do not read alone are the same.
+    """One trial per seed of a setting. Runs that differ only in settings that they do not read are equal.
 
     Raises:
-      FolderError: two folders hold the same run, as after a copy.
+      FolderError: two folders hold the same run, for example after a copy.
     """
     by_seed: dict[int, dict[str, Any]] = {}
     for trial in trials:
@@ -92,7 +92,7 @@ def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, Any]]) -> Group:
-    """Returns the group of one setting's trials. A run that failed has a success of 0 from then on."""
+    """Group of one setting's trials. A failed run counts as success 0 from then on."""
     trials = sorted(trials, key=lambda trial: trial["seed"])
     longest = max((trial["curve"] for trial in trials), key=lambda curve: len(curve.get("epoch", ())))
     longest = longest or {"epoch": [1], "env_steps": [0], "wall_seconds": [0.0]}
@@ -118,12 +118,12 @@ def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, 
 
 
 class Row(NamedTuple):
-    """Comparison of a setting with the baseline. Intervals are at 95 %, over seeds; see `compare`."""
+    """Comparison of a setting with the baseline, with 95 % intervals over seeds; see `compare`."""
 
     env: str
     setting: str
     seeds: int
-    failed: int  # seeds whose run failed; their success is 0 from then on
+    failed: int  # failed seeds; their success is 0 from then on
     final: float  # mean success rate of the last policies
     final_iqm: float  # interquartile mean of these rates
     final_low: float
@@ -132,30 +132,30 @@ class Row(NamedTuple):
     area: float  # interquartile mean of the mean success rate over all epochs
     area_low: float
     area_high: float
-    reached: int  # seeds with an epoch at the threshold or above
-    epochs: float  # median of the first such epoch; infinite if half of the seeds or more have none
+    reached: int  # seeds that reach the threshold
+    epochs: float  # median epochs to the threshold; infinite if at least half of the seeds never reach it
     epochs_low: float
     epochs_high: float
     env_steps: float  # environment steps until that epoch
-    better: float  # probability that a seed has a larger area than one of the baseline; NaN for the baseline itself
+    better: float  # probability that a seed has a larger area than one of the baseline; NaN for the baseline
     better_low: float
     better_high: float
-    area_gain: float  # mean difference of the areas to the baseline's, paired by seed
-    p_value: float  # two-sided p-value of that difference, before correction
-    p_corrected: float  # p-value corrected by Holm's method over the settings of this environment
+    area_gain: float  # mean difference of areas to the baseline, paired by seed
+    p_value: float  # two-sided p-value of the gain, before correction
+    p_corrected: float  # p-value after Holm's correction over the settings of this environment
 
 
 def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]:
     """Compares each setting of an environment with the baseline.
 
-    Success, area and epochs have bootstrap intervals over seeds; `better` is the probability of improvement. If both
-    settings have the same seeds, the p-value is that of a permutation test paired by seed.
+    Success, area and epochs have bootstrap intervals over seeds. `better` is the probability of improvement. If both settings
+    have the same seeds, the p-value comes from a permutation test paired by seed.
 
     Args:
       settings: settings of one environment.
-      baseline: label of one of them, or a sampler. Then each setting is compared with that sampler's setting of the same
-        other values; without such a setting, it is not compared.
-      threshold: success rate that `reached` and `epochs` refer to.
+      baseline: label of a setting, or a sampler. With a sampler, each setting is compared with that sampler's setting of the
+        same other values, if it exists.
+      threshold: success rate for `reached` and `epochs`.
     """
     rows = [_row(group, _baseline_of(group, settings, baseline), threshold) for group in settings]
     tested = [i for i, row in enumerate(rows) if not math.isnan(row.p_value)]
@@ -166,7 +166,7 @@ def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]
 
 
 def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | None:
-    """Returns the setting to compare `group` with; None if there is none, or `group` is the baseline itself."""
+    """Setting to compare `group` with, or None if there is none or `group` is the baseline."""
 
     def fits(other: Group) -> bool:
         return all(group.others.get(name, value) == value for name, value in other.others.items())
@@ -217,7 +217,7 @@ def _areas(group: Group) -> NDArray:
 
 
 def table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
-    """Formats `rows` as a table for the screen: its head and its cells."""
+    """Formats rows as a table for the terminal: its head and its cells."""
     head = ["env", "setting", "seeds", "final success (IQM)", "mean over epochs", "epochs to threshold", "P(better)", "p"]
     cells = []
     for r in rows:

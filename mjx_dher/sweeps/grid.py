@@ -1,4 +1,4 @@
-"""The trials of a sweep: every environment, sampler, number and seed of a grid. Loads neither JAX nor MuJoCo."""
+"""Grid of a sweep: trials for each environment, sampler, number and seed. Loads neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ _SIZES = tuple(field.name for field in dataclasses.fields(Config))
 
 
 def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
-    """Returns every setting with every seed, seed by seed within an environment, so that what is to be compared ends together.
+    """Every setting with every seed, sorted by environment, then seed, so that runs to compare end together.
 
-    Settings that neither sampler nor learner reads are those of the environment's first setting; what is then the same is
-    there once.
+    Settings that a run does not read are set to those of the environment's first setting, and duplicates are dropped.
     """
     settings: dict[RunSpec, None] = {}
     first: dict[str, RunSpec] = {}
@@ -38,7 +37,7 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
 
 
 def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
-    """Returns `spec` with those settings of `base` that neither its sampler nor its learner reads."""
+    """Copy of `spec` in which settings that its sampler and learner do not read come from `base`."""
     settings = fingerprint.settings(spec)
     unread = [name for name in settings if not reads(settings, name)]
     numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
@@ -49,7 +48,7 @@ def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
 
 
 def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
-    """Returns the trials that can share a program together, in the order in which the first of each program comes."""
+    """Groups trials that can share a program, in order of first appearance."""
     groups: dict[RunSpec, list[RunSpec]] = {}
     for spec in specs:
         groups.setdefault(spec.program, []).append(spec)
@@ -57,24 +56,24 @@ def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:
 
 
 def folder_of(sweep: Path, spec: RunSpec) -> Path:
-    """Returns the run folder of a trial."""
+    """Run folder of a trial."""
     return sweep / CELLS / fingerprint.trial_name(spec)
 
 
 def is_done(sweep: Path, spec: RunSpec) -> bool:
-    """Returns whether the trial has ended, and its result can be believed."""
+    """Whether a trial has ended with a valid result."""
     return results.is_done(folder_of(sweep, spec), spec)
 
 
 def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
-    """Sentences about custom source files that have changed since trials in the folder were trained."""
+    """Sentences about custom source files that changed since trials in the folder were trained."""
     now = {(field, getattr(spec, field)): source for spec in specs for field, source in fingerprint.sources(spec).items()}
     told: dict[str, int] = {}
     for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
         try:
             content = run_folder.read_config(path.parent)
         except FolderError:
-            continue  # whoever reads its result will say so
+            continue  # reported when its result is read
         for (field, value), source in now.items():
             if content.get(field) == value and content["sources"].get(field) != source:
                 text = f"{source.split()[0]} ({field} {value}) has changed since"
@@ -83,20 +82,20 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
 
 
 def is_sweep(folders: Sequence[Path]) -> bool:
-    """Whether this is one sweep, and not one or more run folders.
+    """Whether the paths are one sweep. False for one or more run folders.
 
     Raises:
-      FolderError: it is neither.
+      FolderError: they are neither.
     """
     if not folders:
-        raise FolderError("name one or more run folders, or the folder of a sweep; got none")
+        raise FolderError("pass one or more run folders, or a sweep; got none")
     for folder in folders:
         if not folder.is_dir():
-            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: no such folder")
+            raise FolderError(f"{folder} is neither a run folder nor a sweep: no such folder")
         sweep, run = (folder / CELLS).is_dir(), (folder / run_folder.CONFIG_FILE).exists()
         if not sweep and not run:
             told = f"it has neither {run_folder.CONFIG_FILE} nor {CELLS}/"
-            raise FolderError(f"{folder} is neither a run folder nor that of a sweep: {told}")
+            raise FolderError(f"{folder} is neither a run folder nor a sweep: {told}")
         if sweep and len(folders) > 1:
-            raise FolderError(f"{folder} is a sweep: it is taken alone, not with other folders")
+            raise FolderError(f"{folder} is a sweep: pass it alone, without other folders")
     return (folders[0] / CELLS).is_dir()

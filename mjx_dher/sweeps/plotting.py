@@ -17,7 +17,7 @@ from mjx_dher.tools import figures
 
 
 def curves(groups: Sequence[Group], threshold: float) -> Any:
-    """Draws success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
+    """Success over epochs, environment steps and seconds: interquartile mean over seeds, with its 95 % interval."""
     labels = [textwrap.fill(_name(group), 120) for group in groups]
     columns = max(1, min(4, 140 // (6 + max(map(len, labels)))))
     height = 3.6 + 0.2 * math.ceil(len(groups) / columns)
@@ -30,7 +30,7 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
             style = {"color": color, "linestyle": line, "marker": marker, "markevery": every, "markersize": 4}
             axis.plot(x, middle, **style, label=_name(group))
     side_by_side = max(group.lanes for group in groups) > 1
-    seconds = "seconds (all runs side by side)" if side_by_side else "seconds (of one run)"
+    seconds = "seconds (parallel runs)" if side_by_side else "seconds (one run)"
     for axis in axes:
         axis.axhline(threshold, color="0.6", linewidth=0.8)
         axis.axhline(groups[0].at_reset, color="0.6", linewidth=0.8, linestyle=":")
@@ -40,7 +40,7 @@ def curves(groups: Sequence[Group], threshold: float) -> Any:
 
 
 def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> Any:
-    """Draws the epochs to the threshold of each seed, and their median with its interval.
+    """Epochs to the threshold: each seed, and the median with its interval.
 
     Seeds that never reach the threshold lie above the dashed line.
     """
@@ -68,7 +68,7 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
 
 
 def comparison(rows: Sequence[Row]) -> Any:
-    """Draws final success, mean success over all epochs, and probability of improvement on the baseline, with intervals."""
+    """Final success, mean success over epochs, and probability of improvement over the baseline, with intervals."""
     names = [textwrap.fill(f"{row.setting}{_failures(row.failed, row.seeds)}", 40) for row in rows]
     lines = sum(1 + name.count("\n") for name in names)
     figure, axes = figures.subplots(1, 3, 11, 1.4 + 0.3 * lines + 0.15 * len(rows), sharey=True)
@@ -95,7 +95,7 @@ def comparison(rows: Sequence[Row]) -> Any:
 
 
 def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict[str, Any]:
-    """Draws the three figures of an environment; returns them by name."""
+    """The three figures of an environment, by name."""
     return {
         "curves": curves(groups, threshold),
         "thresholds": thresholds(groups, rows, threshold),
@@ -104,7 +104,7 @@ def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict
 
 
 def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
-    """Writes the three figures of an environment into `folder` and returns their paths."""
+    """Writes the three figures of an environment into `folder`. Returns their paths."""
     written = []
     for name, figure in draw(groups, rows, threshold).items():
         for ending in formats:

@@ -1,4 +1,4 @@
-"""A page about a run or a sweep, in one file that opens without a server: curves, tables, settings, videos."""
+"""HTML report of a run or a sweep, in one file that opens without a server: curves, tables, settings and videos."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ REPORT = "report.html"
 
 
 def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> str:
-    """HTML page about the run in `folder`, whose training may still be under way.
+    """HTML report of a run, which may still be training.
 
     Args:
-      folder: of the run.
+      folder: run folder.
       report: called with a line about each video that is left out.
 
     Raises:
-      FolderError: no run folder, or a damaged one.
+      FolderError: it is not a run folder, or it is damaged.
     """
     curve = curves.read_curve(folder, allow_empty=True)
     spec = curve.spec
@@ -65,13 +65,13 @@ def _facts(curve: Curve) -> Iterator[tuple[str, str]]:
 
 
 def _settings(spec: RunSpec, content: dict[str, Any]) -> Iterator[str]:
-    """Yields the settings that a run reads, beside the defaults of the library if they differ."""
+    """Settings that a run reads, next to the library's defaults if they differ."""
     defaults = fingerprint.settings(RunSpec())
     for title, values in fingerprint.groups(spec).items():
         rows = [[n, text(x), text(defaults[n]) if n in defaults and defaults[n] != x else ""] for n, x in values.items()]
         if title == "run":
             rows.append(["physics", content["physics"], ""])
-        yield html.details(title, html.table((title, "value", "default, where it differs"), rows))
+        yield html.details(title, html.table((title, "value", "default, if different"), rows))
 
 
 def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
@@ -79,28 +79,26 @@ def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
         if path.suffix.lower() not in html.VIDEOS or not path.is_file():
             continue
         if path.stat().st_size > html.LARGEST:
-            report(f"{path} is larger than {html.LARGEST / 1e6:.0f} MB, and left out")
+            report(f"{path} is left out because it is larger than {html.LARGEST / 1e6:.0f} MB")
             continue
         yield html.video(path)
 
 
 def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
-    """HTML page about all ended runs of the sweep in `folder`.
+    """HTML report of all finished runs of a sweep.
 
     Args:
-      folder: of the sweep.
-      baseline: setting that the others are compared with, as for `comparison.compare`.
-      threshold: success rate for the time that it takes to get there.
+      folder: folder of the sweep.
+      baseline: setting to compare with, as in `comparison.compare`.
+      threshold: success rate for the time to success.
       report: called with a line about each video that is left out.
 
     Raises:
-      FolderError: no sweep, none of its runs has ended, or a damaged one.
+      FolderError: it is not a sweep, it is damaged, or none of its runs has ended.
     """
     trials = tables.read(folder)
     failed = [trial for trial in trials if trial["status"] == FAILED]
-    body = [
-        html.element("p", f"{len(trials)} runs have ended, {len(failed)} of them failed. Intervals are of 95 %, over seeds.")
-    ]
+    body = [html.element("p", f"{len(trials)} runs have ended, of which {len(failed)} failed. Intervals are 95 %, over seeds.")]
     body += _videos(folder, report)
     for number, (env, groups) in enumerate(comparison.groups(trials).items()):
         rows = comparison.compare(groups, baseline, threshold)
@@ -135,7 +133,7 @@ def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
 def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
     varying, first = _varying(trials), trials[0]["settings"]
     if varying:
-        yield html.element("p", f"What differs between runs: {', '.join(varying)}.")
+        yield html.element("p", f"Runs differ in {', '.join(varying)}.")
     rows = [(name, text(value)) for name, value in first.items() if name not in varying]
     yield html.details("the same in all runs", html.table(("setting", "value"), rows))
 

@@ -1,7 +1,7 @@
 """Trains the trials of a sweep in as few compiled programs as possible.
 
-A trial is a run folder, named after its settings and their digest, with a result once it has ended. A sweep that was stopped or
-made larger trains the missing trials. Runs that were side by side when it was stopped resume from their checkpoint.
+A trial is a run folder, named after its settings and their digest. To finish or extend a sweep, run it again: it trains the
+missing trials, and unfinished runs resume from their checkpoint.
 """
 
 from __future__ import annotations
@@ -32,25 +32,25 @@ def run(
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
 ) -> list[Result]:
-    """Trains trials into the folder of a sweep. Trials that can share a program do, in any order.
+    """Trains trials into the folder of a sweep. Trials share programs if possible, in any order.
 
     Args:
-      folder: of the sweep; made if it does not exist.
+      folder: folder of the sweep, made if it does not exist.
       specs: trials, in order.
-      make_env: makes the environment of a trial.
-      options: evaluation, checkpoints, logs.
-      lanes: runs side by side, at most.
-      devices: to train on, or "all", as for `train_runs`.
-      should_stop: asked after every epoch; True ends the sweep, with a checkpoint.
+      make_env: function that makes the environment of a trial.
+      options: evaluation, checkpoints and logs.
+      lanes: most parallel runs.
+      devices: number of devices, or "all", as in `train_runs`.
+      should_stop: called after every epoch. True stops the sweep with a checkpoint.
       report: called with a line about each program and checkpoint.
-      on_epoch: called after every epoch of those side by side.
+      on_epoch: called after every epoch of the parallel runs.
 
     Returns:
-      A Result for each trained trial. Trials that had ended before, that another program trains, or that were still waiting
-      when the sweep was stopped have none.
+      One Result per trained trial. Trials that had ended before, that another process trains, or that were waiting when the
+      sweep was stopped have none.
 
     Raises:
-      ValueError: as `train_runs`.
+      ValueError: as in `train_runs`.
     """
     results: list[Result] = []
     for trials in grid.by_program(specs):

@@ -1,4 +1,4 @@
-"""The tables of a sweep: reads its trials that have ended, writes results.csv, results.npz and finals.csv."""
+"""Tables of a sweep: reads its finished trials and writes results.csv, results.npz and finals.csv."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ _FINAL = ("success_rate", "reset_success_rate", "return_mean", "episodes")
 
 
 def read(folder: Path) -> list[dict[str, Any]]:
-    """Returns the trials of a sweep that have ended.
+    """Finished trials of a sweep, each a dict.
 
-    Each has its folder, settings (by name; with the engine that ran, and `source`, the files of its own code), seed, lanes,
-    status and reason; curve, lists by column; and final, the last evaluation, empty for a run that failed.
+    Keys: folder, settings (by name, with the engine used and `source`, the custom source files), seed, lanes, status, reason,
+    curve (lists by column) and final (the last evaluation, empty if the run failed).
 
     Raises:
-      FolderError: no sweep, none ended, a link that leads out of it, or a trial that cannot be believed
+      FolderError: it is not a sweep, no run has ended, a link leads out of it, or a trial is invalid
         (`results.result_problem`).
     """
     cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
     paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]
     if not paths:
-        raise FolderError(f"{folder} holds no finished run of a sweep")
+        raise FolderError(f"{folder} has no finished run of a sweep")
     trials = [_read_trial(path) for path in paths]
     return sorted(trials, key=lambda t: (t["settings"]["env"], t["settings"]["sampler"], str(t["settings"]), t["seed"]))
 
 
 def _read_trial(path: Path) -> dict[str, Any]:
     if (problem := results.result_problem(path)) is not None:
-        raise FolderError(f"{problem}; the sweep's command trains it again, or remove the folder")
+        raise FolderError(f"{problem}; run the sweep's command to train it again, or remove the folder")
     result, (content, spec) = results.read_result(path), run_folder.read_run(path)
     failed = result["status"] == FAILED
     flags = [f"{name} {value}" for name, value in content.get("jax_flags", {}).items()]
@@ -66,12 +66,12 @@ def _read_trial(path: Path) -> dict[str, Any]:
 
 
 def _short(value: float) -> float:
-    """Returns a number to the digits of metrics.csv."""
+    """Rounds a number to the digits of metrics.csv."""
     return value if isinstance(value, int) else float(f"{value:.6g}")
 
 
 def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
-    """Writes the tables of trials that `read` gave; docs/sweeps.md describes the columns."""
+    """Writes the tables of the trials from `read`. docs/sweeps.md describes the columns."""
     results: list[dict[str, Any]] = []
     finals: list[dict[str, Any]] = []
     for trial in trials:

@@ -1,6 +1,6 @@
-"""The trained policies that are part of the package: a run folder each, beside this file, with a card (README.md).
+"""Policies bundled with the package, each a run folder with a card (README.md) in this folder.
 
-`docs/publish_policy.py` makes them. Finding one needs nothing but Python.
+`docs/publish_policy.py` makes them. This module needs only Python.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from mjx_dher.lookup import check_name
 from mjx_dher.system.files import FolderError
 
 FOLDER = Path(__file__).resolve().parent
-FACTS, CARD = "card.json", "README.md"  # what was measured of a policy, and the card that is made of it
+FACTS, CARD = "card.json", "README.md"  # a policy's measurements, and the card made from them
 _CONFIG = "config.json"  # every run folder has one
 
 
 def names() -> tuple[str, ...]:
-    """Returns the names of the policies that are part of the package."""
+    """Names of the bundled policies."""
     return tuple(sorted(path.parent.name for path in FOLDER.glob(f"*/{_CONFIG}")))
 
 
 def find(run: str | Path) -> Path:
-    """Returns the run folder, or the file, that `run` names: a path, or else the name of a policy of the package.
+    """Run folder or file for a path or for the name of a bundled policy.
 
-    A run folder or a file by this name in the current folder comes first. A folder that is no run's does not.
+    A run folder or file of this name in the current folder takes precedence.
 
     Raises:
-      FolderError: there is neither; the message has the policies' names, and suggests the nearest.
+      FolderError: there is neither. The message lists the bundled policies and suggests the nearest.
     """
     path = Path(run)
     if path.is_file() or (path / _CONFIG).exists():
@@ -38,17 +38,17 @@ def find(run: str | Path) -> Path:
         return FOLDER / str(run)
     if not path.exists():
         try:
-            check_name("a policy of the package", str(run), known)
+            check_name("a bundled policy", str(run), known)
         except ValueError as error:
             raise FolderError(f"{run} is not a run folder: no such folder; and {error}") from None
     return path
 
 
 def is_shipped(path: Path) -> bool:
-    """Returns whether a path, as `find` gave it, is of a policy of the package."""
+    """Whether a path from `find` is a bundled policy."""
     return path.parent == FOLDER
 
 
 def facts(folder: Path) -> dict[str, Any]:
-    """Returns what was measured of a policy of the package: `here` and `original`, `machine`, `commit` and `date`."""
+    """Measurements of a bundled policy: `here` and `original`, `machine`, `commit` and `date`."""
     return dict(json.loads((folder / FACTS).read_text(encoding="utf-8")))
