@@ -6,8 +6,8 @@
     python bench/ablation.py --out ablation --runs docs/ablation_runs.csv   trains only what that file does not have
     python bench/ablation.py --out toy --toy --seeds 3  the same on the point mass, on a CPU in minutes
 
-It is bench/bakeoff.py with other arms, and has its options. Each arm is a program of its own. docs/learners.md says beforehand
-what is compared.
+It is bench/bakeoff.py with other arms, and has its options. Each arm is a separate program. docs/experiments/ablation.md has
+the plan.
 """
 
 from __future__ import annotations

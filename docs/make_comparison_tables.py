@@ -48,7 +48,7 @@ def repeat(*names: str) -> Experiment:
 
 REPEAT, THIRD = repeat("next_future", "energy", "td_error"), repeat("td_error")
 PAGES = (
-    Page(ABLATION, DOCS / "learners.md", DOCS / "ablation_runs.csv", "ablation"),
+    Page(ABLATION, DOCS / "experiments" / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
     Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
     Page(REPEAT, DOCS / "what_helps.md", DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
     Page(THIRD, DOCS / "what_helps.md", DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),

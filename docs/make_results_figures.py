@@ -1,4 +1,4 @@
-"""Writes the tables and the forest plots of docs/results.md from the committed curves: `python docs/make_results_figures.py`.
+"""Writes tables and forest plots of the paper's experiment from the committed curves: `python docs/make_results_figures.py`.
 
 A table stands in the page between `<!-- NAME: docs/make_results_figures.py -->` and `<!-- end of NAME -->`. The curves are
 those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, docs/paper_TASK_curves.csv.
@@ -40,7 +40,13 @@ from scipy.stats import t
 
 from mjx_dher import stats
 
-PAGE, SCRIPT = DOCS / "results.md", "docs/make_results_figures.py"
+SCRIPT = "docs/make_results_figures.py"
+# The tables of each page.
+PAGES = {
+    DOCS / "results.md": ("verdicts", "lottery", "own_samplers", "samplers", "field"),
+    DOCS / "experiments" / "paper_set.md": ("power", "set", "k", "kernels"),
+    DOCS / "experiments" / "paper_repeats.md": ("repeats", "robustness"),
+}
 
 
 OWN_CYCLES, LONG_CYCLES = "50 an epoch", "1 an epoch"
@@ -301,7 +307,9 @@ def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) ->
 def main() -> None:
     """Writes tables and pictures."""
     the_set, before = paper_set.load_set(paper_set.FOLDER), load()
-    PAGE.write_text(with_tables(PAGE.read_text(), SCRIPT, blocks(the_set, before)))
+    tables = blocks(the_set, before)
+    for page, names in PAGES.items():
+        page.write_text(with_tables(page.read_text(), SCRIPT, {name: tables[name] for name in names}))
     paper_forest.draw(with_repeats(the_set, before), DOCS / "images" / "paper_forest.png", (OWN, TODAY))
     paper_forest.draw_set(paper_set.compared(the_set), DOCS / "images" / "set_forest.png")
 

@@ -1,4 +1,4 @@
-"""Reads learning curves and compares them by seed, for the tables and pictures of docs/results.md."""
+"""Reads learning curves and compares them by seed, for the tables and pictures of the paper's experiment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The forest plots of docs/results.md: `weighted` against `future` in every sweep of every task, and the set's comparisons."""
+"""The forest plots of the paper's experiment: `weighted` against `future` in every sweep, and the comparisons of the set."""
 
 from __future__ import annotations
 

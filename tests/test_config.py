@@ -32,7 +32,7 @@ def test_the_paper_preset_is_the_paper_s(env, workers, epochs):
 
 
 def test_each_reading_of_the_paper_can_be_changed():
-    """By the options that docs/results.md names beside each."""
+    """By the options that docs/experiments/paper_settings.md names for each."""
     options = [
         "--preset",
         "paper",

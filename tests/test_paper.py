@@ -1,4 +1,4 @@
-"""The set of runs that docs/results.md states beforehand: its commands, its comparisons, and what is made of its curves."""
+"""The set of runs that docs/experiments/paper_set.md states beforehand: commands, comparisons, and tables from its curves."""
 
 import csv
 import importlib.util
