@@ -27,24 +27,24 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
     """Makes an environment.
 
     Args:
-      name: one of `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
-      engine: "native" (MuJoCo C on the host's cores), "warp" (a kernel for NVIDIA GPUs), "jax" (MJX) or "auto" (native on
-        a CPU, warp on an NVIDIA GPU, else jax). It is passed on if the constructor has this argument.
-      **overrides: arguments of the environment's constructor, such as `episode_length` or `reward_type`, and of wrappers:
-        `action_filter`, `action_delay`, `obs_noise` and `frame_stack` (`envs.wrappers`).
+      name: a name from `list_envs()`, or the "module:attribute" of a class or function that makes an environment.
+      engine: "native" (MuJoCo C on the host's cores), "warp" (a kernel for NVIDIA GPUs), "jax" (MJX) or "auto" (native on a
+        CPU, warp on an NVIDIA GPU, else jax). It is passed on if the constructor has this argument.
+      **overrides: arguments of the constructor, such as `episode_length` or `reward_type`, and of wrappers: `action_filter`,
+        `action_delay`, `obs_noise` and `frame_stack` (`envs.wrappers`).
 
     Raises:
-      ValueError: there is no such environment, module, attribute or engine (the message names the nearest), an argument is out
-        of range, an engine is given to a constructor that takes none, or the constructor returns no environment.
+      ValueError: the environment, module, attribute or engine does not exist (the message suggests the nearest), an argument
+        is out of range, the constructor takes no engine, or its result is not an environment.
     """
     constructor = load("env", name)
     _check_kind(name, constructor)
-    own = inspect.signature(constructor).parameters  # an argument of the same name is the constructor's
+    own = inspect.signature(constructor).parameters  # the constructor's arguments take precedence
     wrapped = {key: overrides.pop(key) for key in _WRAPPERS if key in overrides and key not in own}
     if _takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
-        raise ValueError(f"env {name!r} has no engine to choose; got {engine!r}")
+        raise ValueError(f"engine must be auto for env {name!r}, which takes no engine; got {engine!r}")
     _check_arguments(name, constructor, overrides)
     try:
         env = constructor(**overrides)
@@ -60,7 +60,7 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
 
 
 def _check_kind(name: str, constructor: Any) -> None:
-    """Raises ValueError for anything but a class with an environment's methods, or a Python function; nothing is called."""
+    """Raises ValueError unless it is a Python function, or a class with an environment's methods. Calls nothing."""
     if inspect.isclass(constructor):
         _check_members(name, constructor, _METHODS)
     elif not (inspect.isfunction(constructor) or isinstance(constructor, functools.partial)):
@@ -69,16 +69,16 @@ def _check_kind(name: str, constructor: Any) -> None:
 
 def _check_members(name: str, env: Any, members: tuple[str, ...]) -> None:
     if missing := [member for member in members if not hasattr(env, member)]:
-        raise ValueError(f"env {name!r} is no environment: it has no {', '.join(missing)} (see mjx_dher.types.Env)")
+        raise ValueError(f"env {name!r} is not an environment: it has no {', '.join(missing)} (see mjx_dher.types.Env)")
 
 
 def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict[str, Any]) -> None:
-    """Raises ValueError for an argument that neither the constructor nor its engine takes, and lists those they take."""
+    """Raises ValueError for an argument that neither the constructor nor its engine takes. The message lists the valid ones."""
     parameters = inspect.signature(constructor).parameters
     named = [
         key for key, parameter in parameters.items() if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
     ]
-    if len(named) < len(parameters):  # **options are the engine's
+    if len(named) < len(parameters):  # **options go to the engine
         if name not in COMPONENTS["env"]:
             return
         from mjx_dher.envs.engines import engine_options
@@ -99,7 +99,7 @@ _WRAPPERS = {
 
 
 def takes_engine(name: str) -> bool:
-    """Whether the constructor of an environment, as `make` finds it, has the argument `engine`."""
+    """Whether the constructor of an environment has the argument `engine`."""
     return _takes_engine(load("env", name))
 
 

@@ -1,4 +1,4 @@
-"""Kinematics: pose and velocity of the gripper at given joint angles, free joints and rotations."""
+"""Kinematics of an arm: pose and velocity of the gripper, free joints and rotations."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from mjx_dher.types import Array
 
 
 class Chain:
-    """Kinematic chain from the world to `body`, whose bodies each have a hinge or are fixed to their parent.
+    """Kinematic chain from the world to `body`, whose bodies each have one hinge or are fixed to their parent.
 
     Args:
-      model: the compiled MJCF.
-      body: the last body's name.
-      site: a site on that body.
+      model: compiled MJCF.
+      body: name of the last body.
+      site: name of a site on that body.
 
     Raises:
-      ValueError: a body of the chain moves other than by one hinge through its origin.
+      ValueError: a body of the chain has a joint other than one hinge through its origin.
     """
 
     def __init__(self, model: mujoco.MjModel, body: str, site: str):
@@ -38,11 +38,11 @@ class Chain:
                 axis = model.jnt_axis[joint]
             links.insert(0, (model.body_pos[index], model.body_quat[index], axis))
             index = int(model.body_parentid[index])
-        # The joints sit next to one another, because a body's only child with a hinge comes right after it.
+        # The joints are adjacent, because a body's only child with a hinge comes right after it.
         self.qpos = slice(int(model.jnt_qposadr[joints[0]]), int(model.jnt_qposadr[joints[0]]) + len(joints))
         self.qvel = slice(int(model.jnt_dofadr[joints[0]]), int(model.jnt_dofadr[joints[0]]) + len(joints))
 
-        # J joints divide the chain into S = J + 1 segments, each in the frame that the joint before it has turned.
+        # J joints divide the chain into S = J + 1 segments, each in the frame behind the joint before it.
         unit = np.array([1.0, 0.0, 0.0, 0.0])
         quat, offset = unit, np.zeros(3)
         offsets: list[np.ndarray] = []
@@ -59,8 +59,7 @@ class Chain:
                 turned.append(_right(_right(np.array([0.0, *axis])) @ quat))
                 quat, offset = unit, np.zeros(3)
         at_site = offset + _rotated(quat, model.site_pos[model.site(site).id])
-        # The orientation [4] of the next segment is cos(half the angle) `still` + sin(half the angle) `turned`, times that of
-        # the one before.
+        # A segment's orientation [4] is cos(half the angle) `still` + sin(half the angle) `turned`, times the previous one.
         self._still, self._turned = _float32(still), _float32(turned)  # [J, 4, 4]
         self._axes = _float32(axes)  # [J, 3] of the joints, each in the frame of the segment before
         self._to_body = _float32([*offsets, offset])  # [S, 3] from a segment's start to its end; and
@@ -69,13 +68,13 @@ class Chain:
         self._before = np.tri(len(joints) + 1, len(joints), -1, dtype=np.float32)  # [S, J] 1 where the joint turns the segment
 
     def pose(self, angles: Array) -> tuple[Array, Array]:
-        """Returns position [3], m, and orientation [4] (w, x, y, z) of the body at joint angles [J], rad."""
+        """Position [3] in m, and orientation [4] (w, x, y, z), of the body at joint angles [J] in rad."""
         quats = self._orientations(angles)
         pos = [jnp.sum(x) for x in _rotate(quats, self._to_body)]
         return jnp.stack(pos), jnp.sum(self._at_body * quats[-1][None], axis=-1)
 
     def site_motion(self, angles: Array, rates: Array) -> tuple[Array, Array]:
-        """Returns position [3], m, and velocity [3], m/s, of the site at joint angles [J], rad, and rates [J], rad/s."""
+        """Position [3] in m, and velocity [3] in m/s, of the site at joint angles [J] in rad and rates [J] in rad/s."""
         quats = self._orientations(angles)
         segments = _rotate(quats, self._to_site)
         axes = _rotate(quats[:-1], self._axes)
@@ -83,9 +82,9 @@ class Chain:
         return jnp.stack([jnp.sum(x) for x in segments]), jnp.stack([jnp.sum(x) for x in _cross(angular, segments)])
 
     def _orientations(self, angles: Array) -> Array:
-        """Returns the segments' orientations [S, 4] in the world's frame.
+        """Orientations [S, 4] of the segments in the world frame.
 
-        Sums take the place of dot products here and elsewhere, because these would have the learner's precision on a GPU.
+        Sums replace dot products here and elsewhere, because dot products would use the learner's precision on a GPU.
         """
         half = 0.5 * angles[:, None, None]
         steps = jnp.cos(half) * self._still + jnp.sin(half) * self._turned  # [J, 4, 4]
@@ -95,12 +94,12 @@ class Chain:
         return jnp.stack(quats)
 
 
-# Separate coordinates, because they compile faster than arrays that are split and stacked again.
+# Separate coordinates compile faster than arrays that are split and stacked again.
 _Vectors = Sequence[Array]  # x, y and z, each [S]
 
 
 def _rotate(quats: Array, vectors: np.ndarray) -> _Vectors:
-    """Returns `vectors` [S, 3] turned by the unit quaternions `quats` [S, 4] (w, x, y, z)."""
+    """Rotates `vectors` [S, 3] by the unit quaternions `quats` [S, 4] (w, x, y, z)."""
     w, *axis = (quats[:, index] for index in range(4))
     vector = list(vectors.T)
     twice = [2 * x for x in _cross(axis, vector)]
@@ -112,13 +111,13 @@ def _cross(a: _Vectors, b: _Vectors) -> _Vectors:
 
 
 def _rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Returns `vector` [3] turned by the unit quaternion `quat` [4] (w, x, y, z): q v q*."""
+    """Rotates `vector` [3] by the unit quaternion `quat` [4] (w, x, y, z): q v q*."""
     conjugate = quat * np.array([1.0, -1.0, -1.0, -1.0])
     return (_right(conjugate) @ _right(np.array([0.0, *vector])) @ quat)[1:]
 
 
 def _right(quat: np.ndarray) -> np.ndarray:
-    """Returns a matrix [4, 4] such that `_right(q) @ p` is the product p q of quaternions (w, x, y, z)."""
+    """Matrix [4, 4] such that `_right(q) @ p` is the product p q of quaternions (w, x, y, z)."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
@@ -128,8 +127,8 @@ def _float32(values: Any) -> np.ndarray:
 
 
 def quat_multiply(a: Array, b: Array) -> Array:
-    """Returns the rotation b followed by a, as quaternions [4] (w, x, y, z)."""
-    # A sum, not a dot product, whose precision on a GPU would be the learner's.
+    """Rotation b followed by a, as quaternions [4] (w, x, y, z)."""
+    # A sum, because a dot product would use the learner's precision on a GPU.
     w = a[0] * b[0] - jnp.sum(a[1:] * b[1:])
     return jnp.concatenate([w[None], a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])])
 
@@ -147,9 +146,9 @@ def quat_to_matrix(quat: Array) -> Array:
 
 
 def matrix_to_euler(matrix: Array) -> Array:
-    """Euler angles (a, b, c), rad, of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), the original's convention.
+    """Euler angles (a, b, c) in rad of a rotation matrix [3, 3] = Rx(a) Ry(b) Rz(c), as in gymnasium-robotics.
 
-    If b is a right angle, a and c turn about the same axis; then a is 0, as in the original.
+    If b is a right angle, a and c turn about the same axis, and a is set to 0.
     """
     cos_b = jnp.hypot(matrix[2, 2], matrix[1, 2])
     regular = cos_b > 4 * np.finfo(np.float32).eps
@@ -160,7 +159,7 @@ def matrix_to_euler(matrix: Array) -> Array:
 
 
 def integrate(qpos: Array, qvel: Array, dt: float) -> Array:
-    """Returns a free joint's coordinates [7] after `dt` s at velocity [6], as MuJoCo integrates them."""
+    """Coordinates [7] of a free joint after `dt` s at velocity [6], integrated as in MuJoCo."""
     half_angle = 0.5 * dt * jnp.linalg.norm(qvel[3:])
     x, y, z = 0.5 * dt * qvel[3:] * jnp.sinc(half_angle / jnp.pi)  # axis times sin of half the angle
     turn = jnp.stack([jnp.cos(half_angle), x, y, z])

@@ -14,22 +14,22 @@ from mjx_dher.types import Array, GoalObs, PRNGKey, PyTree
 
 @struct.dataclass
 class State:
-    """The state of an episode in progress."""
+    """State of an episode."""
 
     physics: PyTree  # the engine's state
     obs: GoalObs  # observation [D], achieved_goal [G], desired_goal [G]
-    reward: Array  # [] reward of the step that led to this state; 0 after a reset
-    success: Array  # [] 1.0 where the achieved goal is within reach of the desired goal, else 0.0
+    reward: Array  # [] reward of the last step; 0 after a reset
+    success: Array  # [] 1.0 if the goal is reached, else 0.0
     step: Array  # [] number of steps taken, int32
-    failed: Array | bool = False  # [] whether the physics blew up in this episode, which must not be learned from
+    failed: Array | bool = False  # [] whether the simulation diverged in this episode; do not learn from it
 
 
 class GoalEnv(abc.ABC):
     """A goal-conditioned environment.
 
-    `reset` and `step` are pure functions of their arguments and take no batch: use `jax.vmap`. An episode has
-    `episode_length` steps, and nothing resets itself, so no last observation is lost. If episodes can end early or rewards lie
-    outside [-1, 0], give the environment a `spec` (`types.EnvSpec`).
+    `reset` and `step` are pure functions of one environment; use `jax.vmap` for a batch. An episode has `episode_length`
+    steps. There is no automatic reset, so no last observation is lost. If episodes can end early or rewards lie outside [-1,
+    0], define `spec` (`types.EnvSpec`).
     """
 
     name: str
@@ -40,24 +40,26 @@ class GoalEnv(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, key: PRNGKey) -> State:
-        """Returns an initial state drawn with `key`."""
+        """Initial state, drawn with `key`."""
 
     @abc.abstractmethod
     def step(self, state: State, action: Array) -> State:
-        """Returns the state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
+        """State after one step with an action [A], which is clipped to [-1, 1]."""
 
     @abc.abstractmethod
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Returns the rewards [...] for `achieved_goal` [..., G] under `desired_goal` [..., G]."""
+        """Rewards [...] of `achieved_goal` [..., G] for `desired_goal` [..., G]."""
 
     def check(self) -> None:  # noqa: B027 - most have nothing to check
         """Raises ValueError if steps so far were wrong in a way that their results do not show.
 
-        Call it on the host once the steps are done, not while tracing.
+        Call it on the host after the steps, not while tracing.
         """
 
     def check_action(self, action: Array) -> Array:
-        """Returns `action` as float32; raises ValueError for a wrong shape or, outside `jit`, a value that is not finite."""
+        """Converts `action` to float32. Raises ValueError for a wrong shape or, outside `jit`, for values that are not
+        finite.
+        """
         shape = jnp.shape(action)
         if shape != (self.action_size,):
             raise ValueError(

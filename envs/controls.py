@@ -1,4 +1,4 @@
-"""Controls: an action moves joint servos, motors or mocap bodies, in the ranges that the model gives them."""
+"""Controls map actions to joint servos, motors or mocap bodies, within the ranges of the model."""
 
 from __future__ import annotations
 
@@ -24,12 +24,10 @@ _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS
 
 
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
-    """Indices whose name in one of the columns fits one of the patterns, such as "j1 finger*", in the columns' order.
-
-    A `Numbered` name fits only itself and "*".
+    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order.
 
     Raises:
-      ValueError: no name fits a pattern; the message lists the names.
+      ValueError: no name matches a pattern. The message lists the names.
     """
     chosen: set[int] = set()
     for pattern in str(patterns).split() or [""]:
@@ -45,25 +43,25 @@ def _fits(name: str, pattern: str) -> bool:
 
 
 class Control:
-    """Base class: maps `size` numbers of an action, in [-1, 1], to the inputs of an engine."""
+    """Base class: maps `size` numbers of an action, in [-1, 1], to inputs of an engine."""
 
     size: int
-    moved: list[str]  # names of the actuators or the mocap body that it moves
+    moved: list[str]  # names of the actuators or the mocap body
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        """Returns a copy for `model`. Raises ValueError for a name that the model lacks."""
+        """Copy for `model`. Raises ValueError for a name that the model lacks."""
         raise NotImplementedError
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
-        """Returns `controls` with the inputs for `action` [size]."""
+        """Updates the inputs `controls` for an action [size] in the state `physics`."""
         raise NotImplementedError
 
     def rest(self, ctrl: np.ndarray) -> np.ndarray:
-        """The action [size] that keeps the start, whose inputs are `ctrl` [nu]."""
+        """Action [size] that holds the start, whose inputs are `ctrl` [nu]."""
         return np.zeros(self.size, np.float32)
 
     def describe(self) -> dict[str, Any]:
-        """Kind, names of what it moves, and scale and limits, as JSON."""
+        """Kind, names of the moved parts, scale and limits, as JSON."""
         about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved)}
         for name in ("scale", "turn", "low", "high"):
             if name in vars(self):
@@ -75,8 +73,8 @@ class Actuators(Control):
     """Actuators of any kind: -1 and 1 are the ends of the actuator's ctrlrange.
 
     Args:
-      names: names of actuators or of their joints, separated by spaces; "*" and "?" stand for any characters.
-      together: whether one number of the action moves all of them, as the fingers of a gripper.
+      names: names of actuators or of their joints, separated by spaces; "*" and "?" match any characters.
+      together: whether one number of the action moves all of them, like the fingers of a gripper.
     """
 
     def __init__(self, names: str = "*", together: bool = False):
@@ -125,11 +123,11 @@ class JointPosition(Actuators):
 
 
 class JointDelta(JointPosition):
-    """Position servos, moved relative to the present joint positions: 1 stands for `scale` (rad, or m for a slide).
+    """Position servos, moved relative to the current joint positions: 1 moves the target by `scale` (rad, or m for a slide).
 
     Args:
-      names, together: as for `Actuators`.
-      scale: distance of the servo's target from the joint's position for an action of 1.
+      names, together: as in `Actuators`.
+      scale: distance between target and joint position for an action of 1.
     """
 
     def __init__(self, names: str = "*", scale: float = 0.1, together: bool = False):
@@ -164,13 +162,13 @@ class Torque(Actuators):
 
 
 class Mocap(Control):
-    """A mocap body that pulls a body by a weld: 1 moves its target `scale` m from the pulled body, along x, y or z.
+    """A mocap body that pulls a body by a weld: 1 moves its target `scale` m away from the body, along x, y or z.
 
     Args:
       body: name of the mocap body.
-      scale: m for an action of 1.
-      turn: rad that an action of 1 turns the target about the world's x, y or z; 0 keeps the orientation in the model, and
-        the action has three numbers instead of six.
+      scale: m per action of 1.
+      turn: rad per action of 1 about the world's x, y or z. 0 keeps the model's orientation, and the action has three numbers
+        instead of six.
     """
 
     def __init__(self, body: str, scale: float = 0.05, turn: float = 0.0):
@@ -209,12 +207,12 @@ class Mocap(Control):
 
 
 def is_servo(model: mujoco.MjModel, index: int) -> bool:
-    """Whether an actuator is a position servo: its force falls with the position."""
+    """Whether an actuator is a position servo, whose force decreases with the position."""
     return bool(model.actuator_biastype[index] == _AFFINE and model.actuator_biasprm[index, 1] < 0)
 
 
 def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Inputs [nu] that hold a configuration: servos of joints hold theirs, and all others get 0."""
+    """Inputs [nu] that hold a configuration: joint servos hold their joint, and others get 0."""
     ctrl = np.zeros(model.nu)
     for index in range(model.nu):
         if is_servo(model, index) and (joint := _joint(model, index)) >= 0:
@@ -225,7 +223,7 @@ def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def _joint(model: mujoco.MjModel, index: int) -> int:
-    """The hinge or slide that an actuator drives, or -1."""
+    """Hinge or slide driven by an actuator, or -1."""
     joint = int(model.actuator_trnid[index, 0]) if model.actuator_trntype[index] == _JOINT else -1
     return joint if joint >= 0 and int(model.jnt_type[joint]) in (2, 3) else -1
 

@@ -1,7 +1,7 @@
-"""The common part of the Fetch tasks: action, observation, goals, reward and reset, as functions of (qpos, qvel).
+"""Common part of the Fetch tasks: action, observation, goals, reward and reset, as functions of (qpos, qvel).
 
-The tasks follow gymnasium-robotics 1.4.2, version v4 of its Fetch environments, run on mujoco 3.11.0; constants named
-"settled" were measured there after the environment's own set-up (docs/fidelity.md).
+The tasks follow version v4 of the Fetch environments in gymnasium-robotics 1.4.2 on mujoco 3.11.0. Constants named "settled"
+were measured there after the environment's set-up (docs/fidelity.md).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from mjx_dher.envs.task import MujocoTask, Position
 from mjx_dher.types import Array, EnvSpec, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
-# Beyond either speed the physics has blown up.
+# Above either speed the simulation has diverged.
 MAX_OBJECT_SPEED = 10.0  # m/s
 MAX_JOINT_SPEED = 100.0  # rad/s, or m/s for a finger
 ACTION_SCALE = 0.05  # m that an action of 1 moves the target
-RESET_CANDIDATES = 64  # object positions drawn at once; with probability < 1e-6, all lie too close in any task
+RESET_CANDIDATES = 64  # object positions drawn per reset; all are too close with probability < 1e-6
 TIMESTEP = 0.002  # s
-DT = SUBSTEPS * TIMESTEP  # s; the observation gives velocities as displacements per step
+DT = SUBSTEPS * TIMESTEP  # s; observed velocities are displacements per step
 POINTING_DOWN = np.array([1.0, 0.0, 1.0, 0.0], np.float32)  # the gripper's orientation (w, x, y, z), not normalized
 ASSETS = Path(__file__).parent / "assets"
 
 
 @dataclasses.dataclass(frozen=True)
 class FetchTask:
-    """The numbers that differ between tasks (all lengths in m)."""
+    """Numbers that differ between tasks. Lengths are in m."""
 
     xml: str  # file in envs/assets
     arm_qpos: tuple[float, ...]  # [7] settled, rad, shoulder to wrist
@@ -52,7 +52,7 @@ class FetchTask:
 
     @property
     def goal_bounds(self) -> np.ndarray:
-        """Lowest and highest coordinates [2, 3] of the goals that a reset draws."""
+        """Lowest and highest coordinates [2, 3] of a reset's goals."""
         bounds = np.add(self.initial_grip_pos, self.target_offset) + self.target_range * np.array([[-1.0], [1.0]])
         if self.object_height is not None:
             bounds[:, 2] = self.object_height, self.object_height + self.max_goal_lift
@@ -60,16 +60,17 @@ class FetchTask:
 
     @property
     def object_bounds(self) -> np.ndarray:
-        """Lowest and highest coordinates [2, 3] at which a reset puts the object."""
+        """Lowest and highest coordinates [2, 3] of the object after a reset."""
         bounds = self.initial_grip_pos + self.object_range * np.array([[-1.0], [1.0]])
         bounds[:, 2] = self.object_height
         return bounds
 
 
 class FetchEnv(MujocoTask):
-    """The Fetch arm and, except for reaching, an object; the goal is a position of the object (or of the gripper).
+    """The Fetch arm and, except for Reach, an object. The goal is a position of the object (or of the gripper).
 
-    Arguments as for `MujocoTask`; the threshold is 0.05 m. Dense rewards count from -1, so distances must not exceed 1 m.
+    Arguments are as in `MujocoTask`, and the threshold is 0.05 m. Dense rewards must lie in [-1, 0], so distances must not
+    exceed 1 m.
     """
 
     task: ClassVar[FetchTask]
@@ -79,16 +80,16 @@ class FetchEnv(MujocoTask):
         return mujoco.MjModel.from_xml_path(str(ASSETS / self.task.xml))
 
     def bind(self) -> None:
-        """Looks up the arm, the fingers and the object. The models have been tried out: nothing else is."""
+        """Looks up arm, fingers and object. These models need no probes."""
         has_object = self.task.object_height is not None
         self.goal = Position("body:object" if has_object else "site:grip", *self.task.goal_bounds).bind(self.model)
         self.goal_size, self.goal_distance = self.goal.size, self.goal.distance
         self.observation_size = 25 if has_object else 10
         self.arm = Chain(self.model, body="gripper", site="grip")
         qpos, qvel = np.zeros(self.model.nq, np.float32), np.zeros(self.model.nv, np.float32)
-        # Not at rest: the original's own set-up ends with the gripper at a few cm/s.
+        # Not at rest: the original's set-up ends with the gripper at a few cm/s.
         qpos[self.arm.qpos], qvel[self.arm.qvel] = self.task.arm_qpos, self.task.arm_qvel
-        # Two finger joints, right and left. Without actuators they are blocked: put back after every step.
+        # Two finger joints, right and left. Without actuators they are reset after every step.
         self.has_fingers = any(self.model.joint(i).name == "finger_r" for i in range(self.model.njnt))
         self.drives_fingers = self.model.nu > 0
         if self.has_fingers:
@@ -98,7 +99,7 @@ class FetchEnv(MujocoTask):
         if has_object:
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
             self._object = Range(self._object_qpos.start, self._object_qvel.start, *self.task.object_bounds)
-            # After the physics blew up, the object is next to the gripper, as near as a reset would put it.
+            # After a divergence the object is next to the gripper, as near as a reset would put it.
             x, y, _ = self.task.initial_grip_pos
             qpos[self._object_qpos] = x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0
         self._rest: Any = Physics(qpos, qvel, warmstart=np.zeros_like(qvel), act=np.zeros(0, np.float32))  # type: ignore[arg-type]
@@ -112,11 +113,11 @@ class FetchEnv(MujocoTask):
         return dataclasses.replace(super().spec, reward_range=(-1.0, 0.0))
 
     def init_state(self, object_qpos: Array | None, desired_goal: Array) -> State:
-        """Returns the state at a given start, for example from a recorded episode. The arm starts as always.
+        """State at a given start, for example from a recorded episode. The arm starts as always.
 
         Args:
-          object_qpos: [7] object position, m, and orientation (w, x, y, z); None for a task without an object.
-          desired_goal: [3] m.
+          object_qpos: position [3] in m and orientation [4] (w, x, y, z) of the object, or None for a task without object.
+          desired_goal: goal [3] in m.
         """
         physics: Physics = jax.tree.map(jnp.asarray, self._rest)
         if object_qpos is not None:
@@ -133,8 +134,8 @@ class FetchEnv(MujocoTask):
         """Moves the gripper's target by 5 cm times `action[:3]` (x, y, z).
 
         `action[3]` opens and closes the fingers if actuators drive them. As in the original, targets are relative to the
-        present places of gripper and fingers, not to earlier targets, and the target's orientation lies half-way between the
-        gripper's and straight down.
+        current positions of gripper and fingers. The target's orientation lies half-way between the gripper's and straight
+        down.
         """
         pos, quat = self.arm.pose(self.observed(physics).qpos[self.arm.qpos])
         quat = quat + POINTING_DOWN
@@ -149,7 +150,7 @@ class FetchEnv(MujocoTask):
         return dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
 
     def is_sound(self, physics: Physics) -> Array:
-        """Whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
+        """Whether this is a possible state of the task, bool []. NaN is not."""
         qpos, qvel = physics.qpos, physics.qvel
         sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
         sound &= jnp.all(jnp.abs(qvel[self.arm.qvel]) < MAX_JOINT_SPEED)
@@ -160,11 +161,11 @@ class FetchEnv(MujocoTask):
         return sound
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        # Strict, unlike the reward: the original differs at a distance of exactly the threshold, so we do.
+        # Strict, unlike the reward, as in the original.
         return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
     def _sample_object(self, key: PRNGKey) -> Array:
-        """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` from it."""
+        """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` away."""
         task = self.task
         bound = task.object_range
         offsets = jax.random.uniform(key, (RESET_CANDIDATES, 2), jnp.float32, minval=-bound, maxval=bound)
@@ -175,9 +176,11 @@ class FetchEnv(MujocoTask):
         return jnp.concatenate([xy, jnp.array([task.object_height, 1.0, 0.0, 0.0, 0.0])])
 
     def sample_goal(self, key: PRNGKey) -> Array:
-        """Draws a goal [3] around the gripper plus the task's offset; with an object, at its height or (half of them) above."""
+        """Draws a goal [3] around the gripper plus the task's offset. With an object, half of the goals lie above its
+        height.
+        """
         task = self.task
-        # Scaled by `uniform`, whose result XLA rounds alike wherever it computes it: reset and first step give the same goal.
+        # Scaled by `uniform`, which XLA rounds equally everywhere, so reset and first step have the same goal.
         largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift], jnp.float32)
         drawn = jax.random.uniform(key, (4,), jnp.float32, minval=-largest, maxval=largest)
         goal = jnp.array(task.initial_grip_pos) + drawn[:3] + jnp.array(task.target_offset)
@@ -186,10 +189,10 @@ class FetchEnv(MujocoTask):
         return goal.at[2].set(task.object_height + jnp.maximum(drawn[3], 0.0))
 
     def observed(self, physics: Physics) -> Physics:
-        """Returns the physics from which the observation after a step is computed.
+        """Physics from which the observation after a step is computed.
 
-        If actuators drive the fingers, the original does not recompute positions after its last substep: gripper and object are
-        observed one substep (2 ms) late, while joint positions and all velocities are up to date.
+        If actuators drive the fingers, the original does not recompute positions after its last substep. Gripper and object
+        are then observed one substep (2 ms) late, while joint positions and all velocities are current.
         """
         if not self.drives_fingers:
             return physics
@@ -218,16 +221,16 @@ class FetchEnv(MujocoTask):
 def fetch_observation(
     grip_pos: Array, grip_vel: Array, object_qpos: Array, object_qvel: Array, finger_pos: Array, finger_vel: Array
 ) -> Array:
-    """Returns the original's observation vector [25].
+    """Observation vector [25] of the original.
 
     0-2 grip position, 3-5 object position, 6-8 object minus grip, 9-10 finger positions (right, left), 11-13 object Euler
-    angles, 14-16 object velocity minus grip velocity, 17-19 object angular velocity (world axes), 20-22 grip velocity,
-    23-24 finger velocities. Positions in m, angles in rad, velocities as displacement per step (x 0.04 s).
+    angles, 14-16 object velocity minus grip velocity, 17-19 object angular velocity (world axes), 20-22 grip velocity, 23-24
+    finger velocities. Positions in m, angles in rad, velocities as displacement per step (x 0.04 s).
 
     Args:
       grip_pos, grip_vel: [3] m, m/s.
       object_qpos: [7] position and quaternion (w, x, y, z).
-      object_qvel: [6] linear velocity in world axes, angular velocity in the object's own axes (MuJoCo's free joint).
+      object_qvel: [6] linear velocity in world axes, angular velocity in the object's axes (MuJoCo's free joint).
       finger_pos, finger_vel: [2] right, left; m, m/s.
     """
     rotation = quat_to_matrix(object_qpos[3:])
@@ -248,6 +251,6 @@ def fetch_observation(
 
 
 def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice, slice]:
-    """Returns the slices of qpos and qvel that hold `width` coordinates from `joint` on (7 and 6 for a free joint)."""
+    """Slices of qpos and qvel that hold `width` coordinates from `joint` on (7 and 6 for a free joint)."""
     qpos, qvel = int(model.joint(joint).qposadr[0]), int(model.joint(joint).dofadr[0])
     return slice(qpos, qpos + width), slice(qvel, qvel + (6 if width == 7 else width))

@@ -1,4 +1,4 @@
-"""Kinds of goals. Each defines size, distance, threshold, sampling range and drawing, and the goal that a state achieves."""
+"""Goal types. Each defines size, distance, threshold, sampling range, and the goal that a state achieves."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ _UNIT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Goal:
-    """Base class."""
+    """Base class of goals."""
 
     size: int  # G
     threshold: float  # largest distance at which the goal is reached
-    low: Any = None  # lowest and highest goals that `sample` draws and a hand may drag to, [G] or [3]
+    low: Any = None  # lowest and highest goals to draw or drag to, [G] or [3]
     high: Any = None
     place: Place | None = None  # the site or body of the goal
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
+        """Copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
         check_number("threshold of the goal", self.threshold, "(0, inf)", float)
         return copy.copy(self)
 
     def achieved(self, physics: Physics) -> Array:
-        """The goal [G] that a state achieves."""
+        """Goal [G] that a state achieves."""
         raise NotImplementedError
 
     def sample(self, key: PRNGKey) -> Array:
@@ -49,12 +49,12 @@ class Goal:
     distance: Any  # (achieved [..., G], desired [..., G]) -> [...]
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
-        """Marks that show a goal: balls, and bodies as ghosts."""
+        """Marks that show a goal [G] in a configuration `qpos` [nq]: balls, and bodies as ghosts."""
         raise NotImplementedError
 
 
 class Position(Goal):
-    """A position of a site or body, [3] m.
+    """Position of a site or body, [3] in m.
 
     Args:
       of: "site:NAME" or "body:NAME".
@@ -85,11 +85,11 @@ class Position(Goal):
 
 
 class Rotation(Goal):
-    """An orientation of a site or body: the first two columns of its rotation matrix, [6]. The distance is an angle, rad.
+    """Orientation of a site or body: the first two columns of its rotation matrix, [6]. The distance is an angle in rad.
 
     Args:
       of: "site:NAME" or "body:NAME".
-      axis: goals are turns about this axis [3] of the world; None for any orientation.
+      axis: axis [3] in the world about which goals turn, or None for any orientation.
       threshold: rad.
     """
 
@@ -132,13 +132,13 @@ class Rotation(Goal):
 
 
 class Pose(Goal):
-    """A position and an orientation of a site or body, [3 + 6]. It is reached if both thresholds are kept.
+    """Position and orientation of a site or body, [3 + 6]. Both thresholds must be met.
 
-    The distance is in m. An angle counts as `threshold / angle` m a radian, if that is more than the distance of the positions.
+    The distance is in m: the larger of the distance of the positions, and the angle times `threshold / angle` m per rad.
 
     Args:
-      of, low, high, threshold: as for `Position`.
-      axis, angle: as `axis` and `threshold` of `Rotation`.
+      of, low, high, threshold: as in `Position`.
+      axis, angle: as `axis` and `threshold` in `Rotation`.
     """
 
     size = 9
@@ -172,11 +172,11 @@ class Pose(Goal):
 
 
 class Joints(Goal):
-    """Positions of hinges and slides, [number of joints]. The distance is the largest difference of a joint, rad or m.
+    """Positions of hinges and slides, [number of joints]. The distance is the largest difference of a joint, in rad or m.
 
     Args:
-      names: names of joints, separated by spaces; "*" and "?" stand for any characters.
-      low, high: lowest and highest positions of goals, by default the joints' ranges.
+      names: names of joints, separated by spaces; "*" and "?" match any characters.
+      low, high: lowest and highest positions of goals. Default: the joints' ranges.
       threshold: rad or m.
     """
 
@@ -191,7 +191,7 @@ class Joints(Goal):
         limits = model.jnt_range[bound.joints].T.copy()
         unlimited = ~model.jnt_limited[bound.joints].astype(bool)
         if self.low is None and unlimited.any():
-            raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range: give low and high")
+            raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range; pass low and high")
         limits[:, unlimited] = [[-np.inf], [np.inf]]
         low, high = limits if self.low is None or self.high is None else (self.low, self.high)
         bound.low, bound.high = box("goal", bound.size, (low, high))
@@ -229,7 +229,7 @@ class Joints(Goal):
 
 
 def box(what: str, size: int, ends: Any) -> np.ndarray:
-    """Converts bounds, low and high, to float32 [2, size]. Raises ValueError if they are no finite numbers, low <= high."""
+    """Converts bounds, low and high, to float32 [2, size]. Raises ValueError unless they are finite and low <= high."""
     try:
         with np.errstate(over="ignore"):
             low, high = array = np.array(ends, np.float32).reshape(2, size)
@@ -241,7 +241,7 @@ def box(what: str, size: int, ends: Any) -> np.ndarray:
 
 
 def _ghost(place: Place, pos: np.ndarray, columns: np.ndarray) -> Mark:
-    """The body of a site or body that is at `pos` [3], with the first two columns [6] of its rotation matrix."""
+    """Body of a site or body at `pos` [3], with the first two columns [6] of its rotation matrix."""
     first, second = np.reshape(np.asarray(columns, float), (2, 3))
     mat = np.stack([first, second, np.cross(first, second)], axis=1) @ place.offset[1].T
     quat = np.zeros(4)

@@ -1,4 +1,4 @@
-"""Forward kinematics of any model in JAX: pose and motion of a site or body, as functions of qpos and qvel on every engine."""
+"""Forward kinematics of any model in JAX: pose and motion of a site or body from qpos and qvel, on every engine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Numbered(str):
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Names of a model's objects of a kind ("site", "body", "joint", "key", ...); "joint_2" if the third joint has none."""
+    """Names of a model's objects of a kind ("site", "body", "joint", "key", ...). Unnamed ones get names such as "joint_2"."""
     count = getattr(model, _COUNTS.get(kind, f"n{kind}"))
     return [getattr(model, kind)(i).name or Numbered(f"{kind}_{i}") for i in range(count)]
 
@@ -34,8 +34,8 @@ class Place:
     """A site or body, whose pose follows from the joints between the world and it.
 
     Args:
-      model: the compiled MJCF.
-      name: "site:NAME" or "body:NAME"; a plain NAME is that of a site, or else of a body.
+      model: compiled MJCF.
+      name: "site:NAME" or "body:NAME". A plain NAME means a site if it exists, else a body.
 
     Raises:
       ValueError: there is no such site or body, or a mocap body moves it.
@@ -64,20 +64,20 @@ class Place:
         self.joints = [joint for _, joints in self._links for joint in joints]
 
     def pose(self, qpos: Array) -> tuple[Array, Array]:
-        """Position [3], m, and rotation matrix [3, 3]."""
+        """Position [3] in m, and rotation matrix [3, 3]."""
         pos, mat = self._frames(qpos)[-1]
         return pos, mat
 
     def position(self, qpos: Array) -> Array:
-        """Position [3], m."""
+        """Position [3] in m."""
         return self.pose(qpos)[0]
 
     def rotation(self, qpos: Array) -> Array:
-        """The first two columns of the rotation matrix, [6]."""
+        """First two columns of the rotation matrix, [6]."""
         return self.pose(qpos)[1][:, :2].T.ravel()
 
     def motion(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        """Linear and angular velocity [3] each in the world's axes, m/s and rad/s."""
+        """Linear and angular velocity, [3] each in world axes, in m/s and rad/s."""
         *frames, (pos, _) = self._frames(qpos)
         if not self.joints:
             return jnp.zeros(3, jnp.float32), jnp.zeros(3, jnp.float32)
@@ -87,7 +87,7 @@ class Place:
         return jnp.sum(linear + jnp.cross(angular, arms), axis=0), jnp.sum(angular, axis=0)
 
     def _frames(self, qpos: Array) -> list[tuple[Array, Array]]:
-        """Position and matrix of each joint, behind its motion, and of the place at the end."""
+        """Position and matrix of each joint, after its motion, and of the place."""
         frames = []
         pos, mat = jnp.zeros(3, jnp.float32), jnp.eye(3, dtype=jnp.float32)
         for link, joints in self._links:
@@ -100,7 +100,7 @@ class Place:
 
 
 class Joint:
-    """A joint's numbers, and how it moves the frame that it is in."""
+    """A joint, and how it moves its frame."""
 
     def __init__(self, model: mujoco.MjModel, index: int):
         self.kind = int(model.jnt_type[index])
@@ -110,7 +110,7 @@ class Joint:
         self._across = np.cross(self.axis, np.eye(3)).T.astype(np.float32)  # `_across @ v` is the axis times v
 
     def move(self, pos: Array, mat: Array, qpos: Array) -> tuple[Array, Array]:
-        """The joint's anchor [3] and the matrix [3, 3] behind it, for those of the frame in front of it."""
+        """Anchor [3] of the joint, and the matrix [3, 3] behind it, from the frame `pos`, `mat` before it."""
         at = self.qpos
         if self.kind == FREE:
             return qpos[at : at + 3], quat_to_matrix(qpos[at + 3 : at + 7])
@@ -124,7 +124,7 @@ class Joint:
         return pos, mat + _times(mat, turn)
 
     def motion(self, mat: Array, qvel: Array) -> tuple[Array, Array]:
-        """The linear and the angular velocity [3] that the joint adds, at its anchor."""
+        """Linear and angular velocity [3] that the joint adds at its anchor."""
         still, at = jnp.zeros(3, jnp.float32), self.qvel
         if self.kind == FREE:
             return qvel[at : at + 3], _turn(mat, qvel[at + 3 : at + 6])
@@ -153,11 +153,11 @@ def _frame(pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _join(pos: Array, mat: Array, frame: tuple[np.ndarray, np.ndarray]) -> tuple[Array, Array]:
-    """The pose of a frame that is given in another one."""
+    """World pose of a frame given in another one."""
     return pos + _turn(mat, frame[0]), mat if (frame[1] == np.eye(3)).all() else _times(mat, frame[1])
 
 
-# Sums, not dot products, whose precision on a GPU would be the learner's.
+# Sums, because dot products would use the learner's precision on a GPU.
 def _turn(mat: Array, vector: Any) -> Array:
     return jnp.sum(mat * vector, axis=-1)
 

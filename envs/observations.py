@@ -17,10 +17,10 @@ KINDS = ("site", "body", "rot", "vel", "angvel", "qpos", "qvel")
 
 
 class Entry:
-    """One entry, or a difference "A - B" of entries. It maps physics to numbers [size].
+    """One entry, or a difference "A - B" of entries. Maps physics to numbers [size].
 
     Raises:
-      ValueError: the kind, or the site, body or joint, does not exist; or the sizes of a difference are not equal.
+      ValueError: the kind, site, body or joint does not exist, or the sizes of a difference are unequal.
     """
 
     def __init__(self, model: mujoco.MjModel, text: str):
@@ -29,7 +29,7 @@ class Entry:
         self._parts = [_Part(model, part.strip()) for part in text.split(" - ")]
         sizes = [part.size for part in self._parts]
         if len(set(sizes)) > 1:
-            raise ValueError(f"observation {text!r} must subtract as many numbers as there are; the sizes are {sizes}")
+            raise ValueError(f"observation {text!r} must subtract entries of equal sizes; got {sizes}")
         self.size = sizes[0]
         self.joints = self._parts[0].joints  # names of those whose coordinates it has
 

@@ -6,7 +6,9 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class PickAndPlace(FetchEnv):
-    """FetchPickAndPlace: as Push, with fingers that `action[3]` opens and closes; half of all goals lie up to 45 cm higher."""
+    """FetchPickAndPlace: like Push, but `action[3]` opens and closes the fingers, and half of the goals lie up to 45 cm
+    higher.
+    """
 
     name = "pick_and_place"
     task = FetchTask(

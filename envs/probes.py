@@ -1,4 +1,4 @@
-"""Cheap trials of a model before training: is it stable, and can the robot reach its goals?"""
+"""Cheap checks of a model before training: stability, and reachable goals."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from mjx_dher.envs.goals import Goal
 from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
 
-_SECONDS = 1.0  # of simulation, at most
+_SECONDS = 1.0  # most seconds to simulate
 _OVERLAP = 0.02  # m
 _ATTEMPTS, _ITERATIONS = 5, 40
 _BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seconds: float) -> None:
-    """Simulates the start, first held and then under random inputs.
+    """Simulates the start for up to `seconds`, first held by the inputs `ctrl` [nu] and then under random inputs.
 
     Raises:
-      ValueError: the simulation diverges; the message names the joint.
+      ValueError: the simulation diverges. The message names the joint.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -49,12 +49,12 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
 
 
 def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> None:
-    """Looks for poses that reach some goals; warns if it misses many.
+    """Searches for poses that reach some goals, from the configuration `start` [nq], and warns if many are missed.
 
-    Goals of bodies that a free or ball joint moves are not tried.
+    Goals of bodies that a free or ball joint moves are not tested.
 
     Raises:
-      ValueError: it finds a pose for none of the goals.
+      ValueError: no goal is reached.
     """
     place = goal.place
     if place is None or goal.low is None or not all(joint.kind in (HINGE, SLIDE) for joint in place.joints):
@@ -71,7 +71,7 @@ def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> Non
 
 
 def _distance(model: mujoco.MjModel, start: np.ndarray, place: Place, goal: np.ndarray) -> float:
-    """Distance, m, at which inverse kinematics from a few configurations ends."""
+    """Distance in m at which inverse kinematics from a few configurations ends."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     dofs = [joint.qvel for joint in place.joints]  # hinges and slides have one each
     joints = model.dof_jntid[dofs]

@@ -6,7 +6,7 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class Push(FetchEnv):
-    """FetchPush: the goal lies on the table, up to 15 cm from the gripper along x and along y."""
+    """FetchPush: the goal lies on the table, up to 15 cm from the gripper along x and y."""
 
     name = "push"
     task = FetchTask(

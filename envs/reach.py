@@ -6,7 +6,7 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class Reach(FetchEnv):
-    """FetchReach: the goal is a position of the grip point, up to 15 cm away along each axis; observation [10]."""
+    """FetchReach: the goal is a position of the grip point, up to 15 cm away along each axis. The observation is [10]."""
 
     name = "reach"
     task = FetchTask(

@@ -6,7 +6,7 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class Slide(FetchEnv):
-    """FetchSlide: a puck on a slippery table; the goal lies up to 30 cm around a point 40 cm ahead of the gripper."""
+    """FetchSlide: a puck on a slippery table. The goal lies up to 30 cm around a point 40 cm ahead of the gripper."""
 
     name = "slide"
     task = FetchTask(

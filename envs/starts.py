@@ -21,7 +21,7 @@ from mjx_dher.validation import check_number
 
 
 class Range(NamedTuple):
-    """Where a free body or a joint starts."""
+    """Range of a free body's or a joint's start."""
 
     qpos: int  # first index in qpos
     qvel: int  # first index in qvel
@@ -30,11 +30,11 @@ class Range(NamedTuple):
 
 
 class Start:
-    """A configuration, parts of which are drawn at each reset.
+    """Initial configuration, parts of which are drawn at each reset.
 
     Args:
-      keyframe: name of a keyframe of the model; None for the model's default configuration.
-      ranges: low and high, by the name of a free body ([3] m each, a position) or of a hinge or slide (rad or m). A start is
+      keyframe: name of a keyframe of the model, or None for the model's default configuration.
+      ranges: low and high, by the name of a free body (positions, [3] m each) or of a hinge or slide (rad or m). Starts are
         uniform between them.
       settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
     """
@@ -43,7 +43,7 @@ class Start:
         self.keyframe, self.ranges, self.settle = keyframe, dict(ranges or {}), settle
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        """Returns a copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
+        """Copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
         bound = copy.copy(self)
         check_number("settle of start", self.settle, "[0, 1000]")
         data = mujoco.MjData(model)
@@ -68,7 +68,7 @@ class Start:
         return bound
 
     def draw(self, key: PRNGKey) -> Array:
-        """Draws the configuration [nq] of a start."""
+        """Draws an initial configuration [nq]."""
         qpos = jnp.asarray(self.physics.qpos)
         for number, (at, _, low, high) in enumerate(self.drawn):
             part = jax.random.uniform(jax.random.fold_in(key, number), low.shape, jnp.float32, low, high)
@@ -81,7 +81,7 @@ class Start:
 
 
 def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
-    """First index in qpos and in qvel, and limits, of free bodies (3 numbers) and of hinges and slides (1) by name."""
+    """First index in qpos and in qvel, and limits, of free bodies (3 numbers) and of hinges and slides (1), by name."""
     places = {}
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))

@@ -44,27 +44,27 @@ __all__ = [
 
 
 class MujocoTask(GoalEnv):
-    """A goal-conditioned task from a model and a few declarations. Every method may be overridden.
+    """A goal-conditioned task from a model and a few declarations. You can override every method.
 
     Args:
       engine: "auto", "native", "jax" or "warp".
-      reward_type: "sparse" (0 if the goal is reached, else -1) or "dense" (minus the distance, without a lower bound).
-      distance_threshold: largest distance at which the goal is reached; None for the goal's own.
-      episode_length: steps of an episode; None for the class's.
+      reward_type: "sparse" (0 if the goal is reached, else -1) or "dense" (minus the distance, unbounded below).
+      distance_threshold: largest distance at which the goal is reached. Default: the goal's threshold.
+      episode_length: steps of an episode. Default: the class's.
       **engine_options: options of the engine; see `make_engine`.
 
     Raises:
-      ValueError: the model lacks a name that is declared, or it is unstable, or no pose of the robot reaches a goal.
+      ValueError: the model lacks a declared name or is unstable, or the robot cannot reach any goal.
     """
 
-    model: Any  # MJCF (a path, relative to the file of the class, or the text), MjSpec or MjModel; of an object, the MjModel
+    model: Any  # MJCF (text, or a path relative to the file of the class), MjSpec or MjModel; MjModel in an instance
     control: Control | Sequence[Control] = JointPosition()
     goal: Goal
     observations: Sequence[str] = ("qpos:*", "qvel:*")
     start: Start = Start()
     hz: float = 25.0  # actions per second
     episode_length: int = 50
-    max_speed: float = 1000.0  # rad/s or m/s; beyond it the physics has blown up
+    max_speed: float = 1000.0  # rad/s or m/s; the simulation has diverged if it is faster
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class MujocoTask(GoalEnv):
         return load_model(type(self), getattr(self, "model", None))
 
     def bind(self) -> None:
-        """Looks up the declared names in the model, and tries the model out."""
+        """Looks up the declared names in the model, and probes the model."""
         declared = self.control if isinstance(self.control, Sequence) else (self.control,)
         self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
         self.action_size = sum(part.size for part in self.parts)
@@ -135,17 +135,17 @@ class MujocoTask(GoalEnv):
 
     @property
     def goal_bounds(self) -> np.ndarray | None:
-        """Lowest and highest coordinates [2, 3] of goals, m, if they are positions."""
+        """Lowest and highest coordinates [2, 3] of goals in m, if they are positions."""
         return None if self.goal.low is None or self.goal.place is None else np.stack([self.goal.low, self.goal.high])
 
     @property
     def has_object(self) -> bool:
-        """Whether the start has a range for a free body, so that `with_object` can move it."""
+        """Whether the start has a range for a free body, which `with_object` can move."""
         return self._object is not None
 
     @property
     def object_bounds(self) -> np.ndarray | None:
-        """Lowest and highest coordinates [2, 3] at which a reset puts the first free body, m."""
+        """Lowest and highest coordinates [2, 3] in m of the first free body after a reset."""
         return None if self._object is None else np.stack(self._object[2:])
 
     def goal_marks(self, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
@@ -158,7 +158,7 @@ class MujocoTask(GoalEnv):
         return self.first_state(self.start_physics(start_key), self.sample_goal(goal_key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """Returns the first state of an episode that starts from `physics`, with a goal [G]."""
+        """First state of an episode that starts from `physics`, with a goal [G]."""
         obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
             physics=physics,
@@ -170,19 +170,19 @@ class MujocoTask(GoalEnv):
         )
 
     def with_goal(self, state: State, goal: Array) -> State:
-        """Returns the state with another desired goal [G]."""
+        """State with another desired goal [G]."""
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
         return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
 
     def step(self, state: State, action: Array) -> State:
         """Applies an action [A] for one step.
 
-        If the physics blows up or the action is not finite, the state goes back to the start, and `failed` stays True until
+        If the simulation diverges or the action is not finite, the state returns to the start, and `failed` stays True until
         `reset`.
         """
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         physics = self.advance(state.physics, action)
-        sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C takes an input that is NaN as 0
+        sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C treats NaN inputs as 0
         physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._rest)
         failed = state.failed | ~sound
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
@@ -196,7 +196,7 @@ class MujocoTask(GoalEnv):
         )
 
     def with_object(self, state: State, position: Array) -> State:
-        """Returns the state with the first free body in the ranges of the start at `position`, [3] m, at rest."""
+        """State with the start's first free body at rest at `position`, [3] in m."""
         assert self._object is not None
         at, dof, *_ = self._object
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
@@ -231,7 +231,7 @@ class MujocoTask(GoalEnv):
         return self.goal.sample(key)
 
     def controls(self, physics: Physics, action: Array) -> Controls:
-        """The engine's inputs for an action [A] in [-1, 1]. Inputs that no control has are those of the start."""
+        """Inputs of the engine for an action [A] in [-1, 1]. Inputs without a control keep their start values."""
         controls, begin = jax.tree.map(jnp.asarray, self._hold), 0
         for part in self.parts:
             controls = part.apply(physics, action[begin : begin + part.size], controls)
@@ -239,28 +239,28 @@ class MujocoTask(GoalEnv):
         return controls
 
     def advance(self, physics: Physics, action: Array) -> Physics:
-        """The physics one step later."""
+        """Physics one step later."""
         return self.engine.advance(physics, self.controls(physics, action))
 
     def observed(self, physics: Physics) -> Physics:
-        """The physics that is observed after a step: by default as it is."""
+        """Physics that is observed after a step. By default unchanged."""
         return physics
 
     def observe(self, physics: Physics) -> Array:
-        """The observation [D]; `layout` has the slices of its parts."""
+        """Observation [D]. `layout` has the slices of its parts."""
         return jnp.concatenate([entry(physics) for entry in self._entries])
 
     def achieved(self, physics: Physics) -> Array:
-        """The goal [G] that a state achieves."""
+        """Goal [G] that a state achieves."""
         return self.goal.achieved(physics)
 
     def observe_goal(self, physics: Physics, desired_goal: Array) -> GoalObs:
-        """Observation, achieved and desired goal, float32 also if JAX computes in 64 bits."""
+        """Observation, achieved and desired goal in float32, even if JAX computes in 64 bits."""
         observation, achieved = self.observe(physics).astype(jnp.float32), self.achieved(physics).astype(jnp.float32)
         return GoalObs(observation=observation, achieved_goal=achieved, desired_goal=desired_goal.astype(jnp.float32))
 
     def is_sound(self, physics: Physics) -> Array:
-        """Whether this can be a state of the task, []. Comparisons with NaN are false, so NaN never passes."""
+        """Whether this is a possible state of the task, bool []. NaN is not."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(physics)]
         return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < self.max_speed)
 
@@ -269,7 +269,7 @@ class MujocoTask(GoalEnv):
 
 
 def load_model(task: type, model: Any) -> mujoco.MjModel:
-    """Compiles the MJCF of a task class; a path is relative to the file of the class.
+    """Compiles the MJCF of a task class. A path is relative to the file of the class.
 
     Raises:
       ValueError: there is no such file, or MuJoCo rejects it.
@@ -289,7 +289,7 @@ def load_model(task: type, model: Any) -> mujoco.MjModel:
 
 
 def _folder(task: type) -> Path:
-    """Folder of the file that declares the model of a task class; the current one if there is no file, as in a notebook."""
+    """Folder of the file that declares a task's model, or the current one if there is no file, as in a notebook."""
     owner = next((base for base in task.__mro__ if "model" in vars(base)), task)
     try:
         return Path(inspect.getfile(owner)).parent
@@ -298,7 +298,7 @@ def _folder(task: type) -> Path:
 
 
 def substeps_of(hz: float, timestep: float) -> int:
-    """Timesteps of the model for each action. Raises ValueError if `hz` does not make a whole number of them."""
+    """Timesteps of the model per action. Raises ValueError if `hz` does not give a whole number."""
     check_number("hz", hz, "(0, inf)", float)
     substeps = round(1 / (hz * timestep))
     if substeps < 1 or abs(substeps * timestep * hz - 1) > 1e-6:
@@ -308,7 +308,7 @@ def substeps_of(hz: float, timestep: float) -> int:
 
 
 def _checked(field: str, value: Any, kind: type) -> Any:
-    """Returns `value`, or raises ValueError if it is of another kind."""
+    """Returns `value`. Raises ValueError if it is of another kind."""
     if not isinstance(value, kind):
         raise ValueError(f"{field} must be a {kind.__name__} object; got {value!r}")
     return value

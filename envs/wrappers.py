@@ -1,7 +1,7 @@
 """Wrappers for any environment: observation noise, action delay, action filter and frame stack. They compose.
 
-A wrapper is an environment itself. It has the members of the environment within, and its states have the fields of the states
-within. With the same key, both start the same episode.
+A wrapper is an environment. It has the members of the wrapped environment, and its states have the fields of the inner states.
+With the same key, both start the same episode.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from mjx_dher.validation import check_number
 
 __all__ = ["ActionDelay", "ActionFilter", "FrameStack", "ObservationNoise", "Wrapper", "WrapperState"]
 
-_KEY = 0x57524150  # the own key of the innermost wrapper is `fold_in(key, _KEY)`; the next one takes the next number
+_KEY = 0x57524150  # folded into the innermost wrapper's key; the next wrapper uses the next number
 
 
 @struct.dataclass
 class WrapperState:
-    """State of a wrapped environment. Other fields, such as `reward` and `physics`, are those of `inner`."""
+    """State of a wrapped environment. Other fields, such as `reward` and `physics`, come from `inner`."""
 
-    inner: PyTree  # the state within
+    inner: PyTree  # state of the inner environment
     obs: GoalObs
-    memory: PyTree  # the wrapper's own
+    memory: PyTree  # state of the wrapper
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "inner":  # while a copy is made, `inner` is missing
@@ -39,7 +39,7 @@ class WrapperState:
 
 
 class Wrapper:
-    """Base class: passes actions and observations on as they are. Goals, rewards and success stay those within."""
+    """Base class: passes actions and observations on unchanged. Goals, rewards and success come from the inner environment."""
 
     def __init__(self, env: Any):
         check_env_parts(env)
@@ -50,38 +50,38 @@ class Wrapper:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "env":
             raise AttributeError(name)
-        if name in ("init_state", "first_state"):  # they draw nothing, so the wrapper's own part would be missing
-            raise AttributeError(f"a wrapped environment has no {name}: it starts by reset(key)")
+        if name in ("init_state", "first_state"):  # they have no key for the wrapper's memory
+            raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
         own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
     def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
-        """Memory and observation after a reset that gave `observation`."""
+        """Memory and observation after a reset with `observation`."""
         return (), observation
 
     def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
-        """Memory, and the action [A] that is applied in place of `action`."""
+        """Memory, and the action [A] to apply in place of `action`."""
         return memory, action
 
     def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
-        """Memory, and what is observed in place of `observation`."""
+        """Memory, and the observation in place of `observation`."""
         return memory, observation
 
     def reset(self, key: PRNGKey) -> WrapperState:
-        """Returns an initial state; `key` draws the start as it does without the wrapper."""
+        """Initial state. `key` draws the same start as without the wrapper."""
         inner = self.env.reset(key)
         memory, observation = self.begin(jax.random.fold_in(key, self._number), inner.obs["observation"])
         return WrapperState(inner, _observed(inner, observation), memory)
 
     def step(self, state: WrapperState, action: Array) -> WrapperState:
-        """Returns the state one step later. `action` is [A]; values outside [-1, 1] are clipped."""
+        """State after one step with an action [A], which is clipped to [-1, 1]."""
         if jnp.shape(action) != (self.env.action_size,):
             raise ValueError(f"action must be [{self.env.action_size}]; got shape {list(jnp.shape(action))}")
         memory, action = self.act(state.memory, jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0))
         return self._seen(self.env.step(state.inner, action), memory)
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Rewards [...] of goals [..., G], those of the environment within."""
+        """Rewards [...] of goals [..., G] in the inner environment."""
         return self.env.compute_reward(achieved_goal, desired_goal)
 
     def _seen(self, inner: Any, memory: PyTree) -> WrapperState:
@@ -97,16 +97,16 @@ class Wrapper:
 
 
 def _observed(inner: Any, observation: PyTree) -> GoalObs:
-    """The goals of a state within, with another observation."""
+    """Goals of an inner state with another observation."""
     obs: Any = {**inner.obs, "observation": observation}
     return obs
 
 
 class ObservationNoise(Wrapper):
-    """Adds normal noise to the observation, drawn at each step. The achieved goal and rewards have none.
+    """Adds normal noise to the observation at each step. Achieved goals and rewards have no noise.
 
     Args:
-      obs_noise: standard deviation in [0, 1000]; a number, or [D] for an observation that is a vector.
+      obs_noise: standard deviation in [0, 1000], a number, or [D] for a vector observation.
     """
 
     def __init__(self, env: Any, obs_noise: Any):
@@ -118,7 +118,7 @@ class ObservationNoise(Wrapper):
         if self._std.ndim and self._std.shape != (spec.observation_size,):
             raise ValueError(f"obs_noise must be a number or [{spec.observation_size}]; got shape {list(self._std.shape)}")
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(spec.observation)):
-            raise ValueError(f"obs_noise takes observations of floats; they are {spec.observation}")
+            raise ValueError(f"obs_noise needs float observations; got {spec.observation}")
 
     def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
         return self.see(key, observation)
@@ -132,10 +132,10 @@ class ObservationNoise(Wrapper):
 
 
 class ActionDelay(Wrapper):
-    """Applies actions some steps late. Until the first one arrives, the environment's `rest_action` is, or 0.
+    """Applies actions some steps late. Before the first one arrives, it applies the environment's `rest_action`, or 0.
 
     Args:
-      action_delay: steps, at most 1000; (low, high) or the text "low-high" for a number that each reset draws.
+      action_delay: steps, at most 1000, or (low, high) or "low-high" to draw a number at each reset.
     """
 
     def __init__(self, env: Any, action_delay: int | tuple[int, int] | str):
@@ -151,16 +151,16 @@ class ActionDelay(Wrapper):
         return (steps, jnp.tile(self._rest, (self._most, 1))), observation
 
     def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
-        steps, earlier = memory  # earlier actions, the latest first
+        steps, earlier = memory  # earlier actions, latest first
         actions = jnp.concatenate([action[None], earlier])
         return (steps, actions[: self._most]), actions[steps]
 
 
 class ActionFilter(Wrapper):
-    """Applies y_t = c y_(t-1) + (1 - c) a_t in place of the action a_t. At first, y is `rest_action`, or 0.
+    """Applies y_t = c y_(t-1) + (1 - c) a_t in place of the action a_t. Initially y is `rest_action`, or 0.
 
     Args:
-      action_filter: c in [0, 1): 0 filters nothing, and 0.9 much.
+      action_filter: c in [0, 1). 0 filters nothing.
     """
 
     def __init__(self, env: Any, action_filter: float):
@@ -177,7 +177,7 @@ class ActionFilter(Wrapper):
 
 
 class FrameStack(Wrapper):
-    """Observes the last n observations, joined along their last axis, the latest first. A reset repeats the first one.
+    """Observes the last n observations, joined along their last axis, latest first. A reset repeats the first one.
 
     Args:
       frame_stack: n in [1, 100].
@@ -188,7 +188,7 @@ class FrameStack(Wrapper):
         check_number("frame_stack", frame_stack, "[1, 100]")
         self._frames = frame_stack
         if not all(leaf.shape for leaf in jax.tree.leaves(env_spec(env).observation)):
-            raise ValueError(f"frame_stack takes observations of vectors; they are {env_spec(env).observation}")
+            raise ValueError(f"frame_stack needs vector observations; got {env_spec(env).observation}")
 
     @property
     def observation_size(self) -> int:
@@ -197,7 +197,7 @@ class FrameStack(Wrapper):
 
     @property
     def spec(self) -> EnvSpec:
-        """The contract of the environment within, with larger observations."""
+        """Contract of the inner environment, with larger observations."""
         joined = jax.eval_shape(self._join, (self.env.spec.observation,) * self._frames)
         return dataclasses.replace(self.env.spec, observation=joined)
 

@@ -69,7 +69,7 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolic
     leaves, treedef = jax.tree.flatten(template)
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
     if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
-        raise ValueError(f"it does not hold what learner {spec.learner!r} with networks {spec.networks!r} needs")
+        raise ValueError(f"its arrays do not fit learner {spec.learner!r} with networks {spec.networks!r}")
     state = jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored])
     policy = LearnerPolicy(learner, state, spec.hparams, env_spec, read_interface(arrays))
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), env_spec.observation)

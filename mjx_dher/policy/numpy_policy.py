@@ -26,7 +26,7 @@ class TrainedPolicy(Protocol):
     @property
     def interface(self) -> Mapping[str, Any]: ...  # `contract.robot_interface` of the run's environment; {} if unknown
 
-    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # observations of one state or a batch -> actions [..., A]
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # actions [..., A] for one state or a batch
 
     def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any: ...  # the same without checks, in NumPy or JAX
 
