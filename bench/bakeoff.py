@@ -8,7 +8,7 @@
 Each learner and task is a sweep in a folder of its own (`python train.py plot bakeoff/paper-slide` draws it, too). The report
 is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. p is corrected over the arms that --arms names.
 A row a run is in bakeoff_runs.csv: `--runs FILE` goes on from it elsewhere, where the folders are not.
-docs/what_helps.md says beforehand what is compared.
+docs/experiments/bakeoff.md has the plan.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from bakeoff_arms import BAKEOFF, Experiment
 from bakeoff_report import ALPHA, Row, compare, corrected, forest
 from bakeoff_runs import by_arm, load
 
-IMAGES, SCRIPT, SEEDS = DOCS / "images", "docs/make_comparison_tables.py", 10
+EXPERIMENTS, IMAGES, SCRIPT, SEEDS = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py", 10
 COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
 
 
@@ -48,10 +48,10 @@ def repeat(*names: str) -> Experiment:
 
 REPEAT, THIRD = repeat("next_future", "energy", "td_error"), repeat("td_error")
 PAGES = (
-    Page(ABLATION, DOCS / "experiments" / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
-    Page(BAKEOFF, DOCS / "what_helps.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
-    Page(REPEAT, DOCS / "what_helps.md", DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
-    Page(THIRD, DOCS / "what_helps.md", DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
+    Page(ABLATION, EXPERIMENTS / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
+    Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
+    Page(REPEAT, EXPERIMENTS / "bakeoff_repeats.md", DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
+    Page(THIRD, EXPERIMENTS / "bakeoff_repeats.md", DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
 
 
@@ -93,7 +93,7 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
 def claims(rows: Sequence[Row], experiment: Experiment) -> str:
     """Returns the table of what is claimed of each arm, and the differences that were found; bold where they are shown."""
     lines = [[f"`{arm.name}`", arm.claim, arm.source, _found(arm.name, rows)] for arm in experiment.arms[1:]]
-    return table("arm | claimed | source | found here", lines)
+    return table("arm | claimed | source | found with our variant", lines)
 
 
 def _found(arm: str, rows: Sequence[Row]) -> str:
