@@ -47,11 +47,12 @@ def repeat(*names: str) -> Experiment:
 
 
 REPEAT, THIRD = repeat("next_future", "energy", "td_error"), repeat("td_error")
+_REPEATS = EXPERIMENTS / "bakeoff_repeats.md"
 PAGES = (
     Page(ABLATION, EXPERIMENTS / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
     Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
-    Page(REPEAT, EXPERIMENTS / "bakeoff_repeats.md", DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
-    Page(THIRD, EXPERIMENTS / "bakeoff_repeats.md", DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
+    Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
+    Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
 
 
