@@ -1,51 +1,82 @@
-"""Both paths of the engine warp beside native, on the models of tests/engine_models.py and on the guide's arm.
+"""Both paths of the engine warp beside native: how far apart their coordinates are, and how fast they run.
 
-    PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu]
+    PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu] [--models arm block_rotate_z] [--num-envs 1024 8192]
 
-Prints the largest distance of all coordinates within 8 environment steps of 10 timesteps, of 64 environments under random
-controls.
+A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest ones of all coordinates within 8
+environment steps of 64 environments under random controls; a task has its own number of timesteps a step. Speed is of 24 more
+steps: physics alone, from where those ended. Each line is printed as soon as it is measured.
 """
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import time
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from engine_models import MODELS, SUBSTEPS, play, start
-from timing import print_table
+from timing import machine
 
+from mjx_dher import envs
 from mjx_dher.envs.engines import make_engine
 
-ARM = Path(__file__).parent.parent / "docs" / "examples" / "arm.xml"
+FEW = 64  # environments that `native` plays, too
+HEAD = "| model | path | environments | env steps/s | first call, s | median distance | largest |"
+
+
+def load(name: str) -> tuple[mujoco.MjModel, int]:
+    """A model and its timesteps an environment step."""
+    if name in MODELS:
+        return mujoco.MjModel.from_xml_string(MODELS[name]), SUBSTEPS
+    if name.endswith(".xml"):
+        return mujoco.MjModel.from_xml_path(name), SUBSTEPS
+    env = envs.make(name, engine="native")
+    return env.model, env.engine._substeps
+
+
+def measure(engine, model, num_envs: int) -> tuple[float, float, np.ndarray]:
+    """Environment steps a second, seconds of the first call, and coordinates [64, 8, nq]."""
+    first, controls = start(model, (FEW,))
+    many = lambda x: jnp.tile(x, (num_envs // FEW, *([1] * (x.ndim - 1))))  # noqa: E731
+    first, controls = jax.tree.map(many, first), jax.tree.map(many, controls)
+    played = jax.jit(jax.vmap(lambda *given: play(engine, *given)))
+    began = time.perf_counter()
+    states = jax.block_until_ready(played(first, controls))
+    compiled = time.perf_counter() - began
+    qpos = np.asarray(states.qpos[:FEW])
+    began = time.perf_counter()
+    for _ in range(3):
+        states = played(jax.tree.map(lambda x: x[:, -1], states), controls)
+    jax.block_until_ready(states)
+    engine.check()
+    return 24 * num_envs / (time.perf_counter() - began), compiled, qpos
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--allow-cpu", action="store_true")
+    parser.add_argument("--models", nargs="+", default=[*MODELS, "docs/examples/arm.xml"])
+    parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
+    parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
     args = parser.parse_args()
-    models = {name: mujoco.MjModel.from_xml_string(xml) for name, xml in MODELS.items()}
-    models["guide's arm"] = mujoco.MjModel.from_xml_path(str(ARM))
-    rows = []
-    for name, model in models.items():
-        first, controls = start(model, (64,))
-        seen = {}
-        for path in ("native", "fused", "graph"):
-            options = {} if path == "native" else {"path": path, "allow_cpu": args.allow_cpu}
+    print(f"{machine()}\n\n{HEAD}\n|{'---|' * 7}", flush=True)
+    for name in args.models:
+        model, substeps = load(name)
+        native = measure(make_engine("native", model, substeps), model, FEW)
+        print(f"| {name} | native | {FEW} | {native[0]:,.0f} | {native[1]:.1f} | | |", flush=True)
+        for path in args.paths:
             try:
-                engine = make_engine("native" if path == "native" else "warp", model, SUBSTEPS, **options)
-            except ValueError:
-                continue  # the kernel leaves out a feature
-            played = jax.jit(jax.vmap(lambda *given, engine=engine: play(engine, *given)))
-            seen[path] = np.asarray(played(first, controls).qpos)
-            engine.check()
-        native = seen.pop("native")
-        for path, qpos in seen.items():
-            error = np.abs(qpos - native).max(axis=(1, 2))
-            rows.append((name, path, f"{np.median(error):.1e}", f"{error.max():.1e}"))
-    print_table(("model", "path", "median distance", "largest"), rows)
+                engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu)
+            except ValueError as error:
+                print(f"| {name} | {path} | {error} | | | | |", flush=True)
+                continue
+            for num_envs in args.num_envs:
+                rate, compiled, qpos = measure(engine, model, num_envs)
+                error = np.abs(qpos - native[2]).max(axis=(1, 2))
+                distances = f"{np.median(error):.1e} | {error.max():.1e}"
+                print(f"| {name} | {path} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,10 @@
     python bench/throughput.py [--env push pick_and_place slide] [--engines native jax] [--num-envs 16 32 128]
 
 On a GPU: --engines warp --num-envs 2048 8192 32768. A custom task is module:attribute. --path chooses how warp runs the model
-(both: --path fused graph), and --random plays random actions in place of the policy's.
+(both: --path fused graph), and --random plays random actions in place of the policy's. Each line is printed as soon as it is
+measured. Hands, each case in less than a minute after kernels are compiled:
+
+    python bench/throughput.py --env block_rotate_z --engines warp --path fused graph --num-envs 1024 8192 --random --repeats 2
 """
 
 from __future__ import annotations
@@ -13,14 +16,14 @@ import itertools
 import time
 
 import jax
-from timing import median_seconds, print_table
+from timing import machine, median_seconds
 
 from mjx_dher import Config, HParams, envs, learners
 from mjx_dher.contract import env_spec
 from mjx_dher.rollout import rollout
 
 
-def measure(task: str, engine: str, num_envs: int, path: str, random: bool, repeats: int = 5) -> tuple[str, float, float]:
+def measure(task: str, engine: str, num_envs: int, path: str, random: bool, repeats: int) -> tuple[str, float, float]:
     """The engine and its path, environment steps a second, and seconds of the first call, which compiles."""
     hparams, env = HParams(), envs.make(task, engine=engine, **({"path": path} if engine == "warp" else {}))
     learner = learners.make("ddpg", Config(), env_spec(env))
@@ -53,12 +56,12 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", default=[16, 32, 128])
     parser.add_argument("--path", nargs="+", default=["auto"], choices=["auto", "fused", "graph"])
     parser.add_argument("--random", action="store_true", help="random actions")
+    parser.add_argument("--repeats", type=int, default=5, help="episodes that are timed")
     args = parser.parse_args()
-    rows = []
+    print(f"{machine()}\n\n| task | engine | num_envs | env steps/s | first call, s |\n|{'---|' * 5}", flush=True)
     for task, engine, num_envs, path in itertools.product(args.env, args.engines, args.num_envs, args.path):
-        name, rate, compiled = measure(task, engine, num_envs, path, args.random)
-        rows.append((task, name, num_envs, f"{rate:,.0f}", f"{compiled:.1f}"))
-    print_table(("task", "engine", "num_envs", "env steps/s", "first call, s"), rows)
+        name, rate, compiled = measure(task, engine, num_envs, path, args.random, args.repeats)
+        print(f"| {task} | {name} | {num_envs} | {rate:,.0f} | {compiled:.1f} |", flush=True)
 
 
 if __name__ == "__main__":
