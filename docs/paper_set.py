@@ -1,7 +1,7 @@
 """The comparisons of the set that bench/paper.py runs, stated before it has run, and what ten seeds can show in it.
 
-A family is a question; p is corrected by Holm's method within it. The least p of ten pairs is 2/1024, so a family of more than
-25 comparisons could show nothing.
+A family is a question; p is corrected by Holm's method within it, and beside it by Westfall and
+Young's sign flips. The least p of ten pairs is 2/1024, so a family of more than 25 comparisons could show nothing by Holm.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ FAMILIES: dict[str, list[Comparison]] = {
     ],
     "eventful": [Comparison(task, f"eventful_{task}", "future, priority_fraction 0.5") for task in NAMES],
 }
-HEAD = "question | task | setting | against | epochs | mean success | 95 % interval | p | p, corrected | verdict"
+HEAD = (
+    "question | task | setting | against | epochs | mean success | 95 % interval | p | p, corrected | p, joint flips | verdict"
+)
 
 
 def load_set(folder: Path) -> dict[str, Sweeps]:
@@ -118,6 +120,7 @@ class Compared(NamedTuple):
     difference: Difference
     epochs: int
     p: float  # corrected over the family, in which comparisons that have not been run have a p of 1
+    joint: float  # p by joint sign flips over the family's comparisons that have been run
 
 
 def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
@@ -126,9 +129,11 @@ def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
     for family, comparisons in FAMILIES.items():
         ready = [c for c in comparisons if {(c.sweep, c.setting), _baseline(c)} <= set(data.get(c.task, {}))]
         differences = [_compare(data[c.task], c) for c in ready]
-        p_values = [d.p for d, _ in differences]
-        corrected = stats.holm(p_values, len(comparisons))
-        found[family] = [Compared(c, *d, p) for c, d, p in zip(ready, differences, corrected)]
+        corrected = stats.holm([d.p for d, _ in differences], len(comparisons))
+        most = max((len(d.each) for d, _ in differences), default=0)
+        each = [np.pad(d.each, (0, most - len(d.each)), constant_values=np.nan) for d, _ in differences]
+        joint = stats.westfall_young(each) if each else []
+        found[family] = [Compared(c, *d, p, j) for c, d, p, j in zip(ready, differences, corrected, joint)]
     return found
 
 
@@ -136,9 +141,9 @@ def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
     """A row for each comparison whose curves are complete."""
     found = []
     for family, results in compared(data).items():
-        for c, d, epochs, p in results:
+        for c, d, epochs, p, joint in results:
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
-            found.append([family, *cells, number(p), verdict(d.low, d.high, p)])
+            found.append([family, *cells, number(p), number(joint), verdict(d.low, d.high, p)])
     return found
 
 

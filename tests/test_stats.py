@@ -131,6 +131,33 @@ def test_paired_p_value_by_hand():
             stats.paired_p_value(a, b)
 
 
+def test_westfall_young_by_hand():
+    """Of two comparisons, three seeds each. All eight flips: |sum| of 1, 2, 3 and of 1, 1, -1, by t."""
+    first, second = [1.0, 2.0, 3.0], [1.0, 1.0, -1.0]
+    # |t| of the first: 3.46 for the two flips with all signs alike, else 1.31 (sum 4), 0.56 (2) or 0 (0), two flips each.
+    # |t| of the second: 0.5 for sums of 1 (six flips), infinite for sums of 3 (two flips, in which the first sums to 0).
+    assert stats.westfall_young([first]) == [pytest.approx(2 / 8)] == [stats.paired_p_value(first, np.zeros(3))]
+    # 3.46 or more: two flips of the first, two of the second. 0.5 or more: all eight flips of the second.
+    assert stats.westfall_young([second, first]) == pytest.approx([1.0, 4 / 8])
+    # Without its third seed, the second has an infinite t in four flips.
+    assert stats.westfall_young([first, [*second[:2], np.nan]])[0] == pytest.approx(4 / 8)
+    for wrong in (first, [[1.0, np.inf]], [[1.0, np.nan]], np.zeros((1, 1))):
+        with pytest.raises(ValueError, match="differences"):
+            stats.westfall_young(wrong)
+
+
+def test_westfall_young_is_no_stricter_than_holm_and_keeps_the_error_rate():
+    rng = np.random.default_rng(0)
+    wrong = 0
+    for _ in range(300):
+        differences = rng.normal(size=(6, 8)) + rng.normal(size=8)  # dependent, and no effect
+        wrong += min(stats.westfall_young(differences)) < 0.05
+    assert wrong / 300 < 0.08  # 0.05, and two and a half standard errors
+    effects = rng.normal(size=(6, 10)) + 2 * np.arange(6)[:, None]
+    p_values = [stats.paired_p_value(row, np.zeros(10)) for row in effects]
+    assert np.mean(stats.westfall_young(effects)) < np.mean(stats.holm(p_values))
+
+
 def test_holm():
     """Holm's procedure by hand: the least times 3, the next times 2 and not below it, the last as it is."""
     assert stats.holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
