@@ -18,8 +18,8 @@ from mjx_dher.envs.engines.pairs import all_pairs
 WELDED = """
 <mujoco>{}<worldbody><body name="t" mocap="true"/><body name="b"><joint name="j"/><geom name="g" type="{}" size="1 1 1"
 contype="0" conaffinity="0"/></body><geom name="o" type="box" size="1 1 1" contype="0" conaffinity="0"/></worldbody>
-<equality><weld body1="t" body2="b" relpose="0 0 0 1 0 0 0"/></equality>
-<contact><pair geom1="g" geom2="o" condim="{}"/></contact></mujoco>
+<option>{}</option><equality><weld body1="t" body2="b" relpose="0 0 0 1 0 0 0"/></equality>
+<contact><pair geom1="g" geom2="o" gap="{}"/></contact></mujoco>
 """
 
 OFF_CENTRE = """
@@ -39,8 +39,8 @@ FEW = """
 """
 
 
-def welded(extra="", shape="box", condim=3):
-    return mujoco.MjModel.from_xml_string(WELDED.format(extra, shape, condim))
+def welded(extra="", shape="box", options="", gap=0.0):
+    return mujoco.MjModel.from_xml_string(WELDED.format(extra, shape, options, gap))
 
 
 def test_unsupported_features_are_named_with_their_elements():
@@ -48,7 +48,7 @@ def test_unsupported_features_are_named_with_their_elements():
     cases = [
         (welded(shape="ellipsoid"), ["contacts of ellipsoid and box", "'g'", "'o'"]),
         (mujoco.MjModel.from_xml_string(OFF_CENTRE), ["free bodies", "implicitfast", "'f'"]),
-        (welded(condim=6), ["rolling friction", "'g'"]),
+        (welded(shape="cylinder", options='<flag nativeccd="disable"/>', gap=0.1), ["gaps of cylinders", "'g'"]),
         (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
         (welded('<option integrator="RK4"/>'), ["integrator"]),
         (welded('<option cone="elliptic"/>'), ["elliptic"]),
@@ -109,10 +109,9 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
     assert len(checked) > 30
     assert {
         "tendon_stiffness",
-        "geom_gap",
         "geom_surfacevel",
         "actuator_armature",
-        "pair_solreffriction",
+        "pair_adhesion",
         "opt.disableactuator",
     } <= {*checked}
     for name in checked:

@@ -28,8 +28,7 @@ _WORDS = {
     "body_gravcomp": "gravity compensation",
     "dof_dampingpoly": "damping that is not linear",
     "jnt_stiffnesspoly": "springs that are not linear",
-    "pair_gap": "contacts with a gap",
-    "pair_solreffriction": "contacts with a softness of friction",
+    "pair_adhesion": "contacts that stick",
 }
 _NEUTRAL = """
 <mujoco><worldbody><body name="t" mocap="true"/><body name="b"><joint name="j"/><geom name="g" size="1"/></body>

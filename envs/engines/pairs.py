@@ -11,6 +11,7 @@ _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"
 # Most contacts of two geoms, in the order of MuJoCo's types; of a sphere or an ellipsoid 1, and of others that are missing 8.
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
 _MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2}
+_LEAST_FRICTION = 1e-5  # MuJoCo's
 _MANY = 50  # of height fields and signed distance fields
 
 
@@ -56,6 +57,7 @@ class Pairs(NamedTuple):
 def all_pairs(model: mujoco.MjModel) -> Pairs:
     """The pairs that a model lists, and those that meet otherwise, with numbers mixed from their geoms' as in MuJoCo C."""
     listed = [getattr(model, f"pair_{name}") for name in Pairs._fields]
+    listed[Pairs._fields.index("friction")] = np.maximum(model.pair_friction, _LEAST_FRICTION)
     others = meeting(model)
     if not len(others):
         return Pairs(*listed)
@@ -75,7 +77,7 @@ def all_pairs(model: mujoco.MjModel) -> Pairs:
         others[:, 1],
         np.where(counts, model.geom_condim[others], 0).max(axis=1),
         model.geom_margin[others].sum(axis=1),
-        np.maximum(friction[:, [0, 0, 1, 2, 2]], 1e-5),
+        np.maximum(friction[:, [0, 0, 1, 2, 2]], _LEAST_FRICTION),
         np.where(leads.any(axis=1, keepdims=True), led, blend),
         (share * model.geom_solimp[others]).sum(axis=1),
     )

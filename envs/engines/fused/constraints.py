@@ -10,7 +10,6 @@ from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, So
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
-_MOST = wp.constant(6)  # edges of a pyramid of condim 4, which has most
 _TINY = wp.constant(1e-15)  # MuJoCo's smallest number
 
 
@@ -186,10 +185,14 @@ def limit(
 
 
 @wp.func
-def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsules: bool, thread: int, threads: int):
+def touch(
+    bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsules: bool, rolling: bool, thread: int, threads: int
+):
     """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent.
 
-    `capsules` says whether there may be some on planes.
+    Args:
+      capsules: whether there may be some on planes.
+      rolling: whether there may be rolling friction.
     """
     nv = dofs.number
     for c in range(memory.counts[0]):
@@ -202,7 +205,12 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsul
         first = tangent(normal)
         if capsules:
             first = tangent_of(contacts, memory, pair, normal)
-        second = friction[1] * wp.cross(normal, first)
+        second = wp.cross(normal, first)
+        roll1, roll2 = wp.vec3(), wp.vec3()
+        if rolling:
+            roll1 = contacts.rolling[pair][0] * first
+            roll2 = contacts.rolling[pair][1] * second
+        second = friction[1] * second
         first = friction[0] * first
         turning = friction[2] * normal
         moves2 = bodies.moved_by[contacts.geom_body[contacts.geom2[pair]]]
@@ -221,20 +229,22 @@ def touch(bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsul
                         aside = wp.dot(velocity, first)
                     elif k == 1:
                         aside = wp.dot(velocity, second)
+                    elif rolling and k > 2:
+                        aside = wp.dot(wp.spatial_top(motion), wp.where(k == 3, roll1, roll2))
                     memory.jacobian[(row + 2 * k) * nv + i] = along + aside
                     memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
     sync(threads)
 
 
 @wp.func
-def press(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
-    """Sets weights and reference accelerations of the rows of contacts."""
+def press(dofs: Dofs, contacts: Contacts, memory: Memory, most: int, thread: int, threads: int):
+    """Sets weights and reference accelerations of the rows of contacts, of which each has at most `most`."""
     nv = dofs.number
-    for at in range(thread, _MOST * memory.counts[0], threads):
-        s = memory.touching[at // _MOST]
+    for at in range(thread, most * memory.counts[0], threads):
+        s = memory.touching[at // most]
         pair = contacts.pair[s]
-        row = memory.slot[at // _MOST] + at % _MOST
-        if at % _MOST < _edges(contacts.dim[pair]):
+        row = memory.slot[at // most] + at % most
+        if at % most < _edges(contacts.dim[pair]):
             depth = memory.distance[s] - contacts.margin[pair]
             velocity = float(0.0)
             for i in range(nv):

@@ -20,6 +20,7 @@ from mjx_dher.envs.engines.fused.model import (
     Sparse,
     World,
 )
+from mjx_dher.envs.engines.fused.near import keep, memory_of, near_pairs
 from mjx_dher.envs.engines.fused.round import collide_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.sparse import ask_sparse
@@ -85,32 +86,6 @@ def _forces(
 
 
 @wp.func
-def _constraints(
-    world: World,
-    bodies: Bodies,
-    dofs: Dofs,
-    contacts: Contacts,
-    memory: Memory,
-    lost: wp.array(dtype=int),  # type: ignore[valid-type]
-    capsules: bool,
-    warps: int,
-    thread: int,
-    threads: int,
-):
-    """Computes the rows of constraints."""
-    gather(warps)
-    number(world, dofs, contacts, memory, lost, thread, threads)
-    gather(warps)
-    weld(world, bodies, dofs, memory, thread, threads)
-    gather(warps)
-    limit(dofs, contacts, memory, thread, threads)
-    gather(warps)
-    touch(bodies, dofs, contacts, memory, capsules, thread, threads)
-    gather(warps)
-    press(dofs, contacts, memory, thread, threads)
-
-
-@wp.func
 def _go_on(
     world: World,
     bodies: Bodies,
@@ -136,18 +111,94 @@ def _go_on(
     integrate(world, bodies, memory, thread, threads)
 
 
+def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
+    """Returns the function that finds contacts, for kinds of geom pairs. See `make`."""
+    boxes, cylinders, round_ones = BOX_BOX in kinds, CYLINDER_BOX in kinds, any(kind >= PLANE_SPHERE for kind in kinds)
+
+    @wp.func
+    def collide(
+        contacts: Contacts,
+        memory: Memory,
+        layout: Layout,
+        spare: wp.array(dtype=float),  # type: ignore[valid-type]
+        lost: wp.array(dtype=int),  # type: ignore[valid-type]
+        thread: int,
+        threads: int,
+    ) -> Contacts:
+        """Finds contacts, and returns `contacts` with their pairs."""
+        near, scratch = contacts, memory
+        if wp.static(not few):
+            gather(wp.static(warps))
+            near = near_pairs(contacts, memory, layout, spare, lost, thread, threads)
+            scratch = memory_of(contacts, memory, layout, spare, threads)
+        gather(wp.static(warps))
+        collide_with_planes(near, scratch, thread, threads)
+        if wp.static(boxes):
+            gather(wp.static(warps))
+            collide_boxes(near, scratch, thread, threads)
+        if wp.static(cylinders):
+            gather(wp.static(warps))
+            collide_cylinders(near, scratch, thread, threads)
+        if wp.static(round_ones):
+            gather(wp.static(warps))
+            collide_round(near, scratch, thread, threads)
+        held = contacts
+        if wp.static(not few):
+            gather(wp.static(warps))
+            held = keep(contacts, near, scratch, memory, layout, spare, lost, thread, threads)
+        return held
+
+    return collide
+
+
+def _constraining(kinds: tuple[int, ...], edges: int, few: bool, warps: int) -> Any:
+    """Returns the function that finds contacts and computes the rows of constraints. See `make`."""
+    capsules, collide = PLANE_CAPSULE in kinds, _collision(kinds, few, warps)
+
+    @wp.func
+    def constrain(
+        world: World,
+        bodies: Bodies,
+        dofs: Dofs,
+        contacts: Contacts,
+        memory: Memory,
+        layout: Layout,
+        spare: wp.array(dtype=float),  # type: ignore[valid-type]
+        lost: wp.array(dtype=int),  # type: ignore[valid-type]
+        thread: int,
+        threads: int,
+    ):
+        held = collide(contacts, memory, layout, spare, lost, thread, threads)
+        gather(wp.static(warps))
+        number(world, dofs, held, memory, lost, thread, threads)
+        gather(wp.static(warps))
+        weld(world, bodies, dofs, memory, thread, threads)
+        gather(wp.static(warps))
+        limit(dofs, held, memory, thread, threads)
+        gather(wp.static(warps))
+        touch(bodies, dofs, held, memory, wp.static(capsules), wp.static(edges > 6), thread, threads)
+        gather(wp.static(warps))
+        press(dofs, held, memory, wp.static(edges), thread, threads)
+
+    return constrain
+
+
 @functools.cache
-def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...], has_sparse: bool) -> Any:
+def make(
+    floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...], edges: int, few: bool, has_sparse: bool
+) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
 
     Args:
-      floats: memory of an environment.
+      floats: memory of an environment; unused on a CPU.
       threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
       kinds: kinds of geom pairs in the model; code for other kinds is left out.
+      edges: most edges that a contact's friction pyramid has.
+      few: whether there is memory for the contacts of all pairs at once; else those that are near are looked for.
       has_sparse: whether the model has rows of `Sparse`.
     """
     shared = warps * (32 // threads_per_env) * floats
-    capsules, round_ones = PLANE_CAPSULE in kinds, any(kind >= PLANE_SPHERE for kind in kinds)
+    constrain = _constraining(kinds, edges, few, warps)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -176,23 +227,13 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[in
         threads = wp.static(threads_per_env)  # so that the compiler knows them
         if wp.static(shared > 0):
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
-        memory = carve(layout, spare[env % spare.shape[0]], threads)
+        own = spare[env % spare.shape[0]]
+        memory = carve(layout, own, threads)
         _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], thread, threads)
         for _substep in range(substeps):
             _forces(world, bodies, dofs, memory, inputs[env], wp.static(warps), thread, threads)
-            gather(wp.static(warps))
-            collide_with_planes(contacts, memory, thread, threads)
-            if wp.static(BOX_BOX in kinds):
-                gather(wp.static(warps))
-                collide_boxes(contacts, memory, thread, threads)
-            if wp.static(CYLINDER_BOX in kinds):
-                gather(wp.static(warps))
-                collide_cylinders(contacts, memory, thread, threads)
-            if wp.static(round_ones):
-                gather(wp.static(warps))
-                collide_round(contacts, memory, thread, threads)
+            constrain(world, bodies, dofs, contacts, memory, layout, own, lost, thread, threads)
             has = wp.static(has_sparse)
-            _constraints(world, bodies, dofs, contacts, memory, lost, wp.static(capsules), wp.static(warps), thread, threads)
             _go_on(world, bodies, dofs, sparse, memory, inputs[env], has, wp.static(nv), wp.static(warps), thread, threads)
         _end(memory, qpos[env], qvel[env], guess[env], thread, threads)
 

@@ -75,6 +75,7 @@ class Contacts:
     geom_mat: _mat33s
     geom_size: _vec3s
     geom_reach: _floats  # radius of a sphere around it
+    geom_half: _vec3s  # half lengths of a box around it
     pairs: int
     geom1: _ints
     geom2: _ints
@@ -84,11 +85,14 @@ class Contacts:
     margin: _floats
     dim: _ints
     friction: _vec3s  # along both tangents, and about the normal
+    rolling: wp.array(dtype=wp.vec2)  # friction about both tangents
     soft: _soft
     weight: _floats  # inverse inertia, as a pyramid's rows have it
     slots: int
     pair: _ints  # pair of each slot
     rounds: int  # 2, in which contacts of a cylinder and a box are looked for
+    near: int  # pairs that may be near at once, of all of which contacts are found; 0 if there is memory for all
+    near_slots: int  # slots for their contacts, before those that touch are kept
 
 
 @wp.struct
@@ -187,5 +191,6 @@ class Layout:
     """Begin and length of each field of `Memory`, and the total size, in floats."""
 
     size: int
+    pair: int  # begin of the pairs of contacts, behind the fields
     begin: _ints  # by the number of the field
     length: _ints

@@ -7,6 +7,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
+from mjx_dher.envs.engines.fused.near import PAIR_WORDS, SLOT_WORDS
 from mjx_dher.envs.engines.pairs import all_pairs
 from mjx_dher.system.warp_setup import wp
 
@@ -23,6 +24,8 @@ CONTACT_KINDS = {
     ("CAPSULE", "CAPSULE"): (kinds.CAPSULE_CAPSULE, 2),
     ("CAPSULE", "BOX"): (kinds.CAPSULE_BOX, 2),
 }  # types of two geoms -> (kind, most contacts)
+FEW = 64  # contacts of all pairs, up to which there is memory for all of them
+_NEAR, _NEAR_SLOTS = 64, 192  # pairs that may be near at once in other models, and slots for their contacts
 _JOINTS = {
     int(mujoco.mjtJoint.mjJNT_HINGE): kinds.HINGE,
     int(mujoco.mjtJoint.mjJNT_SLIDE): kinds.SLIDE,
@@ -187,15 +190,21 @@ def dofs_of(model: mujoco.MjModel) -> Any:
     )
 
 
-def contacts_of(model: mujoco.MjModel) -> Any:
-    """Returns `Contacts` of a model: the pairs that it lists, and those that meet by contype and conaffinity."""
+def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
+    """Returns `Contacts` of a model: the pairs that it lists, and those that meet by contype and conaffinity.
+
+    Args:
+      rows: constraint rows that fit into memory. If not all do, there is memory for a third as many contacts as rows,
+        unless the model has `FEW`.
+    """
     pairs = all_pairs(model)
     geom1, geom2 = pairs.geom1.copy(), pairs.geom2.copy()
     swap = model.geom_type[geom1] > model.geom_type[geom2]
     geom1[swap], geom2[swap] = geom2[swap], geom1[swap]
     kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
-    slide = pairs.friction[:, 0]
+    slide, slots = pairs.friction[:, 0], int(most.sum())
+    few, all_fit = slots <= FEW, rows >= int((most * edges_of(pairs.dim)).sum())
     weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
     return fill(
         Contacts,
@@ -204,6 +213,7 @@ def contacts_of(model: mujoco.MjModel) -> Any:
         geom_mat=_matrices(model.geom_quat),
         geom_size=model.geom_size,
         geom_reach=model.geom_rbound,
+        geom_half=_halves(model),
         pairs=len(kind),
         geom1=geom1,
         geom2=geom2,
@@ -212,13 +222,36 @@ def contacts_of(model: mujoco.MjModel) -> Any:
         most=most,
         margin=pairs.margin,
         dim=pairs.dim,
-        friction=pairs.friction[:, [0, 1, 2]],
+        friction=pairs.friction[:, :3],
+        rolling=pairs.friction[:, 3:],
         soft=[softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
         weight=weight * np.where(pairs.dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
-        slots=int(most.sum()),
+        slots=slots if few or all_fit else min(slots, max(1, rows // 3)),
         pair=np.repeat(np.arange(len(kind)), most),
         rounds=2,
+        near=0 if few else len(kind) if all_fit else min(len(kind), _NEAR),
+        near_slots=0 if few else slots if all_fit else min(slots, _NEAR_SLOTS),
     )
+
+
+def _halves(model: mujoco.MjModel) -> np.ndarray:
+    """Half lengths [ngeom, 3] of boxes around geoms; those of planes do not matter."""
+    radius, half, _ = model.geom_size.T
+    round_ones = {
+        "SPHERE": (radius, radius, radius),
+        "CAPSULE": (radius, radius, radius + half),
+        "CYLINDER": (radius, radius, half),
+    }
+    halves = model.geom_size.copy()
+    for name, lengths in round_ones.items():
+        which = model.geom_type == int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+        halves[which] = np.stack(lengths, axis=1)[which]
+    return halves
+
+
+def edges_of(dims: np.ndarray) -> np.ndarray:
+    """Edges of the friction pyramids of contacts, by their condim."""
+    return np.where(dims == 1, 1, 2 * dims - 2)
 
 
 def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]:
@@ -242,7 +275,8 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
             "weld_weight": wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
         }
     links = links_of(model)
-    dims = contacts.dim.numpy()[contacts.pair.numpy()]
+    edges = edges_of(contacts.dim.numpy()[contacts.pair.numpy()])
+    contact_rows = int(np.sort(edges)[len(edges) - contacts.slots :].sum())
     return fill(
         World,
         timestep=model.opt.timestep,
@@ -250,7 +284,7 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
         weld_body=int(links.last[body]) if welds else -1,
         weld_target=int(links.last[target]) if welds else -1,
         **welds,
-        rows=min(most_rows, other_rows(model) + int(np.where(dims == 1, 1, 2 * dims - 2).sum())),
+        rows=min(most_rows, other_rows(model) + contact_rows),
         tolerance=model.opt.tolerance,
         iterations=model.opt.iterations,
         ls_iterations=model.opt.ls_iterations,
@@ -261,7 +295,7 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
 def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, sparse: Any) -> Any:
     """Returns `Layout` for a model.
 
-    `jacobian` begins with the first fields, whose place it takes, and `factor` with `pos`.
+    `jacobian` begins with the first fields, whose place it takes; so do contacts of near pairs. `factor` begins with `pos`.
     """
     nb, nv, rows = len(links_of(model).body), model.nv, world.rows
     lengths = {
@@ -284,8 +318,9 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, spars
     begin, names = np.cumsum(floats) - floats, list(fields)
     pos, mass, factor = (names.index(name) for name in ("pos", "mass", "factor"))
     passing, known = begin[pos], begin[mass] - begin[pos]  # floats of the fields whose place is taken
-    begin[pos:] += max(0, floats[-1] - passing)
-    begin[mass:] += max(0, floats[factor] - known)
+    begin[pos:] += max(0, floats[-1] - passing, PAIR_WORDS * contacts.near + SLOT_WORDS * contacts.near_slots - passing)
+    pair = int(begin[mass])
+    begin[mass:] += max(contacts.slots if contacts.near else 0, floats[factor] - known)
     size = 2 * ((int(begin[factor]) + 1) // 2)  # so that `jacobian` can be read in pairs
     begin[factor], begin[-1] = begin[pos], 0
-    return fill(Layout, size=size, begin=begin, length=length)
+    return fill(Layout, size=size, pair=pair, begin=begin, length=length)

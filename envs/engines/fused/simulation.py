@@ -37,7 +37,9 @@ class Simulation:
         warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block, self._threads)
         self._block = max(1, 32 * warps)
         kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
-        self._kernel = kernel.make(size, self._threads, warps, model.nv, kinds, sparse.rows > 0)
+        edges = int(max([6, *setup.edges_of(contacts.dim.numpy())]))
+        traits = kinds, edges, contacts.near == 0, sparse.rows > 0
+        self._kernel = kernel.make(size if warps else 0, self._threads, warps, model.nv, *traits)
         memory = wp.zeros((num_envs, size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (*structs, memory)
         self._lost = wp.zeros(1, dtype=int)
@@ -67,7 +69,8 @@ class Simulation:
 
 def _structs(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
     """The kernel's structs for a model, with room for `rows` rows of constraints."""
-    bodies, dofs, contacts, sparse = setup.bodies_of(model), setup.dofs_of(model), setup.contacts_of(model), sparse_of(model)
+    bodies, dofs, sparse = setup.bodies_of(model), setup.dofs_of(model), sparse_of(model)
+    contacts = setup.contacts_of(model, rows)
     world = setup.world_of(model, contacts, rows)
     return world, bodies, dofs, contacts, sparse, setup.layout_of(model, world, contacts, dofs, sparse)
 

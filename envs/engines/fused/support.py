@@ -40,7 +40,7 @@ _WITHOUT_EFFECT = re.compile(
             r"body_(bvh\w+|conaffinity|contype|dofadr|dofnum|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
             r"geom_(aabb|sameframe|dataid)|actuator_(acc0|ctrladr|ctrlnum|ctrlspec|outadr|outnum|length0|lengthrange|historyadr)",
             # What belongs to a feature that is left out.
-            r"opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
+            r"(geom|pair)_gap|pair_solreffriction|opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
             r"opt\.(jacobian|ls_tolerance|magnetic|sleep_tolerance|sdf_\w+|ccd_\w+)",
         ]
     )
@@ -122,14 +122,14 @@ def _is_plain_weld(model: mujoco.MjModel, index: int) -> bool:
 def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
     pairs = all_pairs(model)
     geoms: dict[str, dict[int, None]] = {}
-    for *ends, dim in zip(pairs.geom1, pairs.geom2, pairs.dim):
+    for ends in zip(pairs.geom1, pairs.geom2):
         kind, what = setup.pair_types(model, *ends), None
         if kind not in setup.CONTACT_KINDS:
             what = f"contacts of {kind[0].lower()} and {kind[1].lower()}"
         elif kind == ("CYLINDER", "BOX") and not model.opt.disableflags & _OLDER_CCD:
             what = "contacts of cylinders and boxes without nativeccd=disable"
-        elif dim > 4:
-            what = "contacts with rolling friction"
+        elif kind == ("CYLINDER", "BOX") and (model.pair_gap.any() or model.geom_gap[list(ends)].any()):
+            what = "gaps of cylinders and boxes"
         if what:
             geoms.setdefault(what, {}).update(dict.fromkeys(ends))
     for what, these in geoms.items():

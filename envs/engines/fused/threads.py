@@ -47,6 +47,36 @@ def total(x: float, threads: int) -> float:
     ...
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_GROUP}
+    int sum = x;
+    for (int other = 1; other < threads; other *= 2) {{
+        const int more = __shfl_up_sync(group, sum, other, threads);
+        if (thread >= other) sum += more;
+    }}
+    return sum - x;
+#else
+    return 0;
+#endif
+""")
+def earlier(x: int, thread: int, threads: int) -> int:
+    """Sum of the numbers of the threads before this one."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    {_GROUP}
+    for (int other = threads / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
+#endif
+    return x;
+""")
+def all_of(x: int, threads: int) -> int:
+    """Sum of the threads' numbers."""
+    ...
+
+
 def _carve(of: str) -> str:
     """Returns code that makes an array of a field of one environment's memory: on a GPU in the block's shared memory."""
     return f"""
