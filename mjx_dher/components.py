@@ -29,6 +29,21 @@ _QUANTILES = ("num_quantiles", "dropped_quantiles")
 # Built-in components by `RunSpec` field and name. Each field also takes a custom component as "module:attribute".
 COMPONENTS: dict[str, dict[str, Component]] = {
     "env": {
+        "block": Component("mjx_dher.envs.hand:Block", "bring a block in the Shadow hand to a pose (HandManipulateBlock-v1)"),
+        "block_rotate_parallel": Component(
+            "mjx_dher.envs.hand:BlockRotateParallel", "turn a block to another face (HandManipulateBlockRotateParallel-v1)"
+        ),
+        "block_rotate_xyz": Component(
+            "mjx_dher.envs.hand:BlockRotateXYZ", "turn a block to any orientation (HandManipulateBlockRotateXYZ-v1)"
+        ),
+        "block_rotate_z": Component(
+            "mjx_dher.envs.hand:BlockRotateZ", "turn a block about the vertical (HandManipulateBlockRotateZ-v1)"
+        ),
+        "egg": Component("mjx_dher.envs.hand:Egg", "bring an egg in the Shadow hand to a pose (HandManipulateEgg-v1)"),
+        "egg_rotate": Component("mjx_dher.envs.hand:EggRotate", "turn an egg to any orientation (HandManipulateEggRotate-v1)"),
+        "hand_reach": Component("mjx_dher.envs.hand:HandReach", "bring the fingertips to goals (HandReach-v3)"),
+        "pen": Component("mjx_dher.envs.hand:Pen", "bring a pen in the Shadow hand to a pose (HandManipulatePen-v1)"),
+        "pen_rotate": Component("mjx_dher.envs.hand:PenRotate", "turn a pen to any direction (HandManipulatePenRotate-v1)"),
         "pick_and_place": Component(
             "mjx_dher.envs.pick_and_place:PickAndPlace",
             "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)",
@@ -183,6 +198,11 @@ def load(field: str, value: Any, *parameters: str) -> Any:
         check_name(field, value, table, custom=True)
         value = load_import_path(field, table[value].path if value in table else value)
     return check_function(field, value, parameters) if parameters else value
+
+
+def is_hand(env: Any) -> bool:
+    """Whether an environment is one of the built-in Shadow-hand tasks, by its name."""
+    return isinstance(env, str) and env in COMPONENTS["env"] and COMPONENTS["env"][env].path.startswith("mjx_dher.envs.hand:")
 
 
 def help_text(field: str, text: str) -> str:

@@ -7,6 +7,7 @@ import importlib.util
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
+from mjx_dher.components import is_hand
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name
 from mjx_dher.spec import RunSpec
@@ -46,7 +47,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
       ValueError: there is no such preset.
     """
     check_name("preset", name, PRESETS)
-    best = _LEARNERS.get((name, env), _DDPG)
+    best = _LEARNERS.get((name, env), _HAND if is_hand(env) and name in ("cpu", "gpu") else _DDPG)
     if learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
     setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name]
@@ -61,6 +62,10 @@ def _cpu(env: str) -> tuple[Config, HParams]:
     config = Config(num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
     if env == "reach":
         config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
+    elif is_hand(env):
+        total_steps = 400_000 if env == "hand_reach" else 2_000_000
+        config = dataclasses.replace(config, cycles_per_epoch=8, total_steps=total_steps, replay_size=2_000_000)
+        return config, _TUNED._replace(gamma=0.98)
     elif env == "pick_and_place":
         config = dataclasses.replace(config, total_steps=1_000_000)
         return config, _TUNED._replace(noise_std=0.2, lr_end=0.05)
@@ -82,6 +87,10 @@ def _gpu(env: str) -> tuple[Config, HParams]:
     )
     if env == "reach":
         config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
+    elif is_hand(env):
+        total_steps = {"hand_reach": 2_000_000, "block_rotate_z": 8_000_000}.get(env, 20_000_000)
+        config = dataclasses.replace(config, num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
+        return config, _TUNED._replace(gamma=0.98)
     elif env in ("pick_and_place", "slide"):
         total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
         config = dataclasses.replace(
@@ -184,6 +193,7 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
+_HAND = _Best("tqc", "layer_norm", None)  # not tuned yet
 _LEARNERS = {
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),

@@ -9,8 +9,10 @@ from mjx_dher import envs
 from mjx_dher.envs.arm_kinematics import Chain
 from mjx_dher.envs.kinematics import Place, to_quat
 
+FETCH = ("pick_and_place", "push", "reach", "slide")
 
-@pytest.mark.parametrize("name", envs.list_envs())
+
+@pytest.mark.parametrize("name", FETCH)
 def test_pose_and_motion_are_mujoco_s(name):
     """At random joint angles and rates, against mj_forward and mj_objectVelocity."""
     env = envs.make(name, engine="native")
@@ -31,7 +33,7 @@ def test_pose_and_motion_are_mujoco_s(name):
 
 
 def test_the_settled_arm_holds_the_gripper_where_the_task_says():
-    for name in envs.list_envs():
+    for name in FETCH:
         env = envs.make(name, engine="native")
         grip, _ = jax.jit(env.arm.site_motion)(jnp.array(env.task.arm_qpos), jnp.array(env.task.arm_qvel))
         np.testing.assert_allclose(grip, env.task.initial_grip_pos, atol=2e-4)

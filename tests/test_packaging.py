@@ -74,7 +74,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(distributions):
     expected |= {
         f"mjx_dher/{path.relative_to(ROOT / 'mjx_dher')}" for path in (ROOT / "mjx_dher" / "policy" / "bundled").glob("*/*.*")
     }
-    expected |= {f"mjx_dher/envs/assets/{path.name}" for path in (ROOT / "envs" / "assets").glob("*.xml")}
+    expected |= {f"mjx_dher/{path.relative_to(ROOT)}" for path in (ROOT / "envs" / "assets").rglob("*.xml")}
     expected |= {"mjx_dher/py.typed"}
     assert {name for name in names if name.startswith("mjx_dher/")} == expected
 

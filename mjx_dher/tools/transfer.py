@@ -1,4 +1,4 @@
-"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo in a virtual environment of its own.
+"""Zero-shot transfer to the original Fetch and hand tasks, which need an older MuJoCo in a virtual environment of its own.
 
 In that environment this file is a program that plays episodes and prints their outcomes. It needs gymnasium-robotics and
 NumPy, but neither JAX nor this library's MuJoCo:
@@ -31,9 +31,17 @@ ORIGINALS = {
     "pick_and_place": "FetchPickAndPlace-v4",
     "slide": "FetchSlide-v4",
     "reach": "FetchReach-v4",
+    "hand_reach": "HandReach-v3",
+    "block_rotate_z": "HandManipulateBlockRotateZ-v1",
+    "block_rotate_parallel": "HandManipulateBlockRotateParallel-v1",
+    "block_rotate_xyz": "HandManipulateBlockRotateXYZ-v1",
+    "block": "HandManipulateBlock-v1",
+    "egg_rotate": "HandManipulateEggRotate-v1",
+    "egg": "HandManipulateEgg-v1",
+    "pen_rotate": "HandManipulatePenRotate-v1",
+    "pen": "HandManipulatePen-v1",
 }
 REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0")  # the tasks cannot be built on mujoco 3.12 or newer
-REACHED = 0.05  # m
 
 
 def default_environment() -> Path:
@@ -113,17 +121,18 @@ def play_original(run: Path, episodes: int, first_seed: int) -> dict[str, list[A
 
     gymnasium.register_envs(gymnasium_robotics)
     env, policy = gymnasium.make(ORIGINALS[read_spec(run).env]), load_policy(run)
+    original: Any = env.unwrapped
     outcome: dict[str, list[Any]] = {"success": [], "reset_success": [], "ret": []}
     for seed in range(first_seed, first_seed + episodes):
         obs, _ = env.reset(seed=seed)
-        distance = np.linalg.norm(obs["achieved_goal"] - obs["desired_goal"])
+        reached = original._is_success(obs["achieved_goal"], obs["desired_goal"])
         ended, ret = False, 0.0
         info: dict[str, Any] = {}
         while not ended:
             obs, reward, _, ended, info = env.step(policy(obs))
             ret += float(reward)
         outcome["success"].append(bool(info["is_success"]))
-        outcome["reset_success"].append(bool(distance < REACHED))
+        outcome["reset_success"].append(bool(reached))
         outcome["ret"].append(ret)
     return outcome
 

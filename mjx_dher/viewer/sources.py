@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher.components import is_hand
 from mjx_dher.policy import bundled, load
 from mjx_dher.runs.folder import results, run_folder
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
@@ -46,8 +47,11 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
 
     Raises:
       FolderError: no run folder, or one without a policy.
+      ValueError: the policy is of another Shadow-hand task, whose observations and goals have the same sizes.
     """
     run = run_folder.read_spec(folder)
+    if env not in (None, run.env) and is_hand(env) and is_hand(run.env):
+        raise ValueError(f"{label} is a policy of {run.env} and cannot be played in {env}, which looks alike")
     if not (folder / run_folder.POLICY_FILE).is_file():
         raise FolderError(f"{folder / run_folder.POLICY_FILE} is missing: no epoch of the run has ended yet")
     arguments = {**(run.env_arguments if env is None else {}), **to_arguments(env_kwargs)}

@@ -1,0 +1,349 @@
+"""The Shadow-hand tasks: reach with the fingertips; turn a block, an egg or a pen in the hand.
+
+The tasks follow gymnasium-robotics 1.4.2: HandReach-v3 and the HandManipulate tasks of version v1, run on mujoco 3.11.0.
+`bench/hand_model.py` writes the models in envs/assets/hand (docs/fidelity.md).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_dher.context import euclidean
+from mjx_dher.envs.arm_kinematics import matrix_to_euler, quat_multiply, quat_to_matrix
+from mjx_dher.envs.base import State
+from mjx_dher.envs.engines import Physics
+from mjx_dher.envs.engines.base import check_shape
+from mjx_dher.envs.goals import Goal, Mark
+from mjx_dher.envs.kinematics import Place
+from mjx_dher.envs.starts import Start
+from mjx_dher.envs.task import Actuators, MujocoTask
+from mjx_dher.lookup import check_name
+from mjx_dher.types import Array, PRNGKey
+
+TIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
+JOINTS = "??J?"  # the names of the hand's 24 joints, such as FFJ3
+RESTING_PLACE = (1.01, 0.87, 0.16)  # m; where an object comes to rest, to a centimetre or so
+OFFSETS = ((-0.04, -0.06, 0.0), (0.04, 0.02, 0.06))  # m; lowest and highest of a goal from where the object came to rest
+PALM_HEIGHT = 0.04  # m; an object that is lower after settling fell out of the hand
+ATTEMPTS = 100  # starts that a reset draws before it takes one that fell; in 800 resets of the originals, none fell
+BESIDE = np.array([0.15, 0.0, 0.0])  # m; where a goal without a position is drawn, from the object's place
+ROTATIONS = ("z", "parallel", "xyz")
+_TURNS = (0.0, 0.5, -0.5, 1.0)  # of pi
+# Euler angles [24, 3], rad, of a cube with its faces parallel to the axes. A quaternion's sign follows from them.
+FACES = np.pi * np.array([*itertools.product(_TURNS, (0.0,), _TURNS), *itertools.product((0.0,), (0.5, -0.5), _TURNS)])
+
+
+class ObjectPose(Goal):
+    """The object's position, m, and orientation, a quaternion (w, x, y, z): [7].
+
+    The distance is an angle, rad, from 0 to 2 pi. As in the original the sign counts: q and -q are a full turn apart. If the
+    position counts, `reach` m are worth `threshold` rad, and the larger of the two is the distance.
+
+    Args:
+      rotation: how orientations are drawn: "z", any angle about the vertical; "parallel", one of 24 with the faces parallel to
+        the axes, then any angle about the vertical; "xyz", any angle about any axis.
+      positions: whether the position counts.
+      reach: largest distance of the positions at which the goal is reached, m.
+      ignores_z: whether the third Euler angle does not count, as for the pen.
+    """
+
+    size = 7
+    threshold = 0.1
+
+    def __init__(self, rotation: str, positions: bool = False, reach: float = 0.01, ignores_z: bool = False):
+        check_name("rotation", rotation, ROTATIONS)
+        self.rotation, self.positions, self.reach, self.ignores_z = rotation, positions, reach, ignores_z
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = super().bind(model)
+        bound.place = Place(model, "body:object")
+        if self.positions:
+            bound.low, bound.high = np.add(RESTING_PLACE, OFFSETS).astype(np.float32)
+        bound.qpos = slice(int(model.joint("object").qposadr[0]), int(model.joint("object").qposadr[0]) + 7)
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        pose = physics.qpos[self.qpos]
+        # With the sign that `distances` gives it, so that each state reaches its own goal.
+        return pose.at[3:].set(_from_euler(_euler(pose[3:]))) if self.ignores_z else pose
+
+    def sample(self, key: PRNGKey) -> Array:
+        """Draws a goal for an object that came to rest at `RESTING_PLACE`."""
+        place_key, key = jax.random.split(key)
+        low, high = (self.low, self.high) if self.positions else (jnp.float32(RESTING_PLACE),) * 2
+        return jnp.concatenate([jax.random.uniform(place_key, (3,), jnp.float32, low, high), draw_rotation(key, self.rotation)])
+
+    def distances(self, achieved: Array, desired: Array) -> tuple[Array, Array]:
+        """Distance of the positions, m (0 if they do not count), and of the orientations, rad."""
+        quat, other = achieved[..., 3:], desired[..., 3:]
+        if self.ignores_z:
+            quat = _from_euler(jnp.concatenate([_euler(quat)[..., :2], _euler(other)[..., 2:]], axis=-1))
+        # Of unit quaternions half the angle apart; exact for small angles, unlike an arc cosine.
+        angle = 4.0 * jnp.arctan2(_norm(quat - other), _norm(quat + other))
+        return (_norm(achieved[..., :3] - desired[..., :3]) if self.positions else jnp.zeros_like(angle)), angle
+
+    def distance(self, achieved: Array, desired: Array) -> Array:
+        apart, angle = self.distances(achieved, desired)
+        return jnp.maximum(angle, apart * (self.threshold / self.reach)) if self.positions else angle
+
+    def checked(self, goal: Any) -> Array:
+        """Returns a goal [7] with a unit quaternion.
+
+        Raises:
+          ValueError: the shape is another one or, outside `jit`, the quaternion's length is 0 or not finite. Inside `jit`
+            such a goal is NaN, and never reached.
+        """
+        goal = jnp.asarray(goal, jnp.float32)
+        check_shape("desired_goal", goal, (self.size,))
+        length = _norm(goal[3:])
+        if not isinstance(goal, jax.core.Tracer) and not 0 < float(length) < np.inf:
+            raise ValueError(f"desired_goal must end with a quaternion of finite length, more than 0; got {np.asarray(goal)}")
+        return jnp.concatenate([goal[:3], jnp.where(jnp.abs(length - 1.0) < 1e-5, goal[3:], goal[3:] / length)])
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        assert self.place is not None
+        beside = np.zeros(3) if self.positions else BESIDE
+        return [(self.place.body, np.asarray(goal[:3], float) + beside, np.asarray(goal[3:], float))]
+
+    qpos: slice
+
+
+class Fingertips(Goal):
+    """Positions of the five fingertips, [15] m. As in the original they are seen one timestep late."""
+
+    size = 15
+    threshold = 0.01  # m
+    distance = staticmethod(euclidean)
+
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = super().bind(model)
+        bound.tips, bound.timestep = [Place(model, f"site:{name}") for name in TIPS], model.opt.timestep
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        mujoco.mj_kinematics(model, data)
+        bound.first = np.array([data.site(name).xpos for name in TIPS], np.float32)
+        bound.meeting = np.array(data.body("palm").xpos + np.array([0.0, -0.09, 0.05]), np.float32)
+        return bound
+
+    def achieved(self, physics: Physics) -> Array:
+        # Its hinges' positions advance by the new velocity, and a start is at rest.
+        before = physics.qpos - self.timestep * physics.qvel
+        return jnp.concatenate([tip.position(before) for tip in self.tips])
+
+    def sample(self, key: PRNGKey) -> Array:
+        """Draws a point above the palm where the thumb and another finger meet; one time in ten, all fingers stay."""
+        finger_key, place_key, stay_key = jax.random.split(key, 3)
+        finger = jax.random.randint(finger_key, (), 0, len(TIPS) - 1)
+        meeting = (self.meeting + 0.005 * jax.random.normal(place_key, (3,), jnp.float32))[None]
+        way = meeting - self.first
+        meets = (jnp.arange(len(TIPS)) == finger) | (jnp.arange(len(TIPS)) == len(TIPS) - 1)
+        goal = jnp.where(meets[:, None], meeting - 0.005 * way / _norm(way)[:, None], self.first)
+        return jnp.where(jax.random.uniform(stay_key) < 0.1, self.first, goal).ravel()
+
+    def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
+        return [(-1, place, np.array([1.0, 0.0, 0.0, 0.0])) for place in np.reshape(np.asarray(goal, float), (-1, 3))]
+
+    tips: list[Place]
+    timestep: float
+    first: np.ndarray  # [5, 3] m, of the fingertips at the start
+    meeting: np.ndarray  # [3] m
+
+
+class Drop(Start):
+    """The object falls into the hand and comes to rest in ten steps of the middle action.
+
+    Args:
+      rotation: how its orientation is drawn, as for `ObjectPose`; None keeps the model's.
+    """
+
+    def __init__(self, rotation: str | None):
+        place, spread = np.array([1.0, 0.87, 0.2]), 0.015  # m; three standard deviations
+        super().__init__("start", {"object": (place - spread, place + spread)}, settle=10)
+        self.rotation = rotation
+
+    def draw(self, key: PRNGKey) -> Array:
+        place_key, key = jax.random.split(key)
+        at, qpos = self.drawn[0].qpos, jnp.asarray(self.physics.qpos)
+        qpos = qpos.at[at : at + 3].add(0.005 * jax.random.normal(place_key, (3,), jnp.float32))
+        if self.rotation is None:
+            return qpos
+        quat = quat_multiply(qpos[at + 3 : at + 7], draw_rotation(key, self.rotation))
+        return qpos.at[at + 3 : at + 7].set(quat / _norm(quat))
+
+
+class HandTask(MujocoTask):
+    """The Shadow hand, whose 20 servos the action moves: -1 and 1 are the ends of their ranges."""
+
+    control = Actuators()
+    observations: tuple[str, ...] = (f"qpos:{JOINTS}", f"qvel:{JOINTS}")
+
+    def init_state(self, qpos: Array, desired_goal: Array, qvel: Array | None = None) -> State:
+        """Returns the state at a given start, for example from a recorded episode.
+
+        Args:
+          qpos: [24] joint angles, rad, and with an object [7] its position, m, and orientation (w, x, y, z).
+          desired_goal: [G].
+          qvel: [24] rad/s, and with an object [6] its velocity; None for rest.
+
+        Raises:
+          ValueError: an array has another shape, or the goal's quaternion has no length.
+        """
+        start: Physics = jax.tree.map(jnp.asarray, self._rest)
+        moving = jnp.zeros_like(start.qvel) if qvel is None else jnp.asarray(qvel, jnp.float32)
+        physics = start.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=moving)  # type: ignore[attr-defined]
+        check_shape("qpos", physics.qpos, start.qpos.shape)
+        check_shape("qvel", physics.qvel, start.qvel.shape)
+        return self.first_state(physics, desired_goal)
+
+    def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
+
+
+class HandReach(HandTask):
+    """HandReach-v3: bring the thumb's tip and another finger's together, and leave the others where they are."""
+
+    name = "hand_reach"
+    model = "assets/hand/reach.xml"
+    goal = Fingertips()
+    start = Start("start")
+    observations = (*HandTask.observations, *(f"site:{name}" for name in TIPS))
+
+    def observe(self, physics: Physics) -> Array:
+        return super().observe(physics).at[-self.goal_size :].set(self.achieved(physics))
+
+
+class ManipulateTask(HandTask):
+    """The hand and an object. The goal is a pose of the object; a task names a model, a goal and a start."""
+
+    episode_length = 100
+    observations = (*HandTask.observations, "qvel:object", "qpos:object")
+    goal: ObjectPose
+
+    def start_physics(self, key: PRNGKey) -> Physics:
+        """Drops the object into the hand, again if it falls out of it."""
+
+        def fell(drop: tuple[Array, Physics]) -> Array:
+            count, physics = drop
+            return (count < ATTEMPTS) & ~(physics.qpos[self.goal.qpos][2] > PALM_HEIGHT)
+
+        def again(drop: tuple[Array, Physics]) -> tuple[Array, Physics]:
+            count, _ = drop
+            return count + 1, MujocoTask.start_physics(self, jax.random.fold_in(key, count))
+
+        none: Physics = jax.tree.map(jnp.zeros_like, jax.tree.map(jnp.asarray, self._rest))
+        return jax.lax.while_loop(fell, again, (jnp.zeros((), jnp.int32), none))[1]
+
+    def reset(self, key: PRNGKey) -> State:
+        start_key, goal_key = jax.random.split(key)
+        physics = self.start_physics(start_key)
+        moved = self.achieved(physics)[:3] - jnp.float32(RESTING_PLACE)
+        return self.first_state(physics, self.sample_goal(goal_key).at[:3].add(moved))
+
+    def first_state(self, physics: Physics, desired_goal: Array) -> State:
+        return super().first_state(physics, self.goal.checked(desired_goal))
+
+    def with_goal(self, state: State, goal: Array) -> State:
+        return super().with_goal(state, self.goal.checked(goal))
+
+    def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        return self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold
+
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
+        """Rewards [...] of goals [..., 7]. Dense: minus the angle, rad, and minus ten times the positions' distance, m."""
+        if self.reward_type == "dense":
+            apart, angle = self.goal.distances(achieved_goal, desired_goal)
+            return -(10.0 * apart + angle)
+        return super().compute_reward(achieved_goal, desired_goal)
+
+
+class BlockRotateZ(ManipulateTask):
+    """HandManipulateBlockRotateZ-v1: turn a block about the vertical."""
+
+    name, model = "block_rotate_z", "assets/hand/block.xml"
+    goal, start = ObjectPose("z"), Drop("z")
+
+
+class BlockRotateParallel(ManipulateTask):
+    """HandManipulateBlockRotateParallel-v1: turn a block to another face, and about the vertical."""
+
+    name, model = "block_rotate_parallel", "assets/hand/block.xml"
+    goal, start = ObjectPose("parallel"), Drop("parallel")
+
+
+class BlockRotateXYZ(ManipulateTask):
+    """HandManipulateBlockRotateXYZ-v1: turn a block to any orientation."""
+
+    name, model = "block_rotate_xyz", "assets/hand/block.xml"
+    goal, start = ObjectPose("xyz"), Drop("xyz")
+
+
+class Block(ManipulateTask):
+    """HandManipulateBlock-v1: bring a block to any orientation, and to a position."""
+
+    name, model = "block", "assets/hand/block.xml"
+    goal, start = ObjectPose("xyz", positions=True), Drop("xyz")
+
+
+class EggRotate(ManipulateTask):
+    """HandManipulateEggRotate-v1: turn an egg to any orientation."""
+
+    name, model = "egg_rotate", "assets/hand/egg.xml"
+    goal, start = ObjectPose("xyz"), Drop("xyz")
+
+
+class Egg(ManipulateTask):
+    """HandManipulateEgg-v1: bring an egg to any orientation, and to a position."""
+
+    name, model = "egg", "assets/hand/egg.xml"
+    goal, start = ObjectPose("xyz", positions=True), Drop("xyz")
+
+
+class PenRotate(ManipulateTask):
+    """HandManipulatePenRotate-v1: turn a pen to any direction."""
+
+    name, model = "pen_rotate", "assets/hand/pen.xml"
+    goal, start = ObjectPose("xyz", ignores_z=True), Drop(None)
+
+
+class Pen(ManipulateTask):
+    """HandManipulatePen-v1: bring a pen to any direction, and to a position."""
+
+    name, model = "pen", "assets/hand/pen.xml"
+    goal, start = ObjectPose("xyz", positions=True, reach=0.05, ignores_z=True), Drop(None)
+
+
+def draw_rotation(key: PRNGKey, kind: str) -> Array:
+    """Draws a unit quaternion [4] (w, x, y, z), whose w is not negative for "z" and "xyz"; `ObjectPose` has the kinds."""
+    angle_key, key = jax.random.split(key)
+    half = jax.random.uniform(angle_key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
+    axis = jax.random.uniform(key, (3,), jnp.float32, -1.0, 1.0) if kind == "xyz" else jnp.array([0.0, 0.0, 1.0])
+    axis = axis / jnp.maximum(_norm(axis), 1e-6)
+    quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])
+    if kind == "parallel":
+        quat = quat_multiply(quat, _from_euler(jnp.asarray(FACES, jnp.float32)[jax.random.randint(key, (), 0, len(FACES))]))
+    return quat / _norm(quat)
+
+
+@functools.partial(jnp.vectorize, signature="(e)->(q)")
+def _from_euler(angles: Array) -> Array:
+    """Quaternions [..., 4] of turns by angles [..., 3], rad, about x, the new y, then the new z. The angles give the sign."""
+    (a, b, c), (x, y, z) = jnp.cos(0.5 * angles), jnp.sin(0.5 * angles)
+    return jnp.stack([a * b * c - x * y * z, x * b * c + a * y * z, a * y * c - x * b * z, a * b * z + x * y * c])
+
+
+@functools.partial(jnp.vectorize, signature="(q)->(e)")
+def _euler(quat: Array) -> Array:
+    """Euler angles [..., 3], rad, of quaternions [..., 4]."""
+    return matrix_to_euler(quat_to_matrix(quat))
+
+
+def _norm(vector: Array) -> Array:
+    """Length over the last axis, from a sum: a dot product would have the learner's precision on a GPU."""
+    return jnp.sqrt(jnp.sum(jnp.square(vector), axis=-1))
