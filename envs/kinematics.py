@@ -159,7 +159,7 @@ def _join(pos: Array, mat: Array, frame: tuple[np.ndarray, np.ndarray]) -> tuple
 
 # Sums, because dot products would use the learner's precision on a GPU.
 def _turn(mat: Array, vector: Any) -> Array:
-    return jnp.sum(mat * vector, axis=-1)
+    return jnp.sum(mat * vector[None], axis=-1)
 
 
 def _times(a: Array, b: Any) -> Array:
