@@ -129,7 +129,7 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
     ]
 
 
-# What an estimate is made of, all measured on one H200 (bench/README.md, docs/design.md), 40 runs side by side.
+# What an estimate is made of, all measured on one H200 (bench/README.md, docs/engines.md), 40 runs side by side.
 _UPDATE = 23.8e-6  # seconds of gradients and drawing of an update of 2,048 in bfloat16, a run
 _FLOAT32 = 82.2e-6  # the same in float32, 20 runs side by side
 _STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments

@@ -31,7 +31,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     """Run of a preset in an environment.
 
     `cpu` and `gpu` are tuned for wall-clock time to success, on two cores with native physics and on one NVIDIA GPU with warp.
-    `frugal` is tuned for few environment steps at any number of updates (docs/design.md). `paper` is the set-up of "Distance
+    `frugal` is tuned for few environment steps at any number of updates (docs/experiments). `paper` is the set-up of "Distance
     Based Replay Sampling in Hindsight Experience Replay", completed from the code behind its numbers (docs/results.md). It
     rolls out the workers' episodes in parallel and takes the gradient of their joint batch.
 

@@ -100,6 +100,6 @@ def test_numbers_are_those_of_the_pages_that_have_measured_them():
     assert rates
     assert [rate for rate in rates if rate not in bench] == []
     ours = [row for row in section(field, "Speed").splitlines() if "Push" in row and "H200" in row]
-    table = re.search(r"^\| Push \| (.*) \|$", read("docs/design.md"), re.M)[1].replace(",", "").split(" | ")
+    table = re.search(r"^\| Push \| (.*) \|$", read("docs/engines.md"), re.M)[1].replace(",", "").split(" | ")
     thousands = [str(int(re.search(r"\| ([\d,]+) \|", row)[1].replace(",", "")) // 1000) for row in ours]
     assert thousands == [table[2]]
