@@ -70,6 +70,14 @@ FIGURES: dict[str, tuple[Sweep, ...]] = {
         Sweep("own_slide", "slide", 200, 2, _BOTH, 10, **_NEW),
         Sweep("own_methods", "push", 50, 2, "--sampler closest epsilon_closest", 10, **_NEW),
     ),
+    "own_set": (
+        Sweep("samplers_own_push", "push", 30, 2, "--sampler final random", **_NEW),
+        Sweep("readings_own_push", "push", 30, 5, f"{_LINEAR} sum max minmax none far", **_NEW),
+        Sweep("readings_own_push_softmax", "push", 30, 2, f"{_SOFTMAX} mean none", **_NEW),
+        Sweep("k_own_push", "push", 30, 4, _K, **_NEW),
+        Sweep("ring_own_push", "push", 30, 1, "--sampler future --replay-size 200000", **_NEW),
+        Sweep("noise_own_push", "push", 30, 1, "--sampler future --sweep.random-noise 0", **_NEW),
+    ),
     "samplers": (
         Sweep(
             "samplers",
@@ -231,7 +239,7 @@ def named(sweep: Sweep, label: str) -> str:
     """Returns a setting's name with what all settings of its sweep share: a label names only what differs among them."""
     shared = {
         "readings": lambda: _reading(sweep, label),
-        "ring": lambda: "future, ring of a million",
+        "ring": lambda: f"future, ring of {'200,000' if 'own' in sweep.name else 'a million'}",
         "noise": lambda: "future, random_noise 0",
         "eventful": lambda: "future, priority_fraction 0.5",
     }

@@ -66,6 +66,24 @@ FAMILIES: dict[str, list[Comparison]] = {
     "methods 1 and 2, own cycles": [
         Comparison("push", "own_methods", name, (OWN["push"], "future")) for name in ("closest", "epsilon_closest")
     ],
+    "readings, own cycles": [
+        Comparison("push", "readings_own_push", f"weighted, {name}, linear", (OWN["push"], "future"))
+        for name in ("sum", "max", "minmax", "none", "far")
+    ]
+    + [
+        Comparison("push", "readings_own_push_softmax", f"weighted, {name}, softmax", (OWN["push"], "future"))
+        for name in ("mean", "none")
+    ],
+    "k against 4, own cycles": [
+        Comparison("push", "k_own_push", f"future, her_k {k}", (OWN["push"], "future")) for k in (1, 2, 8, 16)
+    ],
+    "final and random, own cycles": [
+        Comparison("push", "samplers_own_push", name, (OWN["push"], "future")) for name in ("final", "random")
+    ],
+    "ring and noise, own cycles": [
+        Comparison("push", "ring_own_push", "future, ring of 200,000", (OWN["push"], "future")),
+        Comparison("push", "noise_own_push", "future, random_noise 0", (OWN["push"], "future")),
+    ],
     "the paper's claim": [Comparison(task, sweep, "weighted") for task, sweep in MAIN.items()],
     "readings": _readings(),
     "method 2": [Comparison("push", "samplers", f"epsilon_closest, epsilon {e}") for e in (0.1, 0.2, 0.3, 0.5)]
