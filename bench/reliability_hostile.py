@@ -254,7 +254,7 @@ def in_a_process(place, act, seconds=SECONDS):
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
             return 0 if served else os.waitstatus_to_exitcode(status)
-        if time.monotonic() - start > SERVED and b"is at play" in (place / "output").read_bytes() and not served:
+        if time.monotonic() - start > SERVED and b"showing " in (place / "output").read_bytes() and not served:
             served = True
             os.kill(pid, signal.SIGINT)
         time.sleep(0.02)

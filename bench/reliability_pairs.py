@@ -65,7 +65,8 @@ def ended(process, allowed):
     """What is wrong with how a process ended, and what it printed; `allowed` are statuses that need no sentence."""
     stdout, stderr = process.communicate(timeout=600)
     named = any(
-        line.startswith("error: ") and ("another program" in line or "is there already" in line) for line in stderr.splitlines()
+        line.startswith("error: ") and ("another process" in line or "another program" in line or "exists" in line)
+        for line in stderr.splitlines()
     )
     if "Traceback" in stderr:
         return [f"traceback: {stderr[-300:]}"], stdout

@@ -83,7 +83,7 @@ def run_cut(folder, right, rng, disk_rng):
     if not run_folder.checkpoints(run):
         return ([] if done <= INTERVAL else [f"lost: {done} epochs and no checkpoint"]), done
     faults, text = ended(start("resume", run), (0,))
-    went_on = re.search(r"going on from .*, after epoch (\d+)", text)
+    went_on = re.search(r"resuming from .*, after epoch (\d+)", text)
     lost = done - int(went_on[1]) if went_on else 0
     if lost > INTERVAL:
         faults.append(f"lost: {lost} epochs")

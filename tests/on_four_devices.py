@@ -179,7 +179,7 @@ def test_a_run_resumes_on_as_many_devices_to_the_bit_and_on_no_other_number(tmp_
     rows, learner = train(tmp_path / "whole", devices=2)
     train(tmp_path / "cut", epoch=1, devices=2)
     for number in (1, 4):
-        with pytest.raises(FolderError, match=f"devices must be 2 for each run, as when it was made; got {number}"):
+        with pytest.raises(FolderError, match=f"devices must be 2 per run, as when it was written; got {number}"):
             train(tmp_path / "cut", devices=number)
     rows_again, learner_again = train(tmp_path / "cut", devices=2)
     assert rows == rows_again

@@ -314,5 +314,5 @@ def test_memory_that_does_not_suffice_is_a_sentence(bakeoff, ablation, tmp_path,
     monkeypatch.setattr(bakeoff, "train", train)
     assert bakeoff.main(["--out", str(tmp_path / "a"), "--toy"], ablation.ABLATION) == 2
     said = capsys.readouterr().out
-    assert "error: memory does not suffice (RESOURCE_EXHAUSTED" in said
+    assert "error: out of memory (RESOURCE_EXHAUSTED" in said
     assert "[executable_name='jit__init']" in said  # no markup

@@ -300,12 +300,12 @@ def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     assert (second.returncode, stderr) == (128 + signal.SIGTERM, ""), stdout
     newest = run_folder.checkpoints(out)[0]
     assert f"saved {newest}" in stdout
-    assert f"`train.py resume {out}` goes on" in stdout
+    assert f"`train.py resume {out}` resumes" in stdout
     assert len(table(out)) - 1 == int(newest.name[-6:])
     third = start("resume", out)
     stdout, stderr = third.communicate(timeout=200)
     assert (third.returncode, stderr) == (0, "")
-    assert f"going on from {newest}" in stdout
+    assert f"resuming from {newest}" in stdout
     assert cli.main([*TINY, *steps, "--out", str(whole)]) == 0
     assert len(table(whole)) == 401
     assert table(out) == table(whole)
@@ -324,7 +324,7 @@ def refusal(capsys, *args):
 def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "no such folder" in refusal(capsys, "resume", tmp_path / "none")
     run_folder.write_config(tmp_path / "run", RunSpec(config=CONFIG), "native", {})
-    assert "no checkpoint to go on from" in refusal(capsys, "resume", tmp_path / "run")
+    assert "no checkpoint to resume from" in refusal(capsys, "resume", tmp_path / "run")
     assert "engine must be" in refusal(capsys, "resume", tmp_path / "run", "--engine", "bullet")
     assert "keep must lie in" in refusal(capsys, "resume", tmp_path / "run", "--keep", "0")
     assert "checkpoint_every must lie in" in refusal(capsys, "resume", tmp_path / "run", "--checkpoint-every", "-1")
@@ -339,6 +339,6 @@ def test_networks_that_are_not_finite_stop_the_run_and_no_policy_is_written(tmp_
     init = ddpg.DDPG.init
     monkeypatch.setattr(ddpg.DDPG, "init", lambda *args: jax.tree.map(lambda x: x / 0, init(*args)))
     error = refusal(capsys, *TINY, "--total-steps", "300", "--out", tmp_path / "run")
-    assert "epoch 1: the networks or normalizers hold numbers that are not finite" in error
+    assert "epoch 1: the networks or normalizers have numbers that are not finite" in error
     assert "there is no checkpoint" in error
     assert not (tmp_path / "run" / "policy.npz").exists()

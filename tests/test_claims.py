@@ -143,7 +143,7 @@ def test_a_finished_trial_with_a_short_curve_is_named_and_trained_again(tmp_path
         told = []
         (result,) = run(tmp_path, trials, report=told.append)
         assert result.folder == cell
-        assert f"metrics.csv has whole lines of {rows} of 5 epochs; it is trained again" in told[0]
+        assert f"metrics.csv has complete lines of {rows} of 5 epochs; training it again" in told[0]
         assert table(tmp_path) == whole
 
 
@@ -185,9 +185,9 @@ def test_a_sweep_whose_runs_another_program_has_says_so(tmp_path, capsys):
         (cell / "result.json").unlink()
     with held(cells[0]), held(cells[1]):
         assert cli.main(flags) == 2
-    assert "all 2 runs are being trained by another program" in capsys.readouterr().err
+    assert "another process is training all 2 runs" in capsys.readouterr().err
     with held(cells[0]):
         assert cli.main(flags) == 2
-    assert "1 of the 2 runs are being trained by another program, and not in the tables" in capsys.readouterr().err
+    assert "another process is training 1 of the 2 runs, which are not in the tables" in capsys.readouterr().err
     assert cli.main(flags) == 0
     assert len(tables.read(tmp_path)) == 2

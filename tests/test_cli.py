@@ -89,7 +89,7 @@ def test_an_existing_run_is_never_overwritten(finished, capsys):
     out = finished[0]
     before = {path: path.read_bytes() for path in out.iterdir()}
     assert cli.main(["--out", str(out)]) == 2
-    assert f"error: out: {out} is there already and is never overwritten" in capsys.readouterr().err
+    assert f"error: out: {out} exists and is never overwritten" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 

@@ -116,7 +116,7 @@ def test_a_config_gives_the_same_settings_again(trained, capsys):
     printed = capsys.readouterr().out
     assert f"settings of {trained / 'config.json'}: point_mass:PointMass, sampler future, seed 3" in printed
     assert f"written by mjx-dher {mjx_dher.__version__}, physics none" in printed
-    assert "given beside it: gamma 0.5 (0.95 in the file)" in printed
+    assert "changes: gamma 0.5 (0.95 in the file)" in printed
 
 
 def test_a_run_that_is_trained_again_from_its_config_is_the_same_to_the_bit(trained, tmp_path):

@@ -171,7 +171,7 @@ def test_files_that_were_changed_are_not_drawn(tmp_path, capsys):
     (run / "metrics.csv").write_text("".join(lines[:-3]))
     for command in ("plot", "report"):
         assert cli.main([command, str(run)]) == 2
-        assert "metrics.csv has whole lines of 9 of 12 epochs" in capsys.readouterr().err
+        assert "metrics.csv has complete lines of 9 of 12 epochs" in capsys.readouterr().err
 
 
 # The command `report`

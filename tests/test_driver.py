@@ -93,7 +93,7 @@ def test_a_library_call_trains_runs_side_by_side(trained):
     folder, specs, results, seen, said = trained
     assert [result.status for result in results] == ["finished", "failed", "finished"]
     assert seen == [1, 2, 3]
-    assert "compiling for 3 runs side by side, of 3" in said[0]
+    assert "compiling for 3 parallel runs of 3" in said[0]
     assert run_folder.read_spec(results[2].folder) == specs[2]
     assert len((results[0].folder / "metrics.jsonl").read_text().splitlines()) == 3
     assert mjx_dher.load_policy(results[0].folder)({"observation": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)

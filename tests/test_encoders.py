@@ -133,7 +133,7 @@ def test_only_dicts_lists_and_tuples_can_be_stored():
         TASK, observation=({"b": [TASK.observation], "a": TASK.observation},), reward_range=(-np.inf, 1.0)
     )
     assert learner_policy.from_json(learner_policy.to_json(nested)) == nested
-    with pytest.raises(ValueError, match="observation must be made of dicts"):
+    with pytest.raises(ValueError, match="observation must consist of dicts"):
         learner_policy.to_json(dataclasses.replace(TASK, observation=networks.Networks(TASK.observation, TASK.observation)))
 
 

@@ -209,7 +209,7 @@ def test_a_chunk_resumes_where_it_was_on_another_node(tmp_path, killed, monkeypa
         assert worker.train(chunk, make_point_mass, stops) == [b"", b""]
     parcels = worker.train(chunk, make_point_mass, lambda news: told.append(news) or False)
     assert [news.steps / CONFIG.total_steps / 2 for news in told] == ([2, 3, 4] if killed else [3, 4])
-    assert any("going on from" in line for line in told[0].lines)
+    assert any("resuming from" in line for line in told[0].lines)
     for trial, parcel in zip(trials, parcels):
         worker.unpack(grid.folder_of(tmp_path / "fleet", trial), trial, parcel)
     for name in (tables.RESULTS, tables.FINALS):

@@ -49,7 +49,7 @@ def test_twenty_four_trials_on_four_nodes_have_the_tables_of_one_program(bench, 
         assert nodes.workers() == []
     assert len(bench.table(tmp_path / "fleet", "finals.csv")) == 24
     assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
-    assert "ray: nodes 4, tasks at once 4, GPUs of a task 0, its CPUs 1; 24 runs" in (tmp_path / "fleet.log").read_text()
+    assert "ray: 4 nodes, 4 parallel tasks, each with 0 GPUs and 1 CPUs; 24 runs" in (tmp_path / "fleet.log").read_text()
 
 
 def test_kills_of_a_worker_a_node_and_the_driver_cost_no_trial(bench):
@@ -89,7 +89,7 @@ def test_a_signal_ends_a_fleet_in_order_and_the_same_command_goes_on(bench, tmp_
     assert "stopping when this epoch has ended" in log.read_text()
     assert list((tmp_path / "sweep" / "unfinished").glob("fleet-*/*/chunk.json"))
     bench.finished(bench.sweep(tmp_path / "sweep", *flags))
-    assert "going on from" in log.read_text()
+    assert "resuming from" in log.read_text()
     assert not (tmp_path / "sweep" / "unfinished").exists()
 
 

@@ -19,7 +19,7 @@ def test_a_polyak_that_is_likely_a_tau_is_explained():
     for polyak, told in ((0.05, True), (0.95, False)):
         console = Console(file=io.StringIO(), width=200)
         common.warn_of_tau(polyak, console)
-        assert ("it is 1 - tau of other libraries" in console.file.getvalue()) == told
+        assert ("it is 1 - tau in other libraries" in console.file.getvalue()) == told
 
 
 def test_every_foreign_flag_names_one_that_is_there(capsys):

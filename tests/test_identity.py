@@ -216,7 +216,7 @@ def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(st
     content = (stopped / "metrics.csv").read_text().splitlines(keepends=True)
     (stopped / "metrics.csv").write_text("".join(content[:lines]) + content[lines][:-5])
     status, text = resume(stopped, capsys)
-    assert f"epoch-000004 is of a later epoch than the last whole line of metrics.csv, {lines - 1}" in text
+    assert f"epoch-000004 has a later epoch than the last complete line of metrics.csv, {lines - 1}" in text
     assert (status, "epoch-000002, after epoch 2" in text) == (0, True)
     assert rows_of(stopped) == rows_of(whole)
 
@@ -225,7 +225,7 @@ def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(st
 def test_metrics_that_are_damaged_are_named(stopped, capsys, content):
     (stopped / "metrics.csv").write_bytes(content)
     status, text = resume(stopped, capsys)
-    assert (status, "later epoch than the last whole line of metrics.csv, 0" in text) == (2, True)
+    assert (status, "later epoch than the last complete line of metrics.csv, 0" in text) == (2, True)
     assert (stopped / "metrics.csv").read_bytes() == content
     assert len(run_folder.checkpoints(stopped)) == 2
 

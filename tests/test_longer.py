@@ -47,9 +47,7 @@ def test_a_run_that_goes_on_is_as_one_that_was_longer_from_the_start(kept, tmp_p
 def test_no_more_steps_are_nothing_to_go_on_for(kept, more, capsys):
     before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
     assert cli.main(["resume", str(kept), *more]) == 2
-    assert (
-        "has ended after 200 environment steps; total_steps must be more than that for it to go on" in capsys.readouterr().err
-    )
+    assert "has ended after 200 environment steps; total_steps must be larger to resume it" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
 
 
@@ -58,7 +56,7 @@ def test_a_run_that_kept_nothing_says_how_to_train_a_longer_one(tmp_path, capsys
     assert cli.main([*FLAGS, "--out", str(out)]) == 0
     assert cli.main(["resume", str(out), "--total-steps", "200"]) == 2
     error = capsys.readouterr().err
-    assert "has ended; there is nothing to go on with: --keep-end would have kept a checkpoint of its end" in error
+    assert "has ended; there is nothing to resume: --keep-end would have kept its last checkpoint" in error
     assert f"`train.py --config {out} --total-steps N`" in error
 
 
@@ -67,7 +65,7 @@ def test_what_falling_step_sizes_do_is_said(tmp_path, capsys):
     out = tmp_path / "run"
     assert cli.main([*FLAGS, "--keep-end", "--lr-end", "0.1", "--out", str(out)]) == 0
     assert cli.main(["resume", str(out), "--total-steps", "160", "--no-curve"]) == 0
-    assert "step sizes fall to 0.1 of their start over the whole run, whose length has changed" in capsys.readouterr().out
+    assert "learning rates fall to 0.1 of their start over the whole run. Its length has changed" in capsys.readouterr().out
     assert len(rows_of(out)) == 4
 
 
@@ -77,7 +75,7 @@ def test_a_run_that_stop_at_has_ended_goes_on_when_asked(tmp_path, capsys, monke
     assert cli.main([*FLAGS, "--keep-end", "--stop-at", "0.5", "--out", str(out)]) == 0
     assert result_of(out)["epochs"] == 2
     assert cli.main(["resume", str(out)]) == 2
-    assert "at its stop_at 0.5: give --total-steps, or another --stop-at, to go on" in capsys.readouterr().err
+    assert "at its stop_at 0.5: pass --total-steps, or another --stop-at, to resume" in capsys.readouterr().err
     assert cli.main(["resume", str(out), "--total-steps", "160", "--no-curve"]) == 0
     assert len(rows_of(out)) == 4
 

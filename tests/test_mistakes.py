@@ -235,7 +235,7 @@ def test_a_run_that_has_gone_bad_fails_and_says_why(tmp_path, env, parts, reason
         (
             None,
             {"sampler": "mistakes:nan_late"},
-            r"epoch 1: for 0\.\d+ of the transitions to be relabelled the sampler offers no",
+            r"epoch 1: the sampler offers no goal for 0\.\d+ of the transitions to relabel",
         ),
     ],
 )

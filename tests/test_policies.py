@@ -93,7 +93,7 @@ def test_one_is_played_by_its_name(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["eval", "reach", "--episodes", "20"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("reach: the policy of the package; its card is ")
+    assert out.startswith("reach: the bundled policy; its card is ")
     assert float(out.split("success ")[1].split()[0]) >= 0.9
     assert cli.main(["export", "reach", "--format", "safetensors"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["reach.safetensors"]  # nothing is written into the package
@@ -105,7 +105,7 @@ def test_a_run_folder_by_the_name_comes_first(monkeypatch, tmp_path, capsys):
     assert bundled.find("push") == (tmp_path / "push").relative_to(tmp_path)
     assert mjx_dher.load_policy("push").sizes == SIZES["reach"]
     assert cli.main(["export", "push", "--format", "safetensors"]) == 0
-    assert "push: the run in the current folder, not the policy of the package by that name" in capsys.readouterr().out
+    assert "push: the run in the current folder, not the bundled policy of this name" in capsys.readouterr().out
     assert (tmp_path / "push" / "policy.safetensors").exists()
 
 

@@ -155,7 +155,7 @@ def test_two_processes_train_reach_and_one_is_killed(tmp_path, victim):
     before = len(rows_of(folder))
     assert 3 <= before < 40
     first, second = both(*command)
-    epoch = int(re.search(r"going on from .* after epoch (\d+)", first)[1])
+    epoch = int(re.search(r"resuming from .* after epoch (\d+)", first)[1])
     assert before - 2 <= epoch <= before
     assert [row["epoch"] for row in rows_of(folder)] == list(range(1, 41))
     assert json.loads((folder / "result.json").read_text())["status"] == "finished"
@@ -220,7 +220,7 @@ def test_two_processes_resume_a_run(tmp_path):
     pair = run_pair(free_port(), "train.py", "resume", folder, "--distributed")
     first, second = (process.communicate(timeout=500)[0] for process in pair)
     assert [process.returncode for process in pair] == [0, 0], first + second
-    assert "going on from" in first
+    assert "resuming from" in first
     assert "epoch" not in second
     assert [row["epoch"] for row in rows_of(folder)] == list(range(1, 41))
     assert json.loads((folder / "result.json").read_text())["status"] == "finished"

@@ -180,7 +180,7 @@ def test_what_ran_side_by_side_goes_on_from_its_checkpoint_to_the_same_tables(tm
     run(whole, trials, lanes=4, on_epoch=look)
     assert [epoch for epoch, _ in seen] == [4, 5, 1, 2, 3, 4, 5]
     assert seen[1][1] <= seen[-1][1]  # one state in memory, as from the start
-    assert any("going on from" in line and "after epoch 3" in line for line in said)
+    assert any("resuming from" in line and "after epoch 3" in line for line in said)
     assert not (cut / "unfinished").exists()
     assert table(cut) == table(whole)
     assert table(cut, tables.FINALS) == table(whole, tables.FINALS)
@@ -241,7 +241,7 @@ def test_without_a_checkpoint_that_fits_runs_begin_anew(tmp_path, harm):
     on_epoch = lambda specs, progress: seen.append(progress.epoch)  # noqa: E731
     run(tmp_path, trials, lanes=4 if harm == "damaged" else 2, on_epoch=on_epoch, report=said.append)
     assert seen == [1, 2, 3, 4, 5] * (1 if harm == "damaged" else 2)
-    assert any("manifest.json is not as it was written" in line for line in said) == (harm == "damaged")
+    assert any("manifest.json has changed" in line for line in said) == (harm == "damaged")
     assert [len(cell["curve"]["epoch"]) for cell in tables.read(tmp_path)] == [5] * 4
     assert not (tmp_path / "unfinished").exists()
 
@@ -288,7 +288,7 @@ def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, m
     monkeypatch.setattr(memory, "available_bytes", lambda: 250_000)
     told, sizes = [], []
     run(tmp_path, trials, lanes=4, report=told.append, on_epoch=lambda specs, _: sizes.append(len(specs)))
-    assert "compiling for 4 runs side by side, of 4" in told[0]
+    assert "compiling for 4 parallel runs of 4" in told[0]
     assert "compiling for 4 runs" not in told[2]
     assert sum(sizes) == 4
     assert 1 <= max(sizes) < 4

@@ -141,9 +141,9 @@ def test_bad_arguments_are_refused_before_anything_is_written(tmp_path, argument
 def test_a_folder_that_holds_something_else_is_refused(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("")
     assert cli.main(["sweep", "--out", str(tmp_path)]) == 2
-    assert "holds something else than a sweep" in capsys.readouterr().err
+    assert "holds something other than a sweep" in capsys.readouterr().err
     assert cli.main(["plot", str(tmp_path)]) == 2
-    assert "is neither a run folder nor that of a sweep" in capsys.readouterr().err
+    assert "is neither a run folder nor a sweep" in capsys.readouterr().err
     assert cli.main(["plot", str(tmp_path), "--formats", "jpg"]) == 2
     assert "formats must be among png, svg, pdf; got jpg" in capsys.readouterr().err
 

@@ -296,7 +296,7 @@ def test_a_file_that_lacks_a_setting_is_rejected_or_names_it(here, capsys):
     del content["config"]["num_critics"]
     (here / "run" / "config.json").write_text(json.dumps(content))
     assert cli.main(["--config", "run", "--dry-run"]) == 0
-    assert "edited since, and it lacks num_critics" in capsys.readouterr().out
+    assert "edited since; it lacks num_critics" in capsys.readouterr().out
     del content["config"]["batch_size"]
     (here / "run" / "config.json").write_text(json.dumps(content))
     assert cli.main(["--config", "run", "--dry-run"]) == 2

@@ -159,13 +159,13 @@ def test_a_hand_moves_the_goal(port):
 # The commands
 
 BAD = [
-    ([], ["view takes run folders, policies of the package", "push", "--env"]),
+    ([], ["view needs run folders, bundled policies", "push", "--env"]),
     (["nowhere"], ["nowhere is not a run folder: no such folder"]),
     (["docs"], ["docs is not a run folder: it has no config.json"]),
     (["pusch"], ["did you mean 'push'?"]),
     (["--env", "sldie"], ["env must be one of", "did you mean 'slide'?"]),
     (["push", "--engine", "wrap"], ["engine", "'wrap'"]),
-    (["push", "--env-kwargs", "x"], ["env_kwargs must be NAME=VALUE each"]),
+    (["push", "--env-kwargs", "x"], ["env_kwargs must be NAME=VALUE"]),
     (["push", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
     (["push", "--port", "70000"], ["port must lie in [0, 65535]"]),
     (["push", "--host", "192.0.2.1"], ["host '192.0.2.1' is no address of this machine"]),
@@ -220,8 +220,8 @@ def begun(*argv, **variables):
 
 def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
     process, lines = begun("demo", "--port", str(port), PYTHONFAULTHANDLER="1")
-    assert lines[-1] == f"push is at play: http://127.0.0.1:{port} (Ctrl-C ends it)\n"
-    assert process.stdout.readline() == "there is no browser here that could be opened: open that address in one\n"
+    assert lines[-1] == f"showing push: http://127.0.0.1:{port} (Ctrl-C ends it)\n"
+    assert process.stdout.readline() == "no browser was found: open that address in one\n"
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10) as answer:
         assert answer.status == 200
     process.send_signal(signal.SIGINT)

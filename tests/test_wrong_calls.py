@@ -93,7 +93,7 @@ def test_a_run_goes_on_when_its_output_is_lost(redirect, message):
     status, error = shell(TRAINS, redirect)
     assert status == 0
     assert "Traceback" not in error
-    assert (f"error: cannot print ({message}); what was printed since then is lost" in error) == bool(message), error
+    assert (f"error: cannot print ({message}); later output is lost" in error) == bool(message), error
 
 
 def shell(code, redirect):
@@ -145,12 +145,12 @@ def faulty(argv, console):
     ("error", "message"),
     [
         (OSError(28, "No space left on device", "a/b"), "error: a/b: No space left on device"),
-        (MemoryError("Unable to allocate 3 TiB"), "error: memory does not suffice (Unable to allocate 3 TiB); what decides it"),
+        (MemoryError("Unable to allocate 3 TiB"), "error: out of memory (Unable to allocate 3 TiB); it depends on"),
         (
             RuntimeError("RESOURCE_EXHAUSTED: Out of memory"),
-            "error: memory does not suffice (RESOURCE_EXHAUSTED: Out of memory)",
+            "error: out of memory (RESOURCE_EXHAUSTED: Out of memory)",
         ),
-        (RecursionError("maximum recursion depth exceeded"), "error: something is nested too deeply"),
+        (RecursionError("maximum recursion depth exceeded"), "error: the input is nested too deeply"),
         (ValueError("one\ntwo"), "error: one\nerror: two"),
     ],
 )

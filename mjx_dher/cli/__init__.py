@@ -1,4 +1,4 @@
-"""The command line: `python train.py COMMAND`, a file a command. No JAX or MuJoCo before the arguments have been checked."""
+"""The command line: `python train.py COMMAND`, one file per command. Arguments are checked before JAX or MuJoCo is loaded."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS, run
 from mjx_dher.system import signals
 
-MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that decide it
-TRAINING = ("train", "resume", "sweep")  # commands whose purpose is on the disk, not on the screen
+MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that need it
+TRAINING = ("train", "resume", "sweep")  # commands whose output is on disk, not on the screen
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (2: invalid arguments)."""
-    # Else Python looks for cycles among all objects before it ends, which takes half a second after a run.
+    """Runs the command line. Returns the exit status (2: invalid arguments)."""
+    # Skips the final search for reference cycles, which takes half a second after a run.
     atexit.register(gc.freeze)
     argv = list(sys.argv[1:] if argv is None else argv)
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with signals.taken(), output.guarded() as stream:
         try:
             ended = _run(name, argv)
-        except SystemExit as error:  # of --help, and of arguments that cannot be parsed
+        except SystemExit as error:  # from --help, or invalid arguments
             ended, trains = error.code if isinstance(error.code, int) else 1, False
         finally:
             trust.everything = False
@@ -46,7 +46,7 @@ def _run(name: str, argv: list[str]) -> int:
         return run(name, argv, output.PlainConsole(soft_wrap=True))
     except Exception as error:
         if (reason := sentence(error)) is None:
-            raise  # a fault of this program, whose place its report should have
+            raise  # a bug, whose traceback is needed
         with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
             for line in reason.splitlines():
                 print(f"error: {output.printable(line)}", file=sys.stderr)
@@ -60,9 +60,9 @@ def sentence(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
-        return f"memory does not suffice ({_first_line(error)}); what decides it: {', '.join(MEMORY)}"
+        return f"out of memory ({_first_line(error)}); it depends on {', '.join(MEMORY)}"
     if isinstance(error, RecursionError):
-        return f"something is nested too deeply ({_first_line(error)})"
+        return f"the input is nested too deeply ({_first_line(error)})"
     return None
 
 

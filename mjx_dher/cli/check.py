@@ -23,7 +23,7 @@ CheckArgs: Any = dataclasses.make_dataclass(
     ],
     frozen=True,
 )
-CheckArgs.__doc__ = """Test custom components (module:attribute) on random episodes, as `train` does before it begins.
+CheckArgs.__doc__ = """Test custom components (module:attribute) on random episodes, as `train` does before it starts.
 
 A component is tested with the others: `--sampler weighted` reads a custom kernel, for example. Exits with status 0 if all
 pass, else with status 2 and the first error.
@@ -36,7 +36,7 @@ def check_command(argv: list[str], console: Console) -> int:
     run = presets.preset("cpu", **vars(args))
     spec.validate(run)
     if not spec.custom_components(run):
-        raise ValueError("check takes one or more components as module:attribute; all of these are built in")
+        raise ValueError("check needs one or more components as module:attribute; all of these are built in")
     prepare()
     from mjx_dher.testing import verdicts
 

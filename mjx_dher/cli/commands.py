@@ -1,4 +1,4 @@
-"""The commands by name, where each is, and how its arguments are parsed."""
+"""The commands by name, with their modules, and the parser of their arguments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mjx_dher.lookup import command_name
 
 Args = TypeVar("Args")
 
-# Each command, and the function (argv, console) -> exit status. Its module also has the class of its arguments: EvalArgs.
+# Function (argv, console) -> exit status of each command. Its module also has the class of its arguments, such as EvalArgs.
 COMMANDS = {
     "train": "mjx_dher.cli.train:train_command",
     "resume": "mjx_dher.cli.train:resume_command",
@@ -32,7 +32,7 @@ COMMANDS = {
     "doctor": "mjx_dher.cli.doctor:doctor_command",
     "completion": "mjx_dher.cli.completion:completion_command",
 }
-# Flags here, and what other libraries call them.
+# Our flags, and their names in other libraries.
 _FOREIGN = {
     "--actor-lr and --critic-lr": "--learning-rate --lr",
     "--actor-lr": "--policy-lr",
@@ -58,7 +58,7 @@ FOREIGN_FLAGS = {theirs: ours for ours, flags in _FOREIGN.items() for theirs in 
 
 
 def run(name: str, argv: Sequence[str], console: Console) -> int:
-    """Runs a command; returns its exit status."""
+    """Runs a command. Returns its exit status."""
     module, function = COMMANDS[name].split(":")
     return int(getattr(importlib.import_module(module), function)(list(argv), console))
 
@@ -68,11 +68,11 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
 
     Args:
       kind: class of the arguments, such as EvalArgs.
-      argv: the words after the command's name.
-      **options: more arguments of `tyro.cli`.
+      argv: words after the command's name.
+      **options: other arguments of `tyro.cli`.
 
     Raises:
-      ValueError: a flag of another library; the message names ours.
+      ValueError: a flag of another library. The message names ours.
     """
     import tyro
 

@@ -1,4 +1,4 @@
-"""What commands share: flags, progress on the screen, the summary of an evaluation."""
+"""Shared parts of the commands: flags, progress on the screen, and the summary of an evaluation."""
 
 from __future__ import annotations
 
@@ -28,55 +28,55 @@ if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
 CURVE_WIDTH = 24  # characters of the live curve
-Devices = int | Literal["all"]  # of the option --devices
-VIEW_PORT = 8080  # of the viewer's page
-SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress, where there is no terminal
+Devices = int | Literal["all"]  # type of --devices
+VIEW_PORT = 8080  # port of the viewer
+SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress without a terminal
 
-LEAST_LIKELY_POLYAK = 0.5  # one below is likely meant as tau
+LEAST_LIKELY_POLYAK = 0.5  # a smaller one is probably meant as tau
 
 
 def warn_of_tau(polyak: float, console: Console) -> None:
-    """Explains a small polyak, which was likely meant as the tau of other libraries."""
+    """Explains a small polyak, which is probably meant as the tau of other libraries."""
     if polyak < LEAST_LIKELY_POLYAK:
         console.print(
-            f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau of other libraries"
+            f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau in other libraries"
         )
 
 
 def check_episodes(episodes: int, seed: int) -> None:
-    """Raises ValueError for a number of episodes, or a seed, that cannot be played."""
+    """Raises ValueError for an invalid number of episodes or seed."""
     check_count("episodes", episodes)
     check_number("seed", seed, "[0, 4294967295]")
 
 
 def check_engine(engine: str | None) -> None:
-    """Raises ValueError for a name that is no engine."""
+    """Raises ValueError for an unknown engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
 
 
 def make_env(run: RunSpec, engine: str | None = None) -> Any:
-    """Makes the environment of a run, with another engine than the run's if one is given."""
+    """Makes the environment of a run, with `engine` instead of the run's if given."""
     return envs.make(run.env, engine=engine or run.engine, **run.env_arguments)
 
 
 def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
-    """Returns a run whose environment has the arguments in `env_kwargs` in place of its own of these names."""
+    """Run whose environment's arguments are updated with `env_kwargs`."""
     return dataclasses.replace(run, env_kwargs=to_texts({**run.env_arguments, **to_arguments(env_kwargs)}))
 
 
 def settle_compiler(engine: str) -> None:
-    """Avoids a deadlock of MJX programs on a CPU; call it before JAX starts.
+    """Avoids a deadlock of MJX programs on a CPU. Call it before JAX starts.
 
-    With jaxlib 0.10.2 some 300 environments of `jax` that have objects make XLA's CPU backend lose a task. Its older order of
-    operations does not (https://github.com/openxla/xla; no upstream issue known).
+    With jaxlib 0.10.2, some 300 environments of `jax` with objects make XLA's CPU backend lose a task. Its older scheduler
+    does not (https://github.com/openxla/xla; no upstream issue known).
     """
     if engine == "jax" and "concurrency_optimized_scheduler" not in (flags := os.environ.get("XLA_FLAGS", "")):
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_enable_concurrency_optimized_scheduler=false".strip()
 
 
 def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
-    """Tests the custom components of runs of an environment, before anything is compiled or written.
+    """Tests the custom components of runs before anything is compiled or written.
 
     Raises:
       ValueError: names the component and the first violation.
@@ -89,7 +89,7 @@ def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None
 
 
 def find_run(run: Path, console: Console) -> Path:
-    """Finds the run folder or bundled policy that `run` names, and prints which it is if the name could be either.
+    """Finds a run folder or bundled policy, and prints which it is if the name could be either.
 
     Raises:
       FolderError: there is none.
@@ -98,9 +98,9 @@ def find_run(run: Path, console: Console) -> Path:
 
     path = bundled.find(run)
     if bundled.is_shipped(path):
-        console.print(f"{run}: the policy of the package; its card is {path / bundled.CARD}")
+        console.print(f"{run}: the bundled policy; its card is {path / bundled.CARD}")
     elif str(run) in bundled.names():
-        console.print(f"{run}: the run in the current folder, not the policy of the package by that name")
+        console.print(f"{run}: the run in the current folder, not the bundled policy of this name")
     return path
 
 
@@ -108,7 +108,7 @@ def read_run(path: Path, console: Console) -> RunSpec:
     """Reads the description of the run in `path`, and prints which custom source files have changed since.
 
     Raises:
-      FolderError: no run folder, or a damaged one.
+      FolderError: it is not a run folder, or it is damaged.
     """
     content, spec = run_folder.read_run(path)
     for text in run_folder.changed_code(content, spec):
@@ -117,7 +117,7 @@ def read_run(path: Path, console: Console) -> RunSpec:
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
-    """Prints what `evaluate.summarize` returned."""
+    """Prints the result of `evaluate.summarize`."""
     console.print(
         f"success {summary['success_rate']:.3f} (95 % interval {summary['success_low']:.3f} to {summary['success_high']:.3f},"
         f" {summary['episodes']} episodes); already at reset {summary['reset_success_rate']:.3f};"
@@ -126,7 +126,7 @@ def print_summary(summary: dict[str, Any], console: Console) -> None:
 
 
 def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> None:
-    """Prints a whole table; row by row on a terminal that is narrower than it."""
+    """Prints a table in full, row by row if the terminal is too narrow."""
     table = Table(*head)
     for row in rows:
         table.add_row(*row)
@@ -143,7 +143,7 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
 def compare(
     folder: Path, by_env: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
 ) -> Sequence[comparison.Row]:
-    """Prints the comparison of all settings of a sweep, and writes it into the folder."""
+    """Prints the comparison of all settings of a sweep, and writes it to `folder`. Returns its rows."""
     from mjx_dher.sweeps import comparison
 
     rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
@@ -157,27 +157,27 @@ def compare(
 
 
 class Screen:
-    """Progress of one run or many: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s.
+    """Progress of runs: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s.
 
     Args:
-      console: to print to.
-      specs: runs that will be trained.
-      success: success rates of the epochs that had ended, of a run that is resumed.
+      console: console to print to.
+      specs: runs to train.
+      success: success rates of earlier epochs, if a run resumes.
     """
 
     def __init__(self, console: Console, specs: Sequence[RunSpec], success: Sequence[float] = ()):
         self._console, self._single = console, len(specs) == 1
         self._total = sum(spec.config.total_steps for spec in specs)
-        self._done = 0.0  # environment steps, of all runs
-        self._done_before = 0.0  # before those that train now
+        self._done = 0.0  # environment steps of all runs
+        self._done_before = 0.0  # environment steps of earlier runs
         self._present: Sequence[RunSpec] = ()
-        self._trained = 0.0  # since this start of the program, in `_seconds`
+        self._trained = 0.0  # environment steps of this process, in `_seconds`
         self._seconds = 0.0
         self._printed = time.monotonic()
-        self._success = list(success)  # of those that train now, an epoch each
+        self._success = list(success)  # success rates of the current runs, one per epoch
         self._bar: Bar | None = None
         if console.is_terminal:
-            # The curve of one run fills up as the run goes on, and so is its bar. A narrow terminal folds the text.
+            # The growing curve of a single run is its bar. A narrow terminal folds the text.
             bar = () if self._single else (BarColumn(bar_width=20),)
             text = TextColumn("{task.description}", table_column=Column(no_wrap=False, overflow="fold"))
             self._bar = Bar(*bar, TextColumn("{task.fields[curve]}"), text, console=console)
@@ -185,7 +185,7 @@ class Screen:
             self._bar.start()
 
     def show(self, specs: Sequence[RunSpec], progress: Any) -> None:
-        """Shows an epoch of those side by side; `progress` is a `loop.Progress`."""
+        """Shows an epoch of the parallel runs. `progress` is a `loop.Progress`."""
         total = specs[0].config.total_steps
         if list(specs) != list(self._present):
             self._success = [] if self._present else self._success
@@ -206,7 +206,7 @@ class Screen:
             self._printed = time.monotonic()
 
     def _line_of_one(self, progress: Any, eta: str) -> str:
-        per_second = 1 / (progress.epoch * progress.epoch_seconds)  # all epochs are alike
+        per_second = 1 / (progress.epoch * progress.epoch_seconds)  # all epochs are equal
         return (
             f"epoch {progress.epoch}/{progress.num_epochs}  {progress.env_steps:,} steps"
             f"  {progress.env_steps * per_second:,.0f} steps/s  {progress.updates * per_second:,.0f} updates/s"
@@ -232,10 +232,7 @@ class Screen:
 
 
 def sparkline(rates: Sequence[float], total: int, width: int = CURVE_WIDTH, ascii_only: bool = False) -> str:
-    """Returns a curve of rates in [0, 1], an epoch each, in at most `width` characters that stand for as many epochs each.
-
-    Those that are left of `total` epochs are points.
-    """
+    """Curve of rates in [0, 1], one per epoch, as at most `width` characters for `total` epochs. Missing epochs are dots."""
     levels, point = (" .:-=+*#", "_") if ascii_only else ("▁▂▃▄▅▆▇█", "·")
     shares = np.array_split(np.arange(total), min(width, total))
     parts = [np.clip(np.nan_to_num(rates[share[0] : share[-1] + 1]), 0, 1) for share in shares]
@@ -243,7 +240,7 @@ def sparkline(rates: Sequence[float], total: int, width: int = CURVE_WIDTH, asci
 
 
 def clock(seconds: float) -> str:
-    """Returns seconds for a reader: "1:02:03"."""
+    """Formats seconds like "1:02:03"."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -21,7 +21,7 @@ class DoctorArgs:
     json: bool = False
     """Print one JSON object instead."""
     seconds: float = 180.0
-    """Time limit of each trial. Warp compiles its kernels, once a machine, for a minute or more."""
+    """Time limit of each test. Warp compiles its kernels once per machine, for a minute or more."""
 
 
 def doctor_command(argv: list[str], console: Console) -> int:

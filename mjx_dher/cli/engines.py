@@ -17,7 +17,7 @@ from mjx_dher.spec import to_arguments
 
 @dataclasses.dataclass(frozen=True)
 class EnginesArgs:
-    """Show which physics engines take the model of a task, and for each other one the reason and a cure."""
+    """Show which physics engines support the model of a task, and for each other one the reason and a fix."""
 
     env: tyro.conf.Positional[str]
     """Task, or module:attribute."""
@@ -28,12 +28,12 @@ class EnginesArgs:
 
 
 def engines_command(argv: list[str], console: Console) -> int:
-    """Shows which engines take a task's model."""
+    """Shows which engines support a task's model."""
     args = parse(EnginesArgs, argv)
     env = envs.make(args.env, engine="native" if envs.takes_engine(args.env) else "auto", **to_arguments(args.env_kwargs))
     model = getattr(env, "model", None)
     if not isinstance(model, mujoco.MjModel):
-        raise ValueError(f"env {args.env!r} has no attribute `model`, a mujoco.MjModel, to look at")
+        raise ValueError(f"env {args.env!r} must have an attribute `model`, a mujoco.MjModel")
     from mjx_dher.envs.engines.explain import explain
 
     verdicts = explain(model)

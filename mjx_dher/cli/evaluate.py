@@ -30,29 +30,29 @@ from mjx_dher.system.caches import keep_compiled_programs
 
 @dataclasses.dataclass(frozen=True)
 class EvalArgs:
-    """Evaluate a policy again, or several, one after the other: those of run folders, or of the package, such as push."""
+    """Evaluate the policies of run folders, or bundled policies, one after the other."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, or policies of the package, such as push."""
+    """Run folders, or bundled policies such as push."""
     episodes: int = 500
     """Episodes to play."""
     seed: int = 1
     """Seed of the starts and goals."""
     engine: str | None = None
-    """Physics: native, jax, warp or auto; the run's own unless given."""
+    """Physics: native, jax, warp or auto. Default: the run's."""
     env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
+    """Arguments of the environment as NAME=VALUE, which override the run's."""
     trust: bool = False
-    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
+    """Use code and data that the run folder names even if you have not trained with them on this machine."""
     json: bool = False
-    """Print one JSON object a run, a line each, instead; remarks then go to standard error."""
+    """Print one line of JSON per run instead, and remarks to standard error."""
 
 
 def eval_command(argv: list[str], console: Console) -> int:
     """Evaluates the policies of run folders."""
     args = parse(EvalArgs, argv)
     if not args.runs:
-        raise ValueError("eval takes one or more run folders, or policies of the package; got none")
+        raise ValueError("eval needs one or more run folders or bundled policies; got none")
     check_episodes(args.episodes, args.seed)
     check_engine(args.engine)
     to_arguments(args.env_kwargs)
@@ -63,7 +63,7 @@ def eval_command(argv: list[str], console: Console) -> int:
         settle_compiler(args.engine or run.engine)
     from mjx_dher.policy.load import load_policy
 
-    policies = [load_policy(folder) for folder in folders]  # all of them, before any is played
+    policies = [load_policy(folder) for folder in folders]  # all, before any is played
     keep_compiled_programs()
     for path, run, policy in zip(args.runs, runs, policies):
         _evaluate(args, path, run, policy, console)
@@ -71,7 +71,7 @@ def eval_command(argv: list[str], console: Console) -> int:
 
 
 def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Console) -> None:
-    """Plays the policy of one run, and prints the summary."""
+    """Plays the policy of one run and prints the summary."""
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits
 

@@ -23,14 +23,14 @@ class ExportArgs:
     """
 
     run: tyro.conf.Positional[Path]
-    """Run folder, or a policy of the package, such as push."""
+    """Run folder, or a bundled policy such as push."""
     format: str
-    """Format: onnx (a graph from observation and goal to action) or safetensors (the tensors alone)."""
+    """Format: onnx (a graph from observation and goal to action) or safetensors (only the tensors)."""
     out: Path | None = None
-    """File to write, which ends in the format's name; policy.onnx or policy.safetensors in the run folder unless
-    given, and push.onnx or so in the current one for a policy of the package."""
+    """File to write, which ends in the format's name. Default: policy.onnx or policy.safetensors in the run folder, or for a
+    bundled policy, push.onnx or the like in the current folder."""
     overwrite: bool = False
-    """Replacement of an existing `out`."""
+    """Replace an existing file."""
 
 
 def export_command(argv: list[str], console: Console) -> int:

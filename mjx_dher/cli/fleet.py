@@ -25,7 +25,7 @@ from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
 from mjx_dher.system.caches import prepare
 
-SECONDS_WITHOUT_NEWS = 8.0  # of a cluster, after a signal: it has gone
+SECONDS_WITHOUT_NEWS = 8.0  # after a signal; then the cluster is gone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Order:
     engine: str
     lanes: int | None
     options: Options
-    make_trials: Callable[[str], list[RunSpec]]  # for a preset, cpu or gpu, if the user names none
-    announce: Callable[[list[RunSpec]], list[RunSpec]]  # prints the work that is left, and returns its trials
+    make_trials: Callable[[str], list[RunSpec]]  # takes the preset, cpu or gpu, to use if the user names none
+    announce: Callable[[list[RunSpec]], list[RunSpec]]  # prints the remaining work, and returns its trials
 
     @property
     def storage(self) -> Path | None:
@@ -50,7 +50,7 @@ class Order:
 
 
 def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
-    """Trains a chunk in a worker of Ray's."""
+    """Trains a chunk in a Ray worker."""
     settle_compiler(chunk.specs[0].engine)
     prepare()
     return worker.train(chunk, make_env, tell)
@@ -72,7 +72,7 @@ def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec]]
     with cluster.joined(str(order.fleet.ray), code) as ray:
         task = chunks.task_of(order.fleet.ray_cpus, ray.resources())
         trials = order.make_trials("gpu" if task.gpus else "cpu")
-        _try_own(trials, order.engine, console)  # JAX starts here: Ray's processes are forked before
+        _try_own(trials, order.engine, console)  # JAX starts here, after Ray has forked its processes
         report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
         if order.storage is not None:
             try:
@@ -98,11 +98,11 @@ def _train(
     report: Callable[[str], None],
     console: Console,
 ) -> None:
-    """Trains runs that no other program has, until a signal asks for a stop."""
+    """Trains runs that no other process trains, until a signal requests a stop."""
     nodes = [node for node in ray.resources() if task.slots(node)]
     slots = sum(map(task.slots, nodes))
     report(
-        f"ray: nodes {len(nodes)}, tasks at once {slots}, GPUs of a task {task.gpus}, its CPUs {task.cpus}; {len(todo)} runs"
+        f"ray: {len(nodes)} nodes, {slots} parallel tasks, each with {task.gpus} GPUs and {task.cpus} CPUs; {len(todo)} runs"
     )
     before = chunks.unfinished(order.storage, trials, todo)
     others = [run for run in todo if not any(run in chunk for chunk in before)]
@@ -129,7 +129,7 @@ def _train(
 
 
 def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
-    """Tries out custom components on this machine."""
+    """Tests custom components on this machine."""
     for _, group in itertools.groupby(specs, key=lambda run: run.env):
         own = list({dataclasses.replace(run, seed=0): None for run in group})
         if any(map(spec.custom_components, own)):
@@ -138,7 +138,7 @@ def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
 
 
 class _Screen:
-    """Progress of all nodes, a line now and then."""
+    """Progress of all nodes, as a line now and then."""
 
     def __init__(self, console: Console, specs: Sequence[RunSpec]):
         self._console, self._runs = console, len(specs)

@@ -16,17 +16,17 @@ from mjx_dher.policy import bundled
 ENGINES = {
     "auto": "native on a CPU, warp on an NVIDIA GPU, else jax",
     "native": "MuJoCo C on all cores of the host",
-    "jax": "MJX, wherever JAX runs",
-    "warp": "a kernel of this library for NVIDIA GPUs (extra cuda)",
+    "jax": "MJX, on any device that JAX supports",
+    "warp": "our kernel for NVIDIA GPUs (extra cuda)",
 }
 PRESETS = {
-    "auto": "cpu or gpu, the one for this machine",
+    "auto": "cpu or gpu, depending on this machine",
     "cpu": "tuned for time to success on two cores, with native",
     "gpu": "tuned for time to success on one NVIDIA GPU, with warp",
-    "frugal": "tuned for success after few environment steps",
+    "frugal": "tuned for few environment steps",
     "paper": "the settings of the paper",
 }
-FIELDS = {  # kinds of components, and the field of RunSpec that names one
+FIELDS = {  # kinds of components, and their field of RunSpec
     "tasks": "env",
     "samplers": "sampler",
     "kernels": "weight_kernel",
@@ -42,19 +42,19 @@ KINDS = ("tasks", "engines", "presets", *list(FIELDS)[1:], "policies")
 
 @dataclasses.dataclass(frozen=True)
 class ListArgs:
-    """List all tasks, engines, presets, components (samplers, learners and so on) and policies, a line each.
+    """List all tasks, engines, presets, components (samplers, learners and so on) and policies, one per line.
 
     Every component can also be custom, as module:attribute (docs/tutorial.md).
     """
 
     kinds: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Kinds to list, such as tasks; all by default."""
+    """Kinds to list, such as tasks. Default: all."""
     json: bool = False
     """Print one JSON object instead: name and line by kind."""
 
 
 def names(kind: str) -> tuple[str, dict[str, str]]:
-    """The option that takes a name of this kind, and a line on each name."""
+    """The option that takes names of this kind, and a line about each name."""
     if kind == "engines":
         return "--engine", ENGINES
     if kind == "presets":

@@ -1,4 +1,4 @@
-"""Standard output that a command can lose without losing what it does."""
+"""Standard output that may fail without stopping the command."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-# Characters that act on a terminal or reverse its text, in place of being printed: all but tab and line feed.
+# Characters that control a terminal or reverse its text, except tab and line feed.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
-_BYTES = re.compile("[\udc80-\udcff]+")  # of a file name, as Python decodes them
+_BYTES = re.compile("[\udc80-\udcff]+")  # undecodable bytes of a file name
 
 
 def printable(text: str) -> str:
-    """Text with its control characters escaped, and the bytes of file names that the locale cannot decode as UTF-8."""
+    """Text with escaped control characters, and escaped bytes of file names that are not valid UTF-8."""
     text = _BYTES.sub(lambda match: match[0].encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"), text)
     return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
 
 
 class PlainConsole(Console):
-    """A console that prints texts as they are: without markup, and with control characters escaped."""
+    """A console that prints text without markup and with escaped control characters."""
 
     def __init__(self, **options: Any):
         super().__init__(highlight=False, markup=False, emoji=False, **options)
@@ -39,11 +39,11 @@ class PlainConsole(Console):
 
 
 class Guarded:
-    """A text stream that drops what cannot be written, and keeps the first error. All else is the stream's own."""
+    """A text stream that drops text that cannot be written, and keeps the first error."""
 
     def __init__(self, stream: Any):
         self.error: OSError | None = None
-        self._closed = stream is None  # before this program began
+        self._closed = stream is None  # closed before this program started
         self._stream = open(os.devnull, "w", encoding="utf-8") if self._closed else stream  # noqa: SIM115
 
     def write(self, text: str) -> int:
@@ -52,7 +52,7 @@ class Guarded:
         return len(text)
 
     def flush(self) -> None:
-        """Writes what the stream has kept back, or drops it."""
+        """Flushes the stream, or drops its content."""
         self._attempt("flush")
 
     def _attempt(self, method: str, *args: Any) -> None:
@@ -64,7 +64,7 @@ class Guarded:
             getattr(self._stream, method)(*args)
         except OSError as error:
             self.error = error
-            # The interpreter would complain when it flushes what is left.
+            # Otherwise the interpreter would report an error when it flushes the rest.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
@@ -73,20 +73,20 @@ class Guarded:
 
 
 def open_closed() -> None:
-    """Opens the standard streams that the user has closed, onto nothing.
+    """Opens closed standard streams on /dev/null.
 
-    Else the next file that is opened takes the number of one, and what a library in C prints goes into that file.
+    Otherwise the next opened file would get the number of a standard stream, and output of C libraries would go into it.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number
 
 
 @contextlib.contextmanager
 def guarded() -> Iterator[Guarded]:
-    """Guards sys.stdout. A character that it cannot encode is escaped, as on standard error, and as in warnings."""
+    """Guards sys.stdout. Characters that it cannot encode are escaped, and control characters in warnings too."""
     open_closed()
     before, form = sys.stdout, warnings.formatwarning
     if isinstance(before, io.TextIOWrapper):
@@ -102,16 +102,16 @@ def guarded() -> Iterator[Guarded]:
 
 
 def status(stream: Guarded, ended: int, trains: bool) -> int:
-    """Exit status of a command that ended with `ended`; reports output that was lost.
+    """Exit status of a command that ended with `ended`. Reports lost output.
 
-    One that trains has done what it was to do; to another, whose output is its purpose, the loss is an error, or, where the
-    reader has gone (`| head`), what SIGPIPE would have been.
+    A command that trains has still done its work. For others lost output is an error or, if the reader has gone (`| head`),
+    the status of SIGPIPE.
     """
     if stream.error is None:
         return ended
     gone = isinstance(stream.error, BrokenPipeError)
     if not gone or trains:
-        lost = "what was printed since then is lost" if trains else "the output is not complete"
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr may be gone, too
+        lost = "later output is lost" if trains else "the output is incomplete"
+        with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr may be gone too
             print(f"error: cannot print ({stream.error.strerror}); {lost}", file=sys.stderr)
     return ended if trains or ended else (128 + signal.SIGPIPE if gone else 2)

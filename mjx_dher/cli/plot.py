@@ -15,25 +15,25 @@ from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
 from mjx_dher.validation import check_number
 
-TOGETHER = "curves"  # the picture of several runs, without its ending
+TOGETHER = "curves"  # stem of the picture of several runs
 
 
 @dataclasses.dataclass(frozen=True)
 class PlotArgs:
-    """Draw how a run went, several runs together, or a sweep.
+    """Draw the curves of a run, of several runs together, or of a sweep.
 
-    Of a run: success, returns, values and losses, in its folder. Of several: their success together, in the current folder.
-    Of a sweep: learning curves, epochs to a threshold and comparison, in its folder; comparison.csv is written anew.
+    One run: success, returns, values and losses, in its folder. Several runs: their success together, in the current folder. A
+    sweep: learning curves, epochs to a threshold, and comparison, in its folder. comparison.csv is rewritten.
     """
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders, or the folder of one sweep."""
     out: Path | None = None
-    """Folder for the pictures; the run's or the sweep's own unless given, and the current one for several runs."""
+    """Folder for the pictures. Default: the folder of the run or sweep, or the current folder for several runs."""
     threshold: float = 0.9
-    """Success rate for the time that it takes to get there (of a sweep)."""
+    """Success rate for the time to success (for a sweep)."""
     baseline: str = "future"
-    """Setting that the others are compared with: a sampler, or a setting as the table names it (of a sweep)."""
+    """Setting to compare with: a sampler, or a setting as named in the table (for a sweep)."""
     formats: tuple[str, ...] = ("png", "svg")
     """Formats of the pictures: png, svg, pdf."""
 
@@ -52,7 +52,7 @@ def plot_command(argv: list[str], console: Console) -> int:
     if together:
         print_table(*curves.curves_table(runs), console)
     name = TOGETHER if together else curves.CURVE
-    for ending in args.formats:  # drawn anew: a figure that was written before has another layout
+    for ending in args.formats:  # drawn for each, because writing a figure changes its layout
         path = out / f"{name}.{ending}"
         figures.write(curves.draw_together(runs) if together else curves.draw_curve(runs[0]), path)
         console.print(f"wrote {path}")

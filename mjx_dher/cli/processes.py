@@ -18,10 +18,10 @@ from mjx_dher.system.files import FolderError
 
 
 def join(distributed: bool, described: Mapping[str, Any], console: Console) -> Console:
-    """Joins this process to the others if the command is `distributed`; returns a console on which the first one prints.
+    """Joins this process to the others if the command is `distributed`. Returns a console that prints in the first process.
 
     Raises:
-      ValueError: there are no other processes, or their settings, in `described`, or versions differ.
+      ValueError: there are no other processes, or their versions or settings in `described` differ.
     """
     if not distributed:
         return console
@@ -34,13 +34,13 @@ def join(distributed: bool, described: Mapping[str, Any], console: Console) -> C
 
 
 def check_out(distributed: bool, out: Path | None) -> None:
-    """Raises ValueError if several processes are to train a run whose folder has no name."""
+    """Raises ValueError if several processes are to train a run without a named folder."""
     if distributed and out is None:
         raise ValueError("out must name the run folder with --distributed, so that the same command can resume it; got none")
 
 
 def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:
-    """Returns a run's folder, which `stack` keeps locked: a new one, or, if the command `resumes`, one with the same run.
+    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run.
 
     Raises:
       FolderError: it holds something else, or the run has ended.

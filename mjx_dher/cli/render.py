@@ -20,33 +20,33 @@ from mjx_dher.system.caches import check_platform
 
 @dataclasses.dataclass(frozen=True)
 class RenderArgs:
-    """Play the policy of a run folder, one of the package, or random actions, and draw it: a video, or stills side by side.
+    """Draw episodes of a run's or bundled policy, or of random actions, as a video or as stills.
 
-    Needs no screen (EGL or OSMesa draw; MUJOCO_GL chooses) but the extra: `pip install -e ".[video]"`.
+    Needs no screen: EGL or OSMesa draws, as set by MUJOCO_GL. Needs the extra: `pip install -e ".[video]"`.
     """
 
     out: Path
     """File to write: .mp4, .gif or .png (stills of the first episode). Its folder must exist."""
     run: tyro.conf.Positional[Path | None] = None
-    """Run folder, or a policy of the package, such as push; or else give --env."""
+    """Run folder, or a bundled policy such as push. Alternatively pass --env."""
     env: str | None = None
-    """Environment (a name, or module:attribute), played with uniformly random actions, where there is no run folder."""
+    """Environment (a name, or module:attribute) to play with uniformly random actions, instead of a run."""
     episodes: int = 4
     """Episodes to play, one after the other."""
     seed: int = 1
     """Seed of the starts, the goals and the random actions."""
     env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment, NAME=VALUE each, in place of the run's own of these names."""
+    """Arguments of the environment as NAME=VALUE, which override the run's."""
     engine: str | None = None
-    """Physics: native, jax, warp or auto; the run's own unless given."""
+    """Physics: native, jax, warp or auto. Default: the run's."""
     trust: bool = False
-    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
+    """Use code and data that the run folder names even if you have not trained with them on this machine."""
     width: int = 640
-    """Width of a picture, pixels."""
+    """Width in pixels."""
     height: int = 480
-    """Height of a picture, pixels."""
+    """Height in pixels."""
     overwrite: bool = False
-    """Replacement of an existing `out`."""
+    """Replace an existing file."""
 
 
 def render_command(argv: list[str], console: Console) -> int:
@@ -66,13 +66,13 @@ def render_command(argv: list[str], console: Console) -> int:
         check_name("env", args.env, envs.list_envs(), custom=True)
         played, policy = RunSpec(env=args.env), None
     else:
-        raise ValueError(f"render takes either a run folder or --env (one of {', '.join(envs.list_envs())})")
+        raise ValueError(f"render needs either a run folder or --env (one of {', '.join(envs.list_envs())})")
     _draw(changed_arguments(played, args.env_kwargs), policy, args, console)
     return 0
 
 
 def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> None:
-    """Plays episodes and writes their pictures; random ones where there is no policy."""
+    """Plays episodes and writes their pictures. Without a policy, actions are random."""
     from mjx_dher.contract import step_seconds
     from mjx_dher.policy.load import check_fits
     from mjx_dher.tools import render

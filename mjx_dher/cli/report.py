@@ -16,34 +16,34 @@ from mjx_dher.system import files
 from mjx_dher.tools import figures
 from mjx_dher.validation import check_number
 
-EPISODES = 3  # of a video
+EPISODES = 3  # per video
 
 
 @dataclasses.dataclass(frozen=True)
 class ReportArgs:
-    """Write a page about a run or a sweep: curves, tables, settings and videos in one file that opens without a server.
+    """Write an HTML report of a run or a sweep: curves, tables, settings and videos in one file that opens without a server.
 
-    Videos (.mp4, .gif, .webm) that lie in the folder are taken in. Needs the extra: `pip install -e ".[plot]"`.
+    Videos (.mp4, .gif, .webm) in the folder are included. Needs the extra: `pip install -e ".[plot]"`.
     """
 
     folder: tyro.conf.Positional[Path]
-    """Run folder, however far the run came, or the folder of a sweep."""
+    """Run folder, finished or not, or the folder of a sweep."""
     out: Path | None = None
-    """File to write, which ends in .html; report.html in the folder, which it replaces, unless given."""
+    """File to write, which ends in .html. Default: report.html in the folder, which is replaced."""
     overwrite: bool = False
-    """Replacement of an existing `out`."""
+    """Replace an existing file."""
     video: bool = False
-    """Draw a video of the run's policy first, or of the best run of each task of a sweep, into the folder (extra video)."""
+    """First draw a video of the run, or of a sweep's best run per task, into the folder (extra video)."""
     trust: bool = False
-    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
+    """Use code and data that the run folder names even if you have not trained with them on this machine."""
     threshold: float = 0.9
-    """Success rate for the time that it takes to get there (of a sweep)."""
+    """Success rate for the time to success (for a sweep)."""
     baseline: str = "future"
-    """Setting that the others are compared with: a sampler, or a setting as the table names it (of a sweep)."""
+    """Setting to compare with: a sampler, or a setting as named in the table (for a sweep)."""
 
 
 def report_command(argv: list[str], console: Console) -> int:
-    """Writes a page about a run or a sweep."""
+    """Writes a report of a run or a sweep."""
     args = commands.parse(ReportArgs, argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(("svg",), "report")
@@ -68,7 +68,7 @@ def report_command(argv: list[str], console: Console) -> int:
 
 
 def _to_film(folder: Path, sweep: bool) -> list[tuple[Path, Path]]:
-    """Returns the run folders of which a video is to be drawn, and its file: of a sweep, the best run of each task."""
+    """Run folders to draw videos of, with the files to write. For a sweep, the best run of each task."""
     if not sweep:
         return [(folder, folder / "video.mp4")]
     from mjx_dher.sweeps import tables

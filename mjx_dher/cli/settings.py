@@ -1,4 +1,4 @@
-"""Settings of a run from a file, and what they come to before anything is trained."""
+"""Settings of a run from a file, and the amount of work and memory that they need."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from mjx_dher.system.files import FolderError
 
 
 def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
-    """Reads the settings and options in the config.json of a run, and lines about their origin.
+    """Reads settings and options from a run's config.json, and lines about their origin.
 
     Args:
-      path: a run folder, or a config.json, wherever it lies; it may have been edited.
+      path: a run folder, or any config.json, possibly edited.
 
     Raises:
-      FolderError: it describes no run, or one of another schema.
+      FolderError: it does not describe a run, or has another schema.
     """
     file = path / run_folder.CONFIG_FILE if path.is_dir() else path
     try:
@@ -41,7 +41,7 @@ def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
 
 
 def options_of(content: dict[str, Any]) -> Options:
-    """The options in a config.json. Raises ValueError for an invalid one."""
+    """Options in a config.json. Raises ValueError for an invalid one."""
     options = Options(**{field.name: content[field.name] for field in dataclasses.fields(Options) if field.name in content})
     options.check(installed=False)
     return dataclasses.replace(options, log=tuple(options.log))
@@ -54,7 +54,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     edited = "; edited since" if content["digest"] != now else ""
     lacking = fingerprint.settings(run).keys() - {*content, *content["config"], *content["hparams"]} if edited else ()
     if lacking:
-        edited += f", and it lacks {', '.join(sorted(lacking))}, whose defaults are taken"
+        edited += f"; it lacks {', '.join(sorted(lacking))}, for which defaults are used"
     return (
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
         f" {content['physics']}{edited}"
@@ -62,7 +62,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
 
 
 def without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
-    """Returns a run with the `base`'s values of settings that its components do not read, and lines about those ignored."""
+    """Run with the values of `base` for settings that its components do not read, and lines about ignored settings."""
     kept = grid.with_unread_of(base, run)
     old, new = fingerprint.settings(kept), fingerprint.settings(run)
     ignored = [f"{name} {text(new[name])}" for name in new if new[name] != old[name]]
@@ -70,40 +70,40 @@ def without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
 
 
 def changes(before: RunSpec, now: RunSpec) -> str:
-    """Settings that differ from those of a file: "gamma 0.9 (0.98 in the file)"."""
+    """Settings that differ from a file: "gamma 0.9 (0.98 in the file)"."""
     old, new = ({**fingerprint.settings(spec), "seed": spec.seed} for spec in (before, now))
     told = [f"{name} {text(new[name])} ({text(old[name])} in the file)" for name in new if new[name] != old[name]]
-    return "given beside it: " + (", ".join(told) or "nothing")
+    return "changes: " + (", ".join(told) or "none")
 
 
 def check_out(out: Path | None) -> None:
-    """Checks without a trace that a run folder can be made at `out`.
+    """Checks that a run folder can be made at `out`, without leaving a trace.
 
     Raises:
-      FolderError: something is there already, or the folder above cannot be written to.
+      FolderError: it exists, or its parent folder is not writable.
     """
     if out is None:
         return
     if (out.is_symlink() or out.exists()) and (not out.is_dir() or files.is_used(out)):
-        raise FolderError(f"out: {out} is there already and is never overwritten; name a new or empty folder")
+        raise FolderError(f"out: {out} exists and is never overwritten; pass a new or empty folder")
     check_writable(out)
 
 
 def check_writable(out: Path) -> None:
-    """Checks without a trace that a folder is writable, or can be made.
+    """Checks that a folder is writable or can be made, without leaving a trace.
 
     Raises:
       FolderError: it cannot.
     """
     parent = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     try:
-        os.rmdir(tempfile.mkdtemp(dir=parent))  # permissions do not say it: not to root, nor of a file system that is full
+        os.rmdir(tempfile.mkdtemp(dir=parent))  # permissions do not suffice for root, or if the disk is full
     except OSError as error:
         raise FolderError(f"out: {parent} cannot be written to ({error.strerror})") from None
 
 
 def amount(config: Config, episode_length: int, runs: int = 1) -> str:
-    """How much `runs` runs play and learn, as a line."""
+    """Amount of play and learning of `runs` runs, as a line."""
     epochs = config_lib.num_epochs(config, episode_length)
     steps = epochs * config_lib.steps_per_epoch(config, episode_length)
     updates = config_lib.num_updates(config, episode_length)
@@ -116,10 +116,10 @@ def amount(config: Config, episode_length: int, runs: int = 1) -> str:
 
 
 def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
-    """Lines on the memory of runs of one program, without compiling it.
+    """Lines about the memory of runs of one program, without compiling it.
 
     Raises:
-      ValueError: the parts do not fit together, or one run alone is more than memory holds.
+      ValueError: the components do not fit together, or one run exceeds the memory.
     """
     import jax
 
@@ -135,6 +135,6 @@ def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
     each = " a run" if len(specs) > 1 else ""
     return [
         f"memory{each}: replay ring {memory.format_bytes(train.replay_bytes)}, learner {memory.format_bytes(learner)};"
-        f" what the compiled program takes beside them is known when it is compiled; {free} is free",
+        f" the compiled program needs more; {free} is free",
         f"physics {run_folder.engine_name(env)}, learner on {jax.devices()[0].device_kind}",
     ]

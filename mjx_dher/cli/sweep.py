@@ -40,11 +40,11 @@ def _doc(field: str, text: str) -> Doc:
 
 def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
     hint = get_type_hints(owner)[name]
-    return name, Annotated[hint | None, tyro.conf.arg(help=f"The preset's {name}, changed.")], dataclasses.field(default=None)
+    return name, Annotated[hint | None, tyro.conf.arg(help=f"{name} instead of the preset's.")], dataclasses.field(default=None)
 
 
 def _values(name: str) -> tuple[str, Any, Any]:
-    help_text = f"Values of {name}; the preset's unless given."
+    help_text = f"Values of {name}. Default: the preset's."
     hint = Annotated[tuple[float, ...] | None, tyro.conf.arg(help=help_text)]
     return name, hint, dataclasses.field(default=None)
 
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
     class _Changes: ...
 
-else:  # every number, and every size, by its own name
+else:  # all numbers and sizes by name
     _Axes = dataclasses.make_dataclass("_Axes", map(_values, HParams._fields), frozen=True)
     _Changes = dataclasses.make_dataclass(
         "_Changes", [_optional(Config, field.name) for field in dataclasses.fields(Config)], frozen=True
@@ -66,12 +66,12 @@ else:  # every number, and every size, by its own name
 class SweepArgs:
     """Train every combination of environments, components, numbers and seeds, and compare them.
 
-    Runs that differ in sampler, numbers or seed are trained side by side in one compiled program. Each trial is a run folder
-    in cells/. Run the same command again to resume a sweep, or a larger one to add trials.
+    Runs that differ in sampler, numbers or seed train in parallel in one compiled program. Each trial is a run folder in
+    cells/. Run the same command again to resume a sweep, or a larger one to add trials.
     """
 
     out: Path
-    """Folder of the sweep: results.csv, finals.csv and comparison.csv (docs/sweeps.md describes them), and cells/."""
+    """Folder of the sweep, for results.csv, finals.csv and comparison.csv (docs/sweeps.md), and cells/."""
     changes: Annotated[_Changes, tyro.conf.arg(name="")]
     sweep: _Axes
     """Numbers to try: --sweep.her-k 2 4 8."""
@@ -80,43 +80,43 @@ class SweepArgs:
     engine: Engine = "auto"
     """Physics: native, warp, jax or auto."""
     env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environments, NAME=VALUE each."""
+    """Arguments of the environments as NAME=VALUE."""
     sampler: Annotated[tuple[str, ...], _doc("sampler", "Samplers of hindsight goals")] = SAMPLERS
     weight_kernel: Annotated[tuple[str, ...], _doc("weight_kernel", "Kernels")] = ("linear",)
     weight_normalization: Annotated[tuple[str, ...], _doc("weight_normalization", "Normalizations of distances")] = ("mean",)
     metric: Annotated[tuple[str, ...], _doc("metric", "Distances between goals")] = ("position",)
-    priority: Annotated[tuple[str, ...] | None, _doc("priority", "Priorities in replay; the preset's by default")] = None
+    priority: Annotated[tuple[str, ...] | None, _doc("priority", "Priorities, by default the preset's")] = None
     generator: Annotated[tuple[str, ...], _doc("generator", "Generators of the goals of training episodes")] = ("reset",)
-    learner: Annotated[tuple[str, ...] | None, _doc("learner", "Learners; the preset's by default")] = None
-    networks: Annotated[tuple[str, ...] | None, _doc("networks", "Networks; the preset's by default")] = None
+    learner: Annotated[tuple[str, ...] | None, _doc("learner", "Learners, by default the preset's")] = None
+    networks: Annotated[tuple[str, ...] | None, _doc("networks", "Networks, by default the preset's")] = None
     seeds: int = 10
-    """Runs of each setting; every setting has the same seeds, and so the same first networks and resets."""
+    """Runs per setting. All settings use the same seeds, and so the same initial networks and resets."""
     first_seed: int = 0
-    """First seed; the others follow it."""
+    """First seed. The others follow."""
     preset: Literal["auto", presets.Preset] = "auto"
-    """Settings that other options override: cpu, gpu, frugal, paper, or auto, the one for this machine."""
+    """Base settings, which other options override: cpu, gpu, frugal, paper, or auto (cpu or gpu)."""
     lanes: int | None = None
-    """Runs side by side, at most; by default 1 on a CPU, whose cores a run fills, and on a GPU as many as memory holds."""
+    """Most parallel runs. Default: 1 on a CPU, whose cores a run fills, and as many as fit into memory on a GPU."""
     distributed: bool = False
-    """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
+    """Train together with the other processes of this job, which run the same command (docs/scaling.md)."""
     devices: Devices = 1
-    """Devices to train on, or all. They share the runs side by side; with more devices than runs, several share each run."""
+    """Number of devices, or all. Parallel runs are distributed. With more devices than runs, several share a run."""
     fleet: Annotated[FleetOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetOptions)
     threshold: float = 0.9
-    """Success rate for the time that it takes to get there."""
+    """Success rate for the time to success."""
     baseline: str = "future"
-    """Setting that the others are compared with: a sampler, or a setting as the table names it."""
+    """Setting to compare with: a sampler, or a setting as named in the table."""
     dry_run: bool = False
-    """Say what would be trained, and write nothing."""
+    """Print what would be trained, without writing anything."""
 
 
 def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> tuple[SweepArgs, list[RunSpec]]:
-    """Returns the arguments of `sweep` and the trials in them, checked before JAX or MuJoCo is loaded.
+    """Parses the arguments of `sweep` and makes its trials, before JAX or MuJoCo is loaded.
 
-    `report` is called with the options that no trial reads, which are ignored.
+    `report` is called with the ignored options, which no trial reads.
 
     Raises:
-      ValueError: one or more of them cannot be used.
+      ValueError: invalid arguments.
     """
     for flag in argv:
         if (name := flag.partition("=")[0].lstrip("-").replace("-", "_")) in HParams._fields and flag.startswith("--"):
@@ -129,14 +129,14 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
     args = _without_unread(args, trials, report)
     trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
     if args.fleet.ray is not None:
-        return args, trials  # which preset is for the cluster is known once it is joined
+        return args, trials  # the preset is known once the cluster is joined
     if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
         trials = _trials(args, preset)
     return args, trials
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:
-    """Returns the arguments without sizes and numbers that no trial reads, and reports these."""
+    """Drops sizes and numbers that no trial reads, and reports them."""
     groups: dict[str, Any] = {"changes": args.changes, "sweep": args.sweep}
     read = [fingerprint.settings(run) for run in trials]
     given = [name for own in groups.values() for name, value in vars(own).items() if value is not None]
@@ -149,7 +149,7 @@ def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[st
 
 
 def _check(args: SweepArgs) -> None:
-    """Raises ValueError for an argument that cannot be used, whatever the preset."""
+    """Raises ValueError for an argument that is invalid with any preset."""
     for field in GRID:
         if getattr(args, field) == ():
             raise ValueError(f"{field} must be one or more names; got none")
@@ -163,22 +163,18 @@ def _check(args: SweepArgs) -> None:
     check_number("threshold", args.threshold, "(0, 1]", float)
     args.fleet.check()
     if args.fleet.ray is not None and (args.devices != 1 or args.distributed):
-        raise ValueError("devices and distributed are for one program over several devices; with ray each task has a device")
+        raise ValueError("devices and distributed cannot be combined with ray, where each task has its own device")
     if args.fleet.ray is not None and args.dry_run:
-        raise ValueError("dry_run does not go with --ray: try the command without --ray")
+        raise ValueError("dry_run cannot be combined with ray: try the command without --ray")
     if args.out.exists() and not args.out.is_dir():
-        raise FolderError(f"out: {args.out} is there already and is no folder")
+        raise FolderError(f"out: {args.out} exists and is not a folder")
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / grid.CELLS).is_dir():
-        raise FolderError(f"out: {args.out} holds something else than a sweep; name a new or empty folder")
+        raise FolderError(f"out: {args.out} holds something other than a sweep; pass a new or empty folder")
     files.inside(args.out, [*args.out.glob("*"), *args.out.glob("*/*")])
 
 
 def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
-    """Returns all trials of the grid.
-
-    Raises:
-      ValueError: one of them cannot run.
-    """
+    """All trials of the grid. Raises ValueError if one of them cannot run."""
     specs = []
     changes = {name: value for name, value in vars(args.changes).items() if value is not None}
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
@@ -208,7 +204,7 @@ def sweep_command(argv: list[str], console: Console) -> int:
 
 
 def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
-    """Trains a grid of runs; of several processes the first one decides and writes."""
+    """Trains a grid of runs. The first of several processes decides and writes."""
     from mjx_dher.parallel import processes
 
     places = {trial: place for place, trial in enumerate(trials)}
@@ -225,7 +221,7 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
 
 
 def _sweep_fleet(args: SweepArgs, console: Console) -> int:
-    """Trains a grid of runs on a cluster, whose machines decide the preset if the user names none."""
+    """Trains a grid of runs on a cluster. Its machines decide the preset if the user names none."""
     from mjx_dher.cli import fleet
 
     def make_trials(preset: str) -> list[RunSpec]:
@@ -237,7 +233,7 @@ def _sweep_fleet(args: SweepArgs, console: Console) -> int:
 
 
 def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
-    """Prints the number of runs, and returns the trials that have not ended."""
+    """Prints the number of runs. Returns the trials that have not ended."""
     for text in grid.changed_files(args.out, trials):
         console.print(text, soft_wrap=True)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
@@ -247,7 +243,7 @@ def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[
 
 
 def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: int, console: Console) -> int:
-    """Writes the tables of the trials that have ended, and reports the others; `number` is of the signal to stop, or 0."""
+    """Writes the tables of ended trials and reports the others. `number` is the number of a stop signal, or 0."""
     left = [trial for trial in todo if not grid.is_done(args.out, trial)]
     if left and number:
         ended = len(trials) - len(left)
@@ -255,18 +251,18 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: in
         return 128 + number
     signals.forget()
     if len(left) == len(trials):
-        raise files.BusyError(f"{args.out}: all {len(left)} runs are being trained by another program")
+        raise files.BusyError(f"{args.out}: another process is training all {len(left)} runs")
     _write_tables(args, console)
     if left:
         raise files.BusyError(
-            f"{args.out}: {len(left)} of the {len(trials)} runs are being trained by another program, and not in the tables;"
-            " the same command writes them when that has ended"
+            f"{args.out}: another process is training {len(left)} of the {len(trials)} runs, which are not in the tables;"
+            " run the same command again when it has ended"
         )
     return 0
 
 
 def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
-    """Prints the programs and runs of a sweep. Environments are made, and nothing is compiled or written."""
+    """Prints the programs and runs of a sweep. Makes environments, but compiles and writes nothing."""
     settings.check_writable(args.out)
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     console.print(f"{len(trials)} runs, {len(trials) - len(todo)} of them done already")
@@ -282,13 +278,13 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         console.print(f"{program.env}, learner {program.learner}: {len(group)} runs; samplers {samplers}", soft_wrap=True)
         for line in (settings.amount(program.config, env.episode_length, len(group)), *settings.memory_lines(env, group)):
             console.print(f"  {line}", soft_wrap=True)
-    lanes = args.lanes or "one on a CPU, on a GPU as many as memory holds"
-    console.print(f"programs: {len(groups)}; runs side by side: {lanes}; nothing was written", soft_wrap=True)
+    lanes = args.lanes or "one on a CPU, as many as fit into memory on a GPU"
+    console.print(f"programs: {len(groups)}; parallel runs: {lanes}; nothing was written", soft_wrap=True)
     return 0
 
 
 def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
-    """Trains trials, until a signal asks for a stop."""
+    """Trains trials until a signal requests a stop."""
     from mjx_dher.sweeps import sweep
 
     prepare()
@@ -316,7 +312,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
 def _write_tables(args: SweepArgs, console: Console) -> None:
     from mjx_dher.sweeps import comparison, tables
 
-    with files.lock(args.out / grid.CELLS, wait=True):  # another program may be writing them
+    with files.lock(args.out / grid.CELLS, wait=True):  # another process may be writing them
         trials = tables.read(args.out)
         tables.write(args.out, trials)
         compare(args.out, comparison.groups(trials), args.baseline, args.threshold, console)

@@ -43,56 +43,57 @@ from mjx_dher.validation import check_all, check_devices
 class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
-    Other commands: `resume RUN` resumes a run, `eval RUN` evaluates runs again, `view RUN` shows one in the browser, `demo` a
-    bundled policy, `render RUN` draws episodes, `transfer RUN` plays one in the original Fetch task, `export RUN` writes its
-    policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a page about
-    a run or a sweep, `list` lists all tasks and components, `check` tests custom components, `doctor` tries what works on this
-    machine, `completion SHELL` is for your shell (see `eval --help` and so on); `--version`.
+    Other commands: `resume RUN` resumes a run, `eval RUN` evaluates runs, `view RUN` shows one in the browser, `demo` shows a
+    bundled policy, `render RUN` draws episodes, `transfer RUN` plays a run in the original Fetch task, `export RUN` writes its
+    policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a report of
+    a run or a sweep, `list` lists all tasks and components, `check` tests custom components, `engines ENV` shows the engines
+    for a task, `doctor` tests this machine, `completion SHELL` prints a shell's completion, `--version` prints the version.
+    See `eval --help` and so on.
     """
 
     spec: RunSpec
     preset: Literal["auto", Preset] = "auto"
-    """Settings that other options override: cpu or gpu (tuned for time to success there), auto (the one for this machine),
-    frugal (few environment steps) or paper (the paper's settings; docs/results.md has a table)."""
+    """Base settings, which other options override: cpu or gpu (tuned for time to success), auto (cpu or gpu), frugal (few
+    environment steps) or paper (the paper's settings; see docs/results.md)."""
     config_file: Annotated[Path | None, tyro.conf.arg(name="config")] = None
-    """Run folder, or a config.json, whose settings and options are taken in place of a preset's; others given override them."""
+    """Run folder, or a config.json, to use as base settings instead of a preset. Other options override them."""
     out: Path | None = None
-    """Run folder to write; a fresh one under runs/ unless given. Never overwrites."""
+    """Run folder to write, never overwritten. Default: a new one under runs/."""
     trust: bool = False
-    """Use the code and data that --config names, though you have not trained with them on this machine."""
+    """Use code and data that --config names even if you have not trained with them on this machine."""
     dry_run: bool = False
-    """Say what would be trained, and what it takes, and write nothing."""
+    """Print what would be trained, and the memory that it needs, without writing anything."""
     curve: bool = True
     """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
     view: bool = False
-    """Show in the browser how the run learns: the policy after each epoch, at play. Needs the extra view."""
+    """Show the policy in the browser after each epoch. Needs the extra view."""
     view_port: int = VIEW_PORT
-    """Port of that page; 0: any that is free."""
+    """Port of that page; 0 means any free port."""
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     devices: Devices = 1
-    """Devices that share the run, GPUs where there are any, or all: equal parts of its environments, ring and batches."""
+    """Number of devices, or all, that share the run: its environments, ring and batches in equal parts."""
     options: Options = dataclasses.field(default_factory=Options)
 
 
 @dataclasses.dataclass(frozen=True)
 class ResumeArgs:
-    """Go on with a run that was stopped, or killed, from its newest checkpoint that is whole.
+    """Resume a run that was stopped or killed, from its newest undamaged checkpoint.
 
-    With the engine that it had, on a CPU, it ends as if it had never stopped, to the bit. A run that has ended goes on, with a
-    larger --total-steps, if it was trained with --keep-end. Options that are not given stay as the run last had them.
+    On a CPU with the same engine, the result is bit-identical to an uninterrupted run. A finished run can resume with a larger
+    --total-steps if it was trained with --keep-end. Options default to their last values.
     """
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
     engine: str | None = None
-    """Physics: native, jax, warp or auto; the run's own unless given."""
+    """Physics: native, jax, warp or auto. Default: the run's."""
     trust: bool = False
-    """Use the code and data that the run folder names, though you have not trained with them on this machine."""
+    """Use code and data that the run folder names even if you have not trained with them on this machine."""
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     total_steps: int | None = None
-    """Environment steps of the whole run, those that were made included; as before unless given."""
+    """Environment steps of the whole run, including earlier ones. Default: as before."""
     curve: bool = True
     """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
     options: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
@@ -121,7 +122,7 @@ def train_command(argv: list[str], console: Console) -> int:
 
 
 def _viewer(port: int) -> Callable[[Path, Console], Any]:
-    """Makes the viewer of a run that is being trained. Raises ValueError if the page cannot be served."""
+    """Makes the viewer of a run in training. Raises ValueError if the page cannot be served."""
     from mjx_dher.cli.view import Beside, Page
     from mjx_dher.viewer import address
 
@@ -130,7 +131,7 @@ def _viewer(port: int) -> Callable[[Path, Console], Any]:
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
-    """Prints what would be trained. The environment is made; nothing is compiled or written."""
+    """Prints what would be trained. Makes the environment, but compiles and writes nothing."""
     settings.check_out(args.out)
     settle_compiler(args.spec.engine)
     check_platform()
@@ -145,8 +146,8 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
 
 
 def resume_command(argv: list[str], console: Console) -> int:
-    """Goes on with a run that was stopped."""
-    asked = parse(ResumeArgs, argv)  # which run it is
+    """Resumes a run."""
+    asked = parse(ResumeArgs, argv)  # to find the run
     content = run_folder.read_config(asked.run)
     args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
     check_engine(args.engine)
@@ -164,19 +165,19 @@ def resume_command(argv: list[str], console: Console) -> int:
 
 
 def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
-    """Returns the run in a folder, which is locked, with what may be other than it was; refuses other changes by name.
+    """The run in a locked folder and its options, with the changes of the command line.
 
-    `stop_at` is that of the command line. What has ended a run does not end it again, unless it is given again.
+    `stop_at` is the command line's. A reached value does not stop the run again unless it is passed again.
 
     Raises:
       FolderError: the run has ended, has no checkpoint, or its settings were edited.
-      ValueError: an option that cannot be used.
+      ValueError: an invalid option.
     """
     run, options = run_folder.to_spec(args.run, content), args.options
     edits = run_folder.edited(args.run, content, run)
     if refused := [text for name, text in edits.items() if name not in fingerprint.MAY_CHANGE]:
         raise FolderError(
-            f"{args.run / run_folder.CONFIG_FILE} is not as the run wrote it, and a run goes on with what it began with:"
+            f"{args.run / run_folder.CONFIG_FILE} was edited, but a run resumes with its original settings:"
             f" {'; '.join(refused)}"
         )
     run_folder.check_written(args.run, content, run)
@@ -190,44 +191,44 @@ def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any],
     run_folder.checkpoints_to_resume(args.run)
     if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
         console.print(
-            f"step sizes fall to {run.hparams.lr_end:g} of their start over the whole run, whose length has changed: they go on"
-            " from what they would be at this point of a run of the new length"
+            f"learning rates fall to {run.hparams.lr_end:g} of their start over the whole run. Its length has changed: they"
+            " continue from their value at this point of a run of the new length"
         )
     for text in run_folder.changed_versions(content):
         console.print(f"since {args.run} began: {text}")
     told = "; ".join(f"{name} {fingerprint.text(value)}" for name, value in vars(options).items())
-    console.print(f"going on with {args.run}: total_steps {run.config.total_steps}; {told}")
+    console.print(f"resuming {args.run}: total_steps {run.config.total_steps}; {told}")
     return run, options
 
 
 def _check_ended(args: ResumeArgs, run: RunSpec, stop_at: float | None, result: dict[str, Any]) -> None:
-    """Raises FolderError where a run that has ended cannot go on."""
+    """Raises FolderError if an ended run cannot resume."""
     if not run_folder.checkpoints(args.run):
         raise FolderError(
-            f"{args.run} has ended; there is nothing to go on with: --keep-end would have kept a checkpoint of its end."
+            f"{args.run} has ended; there is nothing to resume: --keep-end would have kept its last checkpoint."
             f" `{lookup.command_name()} --config {args.run} --total-steps N` trains a longer one from the start"
         )
     if not results.can_go_on(args.run, run.config.total_steps):
         raise FolderError(
-            f"{args.run} has ended after {result['env_steps']:,} environment steps; total_steps must be more than that for it"
-            f" to go on; got {run.config.total_steps}"
+            f"{args.run} has ended after {result['env_steps']:,} environment steps; total_steps must be larger to resume it;"
+            f" got {run.config.total_steps}"
         )
     if args.total_steps is None and stop_at is None:
         raise FolderError(
             f"{args.run} has ended after {result['env_steps']:,} environment steps, at its stop_at {args.options.stop_at}:"
-            " give --total-steps, or another --stop-at, to go on"
+            " pass --total-steps, or another --stop-at, to resume"
         )
 
 
 def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> TrainArgs:
-    """Parses the arguments of `train`, and checks them before JAX, and with it CUDA, or MuJoCo is loaded.
+    """Parses the arguments of `train`, and checks them before JAX, CUDA or MuJoCo is loaded.
 
     `report` is called with the origin of the settings, if they come from a file.
 
     Raises:
-      ValueError: one or more invalid arguments.
+      ValueError: invalid arguments.
     """
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # they decide the defaults of all others
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # arguments that decide the defaults of the others
     early.add_argument("--preset", default="auto")
     early.add_argument("--env", default="push")
     early.add_argument("--learner")
@@ -236,7 +237,7 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
     check_name("preset", chosen.preset, ("auto", *PRESETS))
     if chosen.config is not None:
         if chosen.preset != "auto":
-            raise ValueError("config and preset are both whole settings: give one of them")
+            raise ValueError("config and preset cannot be combined; pass one of them")
         base, options, notes = settings.load(chosen.config)
         args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
         run = args.spec
@@ -253,7 +254,7 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
         run, ignored = settings.without_unread(base, args.spec)
         return dataclasses.replace(args, spec=run, preset=preset), ignored
 
-    # Asking for the machine's preset starts CUDA, so invalid arguments are rejected before, unless help is asked for.
+    # Finding the machine's preset starts CUDA, so invalid arguments are rejected before, except with --help.
     on_cpu = None if chosen.preset != "auto" or {"-h", "--help"} & set(argv) else parse_preset("cpu")
     preset = presets.machine_preset() if chosen.preset == "auto" else chosen.preset
     args, ignored = on_cpu if on_cpu is not None and preset == "cpu" else parse_preset(preset)
@@ -280,7 +281,7 @@ def _train(
     devices: Devices,
     after_epoch: Callable[[], None] = lambda: None,
 ) -> int:
-    """Trains into `folder`; goes on where it has a checkpoint."""
+    """Trains into `folder`, from its checkpoint if there is one."""
     from mjx_dher.parallel import processes
     from mjx_dher.runs import driver
     from mjx_dher.runs.folder.locks import last_checkpoint
@@ -316,7 +317,7 @@ def _train(
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"
-            f" `{lookup.command_name()} resume {folder}` goes on"
+            f" `{lookup.command_name()} resume {folder}` resumes"
         )
         return 128 + processes.highest(signals.asked() or 0)
     signals.forget()
@@ -330,7 +331,7 @@ def _train(
 
 
 def _draw(folder: Path, curve: bool, console: Console) -> None:
-    """Draws the curve of a run that has ended. A picture that cannot be drawn costs a line, and nothing else."""
+    """Draws the curve of an ended run, or reports that it cannot be drawn."""
     if not curve:
         return
     from mjx_dher.tools import curves, figures
@@ -341,5 +342,5 @@ def _draw(folder: Path, curve: bool, console: Console) -> None:
     try:
         figures.write(curves.draw_curve(curves.read_curve(folder)), picture)
         console.print(f"learning curve: {picture}")
-    except Exception as error:  # the run itself has ended as it should
+    except Exception as error:  # the run itself has succeeded
         console.print(f"the learning curve could not be drawn ({type(error).__name__}: {error})")

@@ -16,23 +16,23 @@ from mjx_dher.system.caches import keep_compiled_programs
 
 @dataclasses.dataclass(frozen=True)
 class TransferArgs:
-    """Play a policy, unchanged, in the original task of gymnasium-robotics and here, and compare.
+    """Compare a policy's success in the original gymnasium-robotics task with its success here.
 
-    The original needs an older MuJoCo, and so an environment of its own: --set-up makes it once.
+    The original task needs an older MuJoCo, and so its own environment, which --set-up makes once.
     """
 
     run: tyro.conf.Positional[Path]
-    """Run folder, or a policy of the package, such as push."""
+    """Run folder, or a bundled policy such as push."""
     episodes: int = 500
-    """Episodes to play, there and here."""
+    """Episodes to play in each task."""
     seed: int = 1000
     """Seed of the first original episode (episode i uses seed + i) and of the episodes played here."""
     set_up: bool = False
-    """Make the originals' environment in the user's cache folder, if it is not there yet (a download of 200 MB)."""
+    """Make the Python environment of the originals in the user's cache folder, if missing (a 200 MB download)."""
     python: Path | None = None
-    """The Python of an environment that has the original tasks; the one that --set-up makes unless given."""
+    """Python of an environment that has the original tasks. Default: the one from --set-up."""
     engine: str | None = None
-    """Physics here: native, jax, warp or auto; the run's own unless given."""
+    """Physics here: native, jax, warp or auto. Default: the run's."""
 
 
 def transfer_command(argv: list[str], console: Console) -> int:
@@ -52,13 +52,13 @@ def transfer_command(argv: list[str], console: Console) -> int:
     policy = load_plain(folder, "transfer")
     if args.set_up:
         environment = transfer.default_environment()
-        console.print(f"the originals' environment is in {environment}; setting it up if need be ...", soft_wrap=True)
+        console.print(f"the originals' environment is in {environment}; setting it up if necessary ...", soft_wrap=True)
         transfer.set_up(environment)
     python = args.python or transfer.interpreter(transfer.default_environment())
     name = transfer.check_original(run.env, python)
     keep_compiled_programs()
     if run.env_kwargs:
-        console.print(f"trained with {' '.join(run.env_kwargs)}; played without them, there and here", soft_wrap=True)
+        console.print(f"trained with {' '.join(run.env_kwargs)}; played without them in both tasks", soft_wrap=True)
     env = make_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")

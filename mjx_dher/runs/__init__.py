@@ -1,1 +1,1 @@
-"""Runs on disk: folders, checkpoints, logs, and the driver that trains. Kept empty: a policy loads where only NumPy is."""
+"""Training runs: folders, checkpoints, logs and the driver. Empty, so that policies load with NumPy alone."""

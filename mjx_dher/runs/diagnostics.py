@@ -1,4 +1,4 @@
-"""Failures and warnings, from an epoch's metrics."""
+"""Failures and warnings derived from an epoch's metrics."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mjx_dher.spec import RunSpec
 
 
 def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
-    """Reason why a run ends as failed after an epoch, or None.
+    """Reason why a run fails after an epoch, or None.
 
     Args:
-      metrics: of the epoch, by the names of `trainer.make_train`.
+      metrics: metrics of the epoch from `trainer.make_train`.
       config: sizes.
-      finite: whether all numbers of the learner are finite.
+      finite: whether all of the learner's floats are finite.
     """
     if not finite:
-        return "the networks or normalizers hold numbers that are not finite (smaller actor_lr and critic_lr may help)"
+        return "the networks or normalizers have numbers that are not finite (smaller actor_lr and critic_lr may help)"
     episodes = config.num_envs * config.cycles_per_epoch
     if metrics["discarded_episodes"] >= episodes:
         return (
-            f"all {episodes} episodes were discarded, so nothing can be learned: the environment says `failed`, or an"
+            f"all {episodes} episodes were discarded, so nothing can be learned: the environment reports `failed`, or an"
             " observation, a goal, an action or a reward is not finite"
         )
     if metrics["bad_success"] > 0:
@@ -36,21 +36,21 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
 
 
 def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
-    """Warnings about an epoch with these metrics: a sentence for each metric at fault."""
+    """Warning sentences about an epoch, by metric."""
     episodes = config.num_envs * config.cycles_per_epoch
     sentences = {
-        "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment says"
-        " `failed`, or a number in them is not finite",
-        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range, whose returns"
-        " bound the learner's targets",
-        "no_goal_share": f"for {metrics['no_goal_share']:.3g} of the transitions to be relabelled the sampler offers no goal;"
+        "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment"
+        " reports `failed`, or a number in them is not finite",
+        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range, which"
+        " bounds the learner's targets",
+        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel;"
         " these keep their own",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}
 
 
 class Watch:
-    """Failures and warnings of runs side by side."""
+    """Failures and warnings of parallel runs."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Watch:
         report: Callable[[str], None],
         failed: dict[int, tuple[int, str]],
     ):
-        self.failed = failed  # lane -> the epoch in which it failed, and why; it is added to
+        self.failed = failed  # epoch and reason of each failed lane; updated in place
         self._specs, self._report = specs, report
         self._names = [f"{folder.name}: " if len(specs) > 1 else "" for folder in folders]
         self._warned: set[tuple[int, str]] = set()

@@ -1,6 +1,6 @@
-"""The run driver: trains one run, or many side by side, into run folders.
+"""The run driver: trains one run, or many in parallel, into run folders.
 
-Runs that differ only in `spec.LANE_FIELDS` are *lanes* of one vmapped program. A lane computes what the run computes alone.
+Runs that differ only in `spec._LANE_FIELDS` are *lanes* of one vmapped program. A lane gives the same result as the run alone.
 `train`, `resume` and `sweep` all call `train_runs`.
 """
 
@@ -45,7 +45,7 @@ class Result(NamedTuple):
     status: str  # finished, failed or stopped
     epoch: int  # epochs that have ended
     num_epochs: int
-    content: dict[str, Any]  # of result.json; empty for a run that was stopped
+    content: dict[str, Any]  # content of result.json; empty for a stopped run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,34 +78,34 @@ def train_runs(
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
     make_sinks: Callable[[RunSpec, Path], Sequence[Sink]] = lambda spec, folder: (),
 ) -> list[Result]:
-    """Trains runs that share a program, as many side by side as possible, each into its own folder.
+    """Trains runs that share a program, as many in parallel as possible, each into its own folder.
 
-    A run whose folder has a checkpoint resumes from it. A run that fails (`diagnostics.failure`) ends alone, and its result
-    has the reason.
+    A run whose folder has a checkpoint resumes from it. A failed run (`diagnostics.failure`) ends without the others, and its
+    result has the reason.
 
     Args:
       env: the environment of all runs.
-      specs: descriptions; all must agree in `RunSpec.program`.
-      folders: run folders, one each; missing ones are made.
-      options: evaluation, checkpoints, logs. None: the defaults.
-      lanes: most runs side by side. None: one on a CPU, whose cores one run fills, and elsewhere as many as memory holds.
-      devices: to train on, or "all". Runs side by side are distributed among them; several devices share a run if there are
-        fewer runs than devices.
-      shared: folder for the checkpoints of runs side by side. None: "unfinished" beside the first run's folder.
-      sweep: whether to skip runs that have ended or that another process trains, and to start runs over whose checkpoints
-        cannot be used, instead of raising.
-      should_stop: called after every epoch; True ends training, with a checkpoint.
+      specs: descriptions, which must agree in `RunSpec.program`.
+      folders: run folders, one per run. Missing ones are made.
+      options: evaluation, checkpoints and logs.
+      lanes: most parallel runs. Default: one on a CPU, whose cores one run fills, otherwise as many as fit into memory.
+      devices: number of devices, or "all". Parallel runs are distributed among them. If there are fewer runs than devices,
+        several devices share a run.
+      shared: folder for the checkpoints of parallel runs. Default: "unfinished" next to the first run's folder.
+      sweep: whether to skip runs that have ended or that another process trains, and to restart runs whose checkpoints are
+        unusable, instead of raising an error.
+      should_stop: called after every epoch. True stops training with a checkpoint.
       report: called with a line about each program and checkpoint.
-      on_epoch: called after every epoch of runs side by side; after their last epoch, when their results are written.
-      make_sinks: makes further sinks for a run's metrics.
+      on_epoch: called after every epoch of the parallel runs, the last time when their results are written.
+      make_sinks: makes additional sinks for a run's metrics.
 
     Returns:
-      A Result each; fewer than `specs` if training was stopped or runs were skipped.
+      One Result per run. Fewer if training was stopped or runs were skipped.
 
     Raises:
-      ValueError: a run that cannot be trained, too little memory or too few devices, sizes that the devices do not divide, or
-        `stop_at` or `keep_end` for several runs.
-      FolderError: a run that has ended, that another process trains, or whose folder is not writable.
+      ValueError: a run cannot be trained, memory or devices are insufficient, the devices do not divide the sizes, or
+        `stop_at` or `keep_end` is given for several runs.
+      FolderError: a run has ended, another process trains it, or its folder is not writable.
     """
     options = options or Options()
     _check_runs(env, specs, folders, options, sweep)
@@ -121,7 +121,7 @@ def train_runs(
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
         program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
-        processes.check_equal({"lanes": program.lanes})  # memory decides them where the user does not
+        processes.check_equal({"lanes": program.lanes})  # by default they depend on memory
         return _train_in_turn(session, program, claims, waiting)
 
 
@@ -133,11 +133,11 @@ def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], opt
     for spec in specs:
         spec_lib.validate(spec, env.episode_length)
     if len({spec.program for spec in specs}) != 1 or len({folder.absolute() for folder in folders}) != len(specs):
-        raise ValueError("train_runs takes one or more runs that agree in RunSpec.program, and a folder of its own for each")
+        raise ValueError("train_runs needs one or more runs that agree in RunSpec.program, each with its own folder")
 
 
 def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting: Sequence[Run]) -> list[Result]:
-    """Trains runs, as many side by side as the program has lanes, until all are trained or a stop is requested."""
+    """Trains runs, as many in parallel as the program has lanes, until all are trained or a stop is requested."""
     results: list[Result] = []
     while waiting and not (results and session.should_stop()):
         with contextlib.ExitStack() as stack:
@@ -153,7 +153,7 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
 def _claim(
     session: _Session, claims: Claims, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int
 ) -> tuple[list[Run], list[Run]]:
-    """Returns the runs that `claims` has claimed for the first process, and those that wait."""
+    """Claims runs for the first process. Returns the claimed and the waiting ones."""
     places = {run[1]: place for place, run in enumerate(waiting)}
     decide = lambda: [[places[folder] for _, folder in runs] for runs in claims.claim(stack, waiting, lanes)]  # noqa: E731
     claimed, left = processes.broadcast(decide)
@@ -161,7 +161,7 @@ def _claim(
 
 
 def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folders: Sequence[Path]) -> list[Result]:
-    """Trains runs side by side, from their start or checkpoint, to their end or until a stop is requested."""
+    """Trains parallel runs from their start or checkpoint, to their end or until a stop is requested."""
     options = session.options
     keep = options.keep if program.lanes == 1 else 1
     physics = run_folder.engine_name(session.env)
@@ -173,7 +173,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     will_save = 0 < options.checkpoint_every < num_epochs
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
     _refuse_ended(specs[0], start, num_epochs)
-    for folder in folders if processes.leads() else ():  # before anything that a result tells of is touched
+    for folder in folders if processes.leads() else ():  # before any file that a result describes changes
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
     report_once = functools.cache(session.report)
@@ -182,7 +182,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = zip(ended, specs, folders, runs) if processes.leads() else ()
         logs = [_open(stack, session, program.lanes, *run) for run in own]
-        success = processes.broadcast(lambda: _success_rates(folders[0]))  # of one run, see stop_at
+        success = processes.broadcast(lambda: _success_rates(folders[0]))  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
         for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
@@ -195,7 +195,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
                 learner = processes.collect(progress.state.learner)
                 try:
                     _save_policy(session.env, program, learner, specs[0], folders[0], runs[0])
-                except OSError as error:  # the run can go on without one
+                except OSError as error:  # the run can continue
                     report_once(f"cannot write the policy ({error})")
             session.on_epoch(specs, progress)
             if session.should_stop():
@@ -239,7 +239,7 @@ def _open(
 ) -> list[Sink]:
     """Writes config.json of a run that starts, or resumes with other settings or options, and opens its metrics' sinks.
 
-    `ended` is the number of epochs that its metrics have.
+    `ended` is the number of epochs in its metrics.
     """
     digest = fingerprint.digest(run)
     earlier = results.earlier_digests(folder, digest) if ended else []
@@ -255,7 +255,7 @@ def _open(
 
 
 def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:
-    """An epoch's metrics of each run."""
+    """Metrics of an epoch, per run."""
     metrics = {name: np.atleast_1d(values) for name, values in progress.metrics.items()}
     return [loggers.metrics_row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
 
@@ -269,7 +269,7 @@ def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], faile
 
 
 def _save_policy(env: Env, program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:
-    """Writes the policy of a run's learner, as NumPy arrays if possible, or else as the learner's state.
+    """Writes the policy of a run's learner, as NumPy arrays if possible, else as the learner's state.
 
     The learner is None in processes that do not write.
     """
@@ -292,7 +292,7 @@ def _finish(
     runs: Sequence[dict[str, Any]],
     failed: dict[int, tuple[int, str]],
 ) -> list[Result]:
-    """Writes the policies and results of runs that have ended. result.json comes last: it marks a run as done."""
+    """Writes the policies and results of ended runs. result.json comes last, because it marks a run as done."""
     outcome: Any = None
     learners = processes.collect(progress.state.learner)
     if len(failed) < len(specs):

@@ -1,4 +1,4 @@
-"""Options of training that do not change what a run computes."""
+"""Training options that do not affect a run's result."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ class Options:
     """Evaluation, checkpoints and logs of runs."""
 
     final_episodes: int = 500
-    """Episodes of the last evaluation."""
+    """Episodes of the final evaluation."""
     checkpoint_every: int = 10
-    """Epochs between checkpoints, from which a run resumes; 0: none. There is also one after 2 minutes, then every 10,
-    and one when the run is stopped (Ctrl-C, SIGTERM, SIGHUP)."""
+    """Epochs between checkpoints; 0 disables this. A checkpoint is also written after 2 minutes, then every 10 minutes, and
+    when the run is stopped (Ctrl-C, SIGTERM, SIGHUP)."""
     keep: int = 2
-    """Newest checkpoints to keep (one, if runs are side by side). They are deleted when the run has ended."""
+    """Newest checkpoints to keep (one for parallel runs). They are deleted when the run has ended."""
     keep_end: bool = False
-    """Checkpoint of the end, kept, from which `resume --total-steps` makes a single run longer; as large as the replay ring."""
+    """Keep the last checkpoint, so that `resume --total-steps` can extend the run. It is as large as the replay ring."""
     log: tuple[str, ...] = ()
-    """Logs beside metrics.csv: jsonl, tensorboard, wandb."""
+    """Logs in addition to metrics.csv: jsonl, tensorboard, wandb."""
     stop_at: float | None = None
-    """Success rate that ends a run early, as the mean of its last three evaluations."""
+    """Stop a run early at this success rate, averaged over the last three evaluations."""
 
     def check(self, installed: bool = True) -> None:
-        """Raises ValueError for an invalid option, or, if they must be `installed`, for a log whose package is missing."""
+        """Raises ValueError for an invalid option, or for a log whose package is missing, if packages must be `installed`."""
         check_count("final_episodes", self.final_episodes)
         check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
         check_count("keep", self.keep)
@@ -39,13 +39,13 @@ class Options:
             check_number("stop_at", self.stop_at, "(0, 1]", float)
 
     def check_many(self) -> None:
-        """Raises ValueError for an option that only a single run can have."""
+        """Raises ValueError for an option that only a single run supports."""
         if self.stop_at is not None:
-            raise ValueError("stop_at ends one run alone: the runs of a sweep are compared epoch by epoch")
+            raise ValueError("stop_at is only for a single run, because the runs of a sweep are compared epoch by epoch")
         if self.keep_end:
-            raise ValueError("keep_end is for one run alone: a sweep with another total_steps has runs of its own")
+            raise ValueError("keep_end is only for a single run: a sweep with another total_steps has other runs")
 
     def is_reached(self, success_rates: Sequence[float]) -> bool:
-        """Whether a run has reached `stop_at`, given the success rates of its epochs."""
+        """Whether a run with these success rates per epoch has reached `stop_at`."""
         last = success_rates[-3:]
         return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at

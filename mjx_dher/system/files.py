@@ -188,7 +188,7 @@ def new_folder(folder: Path) -> Iterator[None]:
 
 def _refuse_used(folder: Path) -> None:
     if is_used(folder):
-        raise FolderError(f"out: {folder} is there already and is never overwritten; name a new or empty folder")
+        raise FolderError(f"out: {folder} exists and is never overwritten; pass a new or empty folder")
 
 
 def is_used(folder: Path) -> bool:

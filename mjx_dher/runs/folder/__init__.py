@@ -1,1 +1,1 @@
-"""A run on disk: its folder, fingerprint, metrics, checkpoints and locks."""
+"""A run on disk: folder, fingerprint, metrics, checkpoints and locks."""

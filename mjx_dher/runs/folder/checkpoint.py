@@ -1,7 +1,7 @@
-"""Checkpoints of a run: written whole or not at all, and restored only if they are undamaged.
+"""Checkpoints of a run. They are written atomically, and restored only if undamaged.
 
-A checkpoint is a folder, RUN/checkpoints/epoch-000010: `state`, a NumPy file for each leaf of the TrainState, and
-manifest.json, which has the SHA-256 of every file (and of itself), and each leaf's name, shape and dtype.
+A checkpoint is a folder, RUN/checkpoints/epoch-000010. It has `state`, with a NumPy file per leaf of the TrainState, and
+manifest.json, with the SHA-256 of every file and of itself, and each leaf's name, shape and dtype.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _STATE = "state"
 _PARTIAL = ".partial-"
 _HPARAMS = ".hparams."
 _CURSOR, _STEPS = ".replay.cursor", ".env_steps"
-_PIECE = 1 << 20  # bytes that are looked at together for zeros
-_SPARE = 1 << 16  # bytes that a checkpoint leaves for metrics and result
-_EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # arrays that checkpoints of 0.2.0 lack
+_PIECE = 1 << 20  # bytes per test for zeros
+_SPARE = 1 << 16  # bytes to leave free for metrics and result
+_EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # missing in checkpoints of 0.2.0
 
 
 class CheckpointError(FolderError):
-    """A checkpoint that cannot be written or used."""
+    """A checkpoint cannot be written or used."""
 
 
 class Restored(NamedTuple):
@@ -53,8 +53,8 @@ class Restored(NamedTuple):
     wall_seconds: float
     state: Any
     runs: list[dict[str, Any]]  # `fingerprint.identity` of each
-    refused: dict[Path, str]  # newer checkpoints that are not used, and why
-    failed: dict[int, tuple[int, str]]  # of runs side by side, those that had failed: the epoch, and why
+    refused: dict[Path, str]  # newer unusable checkpoints, and why
+    failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane
 
 
 def save(
@@ -67,28 +67,28 @@ def save(
     refused: Sequence[Path] = (),
     failed: Mapping[int, tuple[int, str]] | None = None,
 ) -> Path:
-    """Writes a checkpoint of the run in `folder`, and deletes all but this one and the newest `keep` - 1 before it.
+    """Writes a checkpoint of a run. Keeps this one and the newest `keep` - 1 before it, and deletes the others.
 
-    Checkpoints of later epochs are deleted, too. If the disk is too full, all but the newest one are deleted first.
+    Checkpoints of later epochs are deleted too. If the disk is too full, all but the newest one are deleted first.
 
     Args:
-      folder: of the run.
+      folder: run folder.
       state: a TrainState, or any pytree of arrays.
       epoch: epochs that have ended.
-      wall_seconds: of training so far.
-      keep: at least 1.
-      runs: `fingerprint.identity` of the run, or of each of those side by side.
-      refused: checkpoints that cannot be used, to be deleted.
+      wall_seconds: seconds of training so far.
+      keep: number of checkpoints to keep, at least 1.
+      runs: `fingerprint.identity` of each run.
+      refused: unusable checkpoints to delete.
       failed: epoch and reason of each failed run, by lane.
 
     Raises:
-      CheckpointError: it cannot be written; earlier checkpoints stay as they were.
+      CheckpointError: it cannot be written. Earlier checkpoints stay unchanged.
     """
     parent = folder / CHECKPOINTS
     target, partial = parent / f"epoch-{epoch:06d}", parent / f"{_PARTIAL}{epoch:06d}"
     try:
         files.make_folder(parent)
-        for left in parent.glob(f"{_PARTIAL}*"):  # of a run that was killed while it saved
+        for left in parent.glob(f"{_PARTIAL}*"):  # left by a run that was killed while saving
             files.remove(left)
         whole = [path for path in checkpoints(folder) if epoch_of(path) < epoch and path not in refused]
         for old in reversed(whole[1:]):
@@ -115,14 +115,14 @@ def save(
 
 
 def lack_of_space(folder: Path, state: Any) -> str | None:
-    """Reason why a checkpoint of `state`, arrays or their shapes, does not fit on the disk of `folder`; None if it does."""
+    """Reason why a checkpoint of `state`, arrays or their shapes, does not fit on the disk of `folder`, or None if it does."""
     sizes = [x.size * x.dtype.itemsize + np.lib.format.ARRAY_ALIGN * 2 for x in _to_shapes(state).values()]
     lack = files.lack_of_space(folder, [*sizes, 300 * len(sizes), _SPARE])
     return lack and f"a checkpoint takes {lack}"
 
 
 def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
-    """Writes a checkpoint's files into the folder `partial`; its manifest has `content` and the digests of all files."""
+    """Writes a checkpoint's files into the folder `partial`. The manifest has `content` and the digests of all files."""
     leaves = _to_arrays(state)
     _write_arrays(partial / _STATE, list(leaves.values()))
     content = {
@@ -135,16 +135,16 @@ def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
 
 
 def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
-    """Restores the newest undamaged checkpoint of the run in `folder`.
+    """Restores the newest undamaged checkpoint of a run.
 
     Args:
-      folder: of the run.
-      template: the state's structure; leaves have shape and dtype, and on several devices a sharding (`jax.ShapeDtypeStruct`).
-      lines: number of epochs in metrics.csv of each run; checkpoints of later epochs are not used.
+      folder: run folder.
+      template: structure of the state (`jax.ShapeDtypeStruct`s), with shardings if there are several devices.
+      lines: epochs in metrics.csv of each run. Checkpoints of later epochs are not used.
 
     Raises:
-      FolderError: there is none.
-      CheckpointError: no checkpoint can be used; gives the reason for each.
+      FolderError: there is no checkpoint.
+      CheckpointError: no checkpoint is usable. The message has the reason for each.
     """
     refused: dict[Path, str] = {}
     for path in checkpoints_to_resume(folder):
@@ -157,32 +157,32 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
         except FolderError as error:
             refused[path] = str(error)
-    raise CheckpointError(f"{folder} has no checkpoint to go on from: " + "\n".join(refused.values()))
+    raise CheckpointError(f"{folder} has no checkpoint to resume from: " + "\n".join(refused.values()))
 
 
 def _check_lines(path: Path, manifest: Mapping[str, Any], lines: Sequence[int]) -> dict[int, tuple[int, str]]:
-    """The failed runs; raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
+    """Failed runs. Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
     failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
     for lane, whole in enumerate(lines):
         if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
-            raise CheckpointError(f"{path} is of a later epoch than the last whole line of metrics.csv, {whole}")
+            raise CheckpointError(f"{path} has a later epoch than the last complete line of metrics.csv, {whole}")
     return failed
 
 
 def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.ndarray]:
     present = {file.relative_to(path).as_posix() for file in _files(path)}
     for name, digest in manifest["files"].items():
-        if name not in present:  # nor is a file of another folder read
+        if name not in present:  # this also excludes files of other folders
             raise CheckpointError(f"{path} is damaged: {name} is missing")
         if _digest(path / name) != digest:
-            raise CheckpointError(f"{path} is damaged: {name} is not as it was written (SHA-256 differs)")
+            raise CheckpointError(f"{path} is damaged: {name} has changed (SHA-256 differs)")
     if manifest["epoch"] != epoch_of(path):
-        raise CheckpointError(f"{path} is that of epoch {manifest['epoch']} under another name")
+        raise CheckpointError(f"{path} was renamed: it is the checkpoint of epoch {manifest['epoch']}")
     read = _read_arrays(path / _STATE, [dtype for _, _, dtype in manifest["leaves"]])
     arrays = {name: array for (name, _, _), array in zip(manifest["leaves"], read)}
     for name, shape, dtype in manifest["leaves"]:
         if (held := _say(name, arrays[name])) != (saved := f"{name} {dtype}{shape}"):
-            raise CheckpointError(f"{path} was read as {held}, and was written as {saved}")
+            raise CheckpointError(f"{path} was written as {saved} but read as {held}")
     shapes = _to_shapes(template)
     arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
     _check_devices(path, arrays, shapes)
@@ -190,12 +190,12 @@ def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.nda
 
 
 def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
-    """Returns the arrays of the `runs` that were saved, with the last one repeated up to the number of lanes in `shapes`.
+    """Arrays of the saved `runs`, with the last one repeated up to the number of lanes in `shapes`.
 
-    A program may have more lanes than runs. One run alone has no lane axis.
+    A program may have more lanes than runs. A single run has no lane axis.
     """
     if _STEPS not in arrays or _STEPS not in shapes:
-        return arrays  # of no TrainState
+        return arrays  # not a TrainState
     saved, needed = arrays[_STEPS].shape, tuple(shapes[_STEPS].shape)
     if saved == needed or not 1 <= runs <= min(*(saved or (1,)), *(needed or (1,))):
         return arrays
@@ -204,20 +204,20 @@ def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: i
 
 
 def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any]) -> None:
-    """Raises CheckpointError if each run was split over another number of devices: each device has a ring with a cursor."""
+    """Raises CheckpointError if another number of devices shared each run. Each device has a ring with a cursor."""
     if all(name in known for name in (_CURSOR, _STEPS) for known in (arrays, shapes)):
         before, now = (known[_CURSOR].size // max(1, known[_STEPS].size) for known in (arrays, shapes))
         if before != now:
-            raise CheckpointError(f"{path}: devices must be {before} for each run, as when it was made; got {now}")
+            raise CheckpointError(f"{path}: devices must be {before} per run, as when it was written; got {now}")
 
 
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
     """Arrays in the order of `shapes`.
 
-    HParams that the checkpoint lacks are 0, and those that it has too many are left out: a run takes them from its settings.
+    Missing HParams become 0 and additional ones are dropped, because a run takes them from its settings.
 
     Raises:
-      CheckpointError: names the first array that is not what `shapes` asks for.
+      CheckpointError: names the first array that does not match `shapes`.
     """
     fitted = []
     for name, leaf in shapes.items():
@@ -230,11 +230,11 @@ def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeD
         elif name not in arrays:
             raise CheckpointError(f"{path} does not fit this run: it has no {needed}")
         elif (held := _say(name, arrays[name])) != needed:
-            raise CheckpointError(f"{path} does not fit this run: it holds {held} where {needed} is needed")
+            raise CheckpointError(f"{path} does not fit this run: it has {held} instead of {needed}")
         else:
             fitted.append(arrays[name])
     if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
-        raise CheckpointError(f"{path} does not fit this run: it holds {extra[0]}, which is not needed")
+        raise CheckpointError(f"{path} does not fit this run: it has {extra[0]}, which is not needed")
     return fitted
 
 
@@ -269,17 +269,17 @@ def _to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def without_keys(state: Any) -> Any:
-    """A state with the data of its keys in place of the keys; `save` writes the same for it."""
+    """State with its keys replaced by their data. `save` writes the same for it."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
 
 
 def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
-    """Makes a state of its leaves, with the shardings of `template`, or else on the default device."""
+    """Makes a state from its leaves, with the shardings of `template` or on the default device."""
     leaves, treedef = jax.tree.flatten(template)
 
     def put(array: np.ndarray, leaf: Any) -> Any:
         if getattr(leaf, "sharding", None) is None:
-            value = jnp.array(array)  # a copy: the next epoch takes over its memory
+            value = jnp.array(array)  # a copy, because the next epoch reuses its memory
         else:
             value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
         return jax.random.wrap_key_data(value) if _is_key(leaf) else value
@@ -288,7 +288,7 @@ def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
 
 
 def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
-    """Writes NumPy files. Zeros, such as those of a ring that is not full, take no space on most file systems."""
+    """Writes NumPy files. Zeros, such as in a ring that is not full, take no space on most file systems."""
     path.mkdir(parents=True)
     for index, array in enumerate(np.asarray(array, order="C") for array in arrays):
         file = path / f"{index:04d}.npy"
@@ -307,7 +307,7 @@ def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:
 def _read_arrays(path: Path, dtypes: Sequence[str]) -> list[np.ndarray]:
     names = [f"{index:04d}" for index in range(len(dtypes))]
     try:
-        if not any(path.glob("*.npy")):  # of a version that wrote checkpoints with orbax
+        if not any(path.glob("*.npy")):  # from a version that used orbax
             with private_api.array_checkpointer() as checkpointer:
                 arrays = checkpointer.restore(path.absolute())
             return [np.asarray(arrays[name]) for name in names]

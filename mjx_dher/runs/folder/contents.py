@@ -1,4 +1,4 @@
-"""Types and ranges of what a run's files hold. Whoever reads one of these files checks it here."""
+"""Types and ranges of the content of a run's files, which are checked whenever they are read."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 from mjx_dher.validation import check_number
 
-# A form is a type, a pattern of texts, (kind, interval) of a number, [form] of a list's entries, or the forms of a dict by key,
-# where "*" stands for all keys, and a key that ends in "?" may be missing.
+# A form is a type, a pattern for a string, (kind, interval) of a number, [form] for a list, or a dict of forms by key. The key
+# "*" means all keys, and a key that ends in "?" may be missing.
 Form = Any
 
 FINISHED, FAILED = "finished", "failed"  # statuses in result.json
@@ -61,7 +61,7 @@ MANIFEST: Form = {
 
 
 def check(content: Any, form: Form, name: str = "content") -> None:
-    """Raises ValueError, TypeError or KeyError, which name the entry, for content that does not have a form."""
+    """Raises ValueError, TypeError or KeyError, naming the entry, unless `content` has the form `form`."""
     if isinstance(form, type):
         if not isinstance(content, form):
             raise TypeError(f"{name} must be a {form.__name__}")

@@ -1,4 +1,4 @@
-"""Identity of a run: its settings, the digests of custom source files, and the digest that all of its files carry."""
+"""Identity of a run: its settings, digests of custom source files, and a digest of all of these that its files carry."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
 from mjx_dher.spec import RunSpec, custom_components, find_demonstrations
 
-MAY_CHANGE = ("total_steps", "physics", "sources")  # what may differ when a run is resumed
-# JAX's settings that change numbers by more than rounding, and JAX's defaults. Digests include those that differ.
+MAY_CHANGE = ("total_steps", "physics", "sources")  # may differ when a run is resumed
+# JAX flags that change results by more than rounding, and their defaults. Digests include flags that differ.
 JAX_FLAGS: dict[str, Any] = {
     "JAX_ENABLE_X64": 0,
     "JAX_DEFAULT_MATMUL_PRECISION": "default",  # read on GPUs
@@ -28,8 +28,8 @@ JAX_FLAGS: dict[str, Any] = {
     "JAX_RANDOM_SEED_OFFSET": 0,
 }
 _WORDS = {**dict.fromkeys(("y", "yes", "t", "true", "on", "1"), 1), **dict.fromkeys(("n", "no", "f", "false", "off", "0"), 0)}
-# Every version has written these settings, and a digest always includes them. It includes any other setting only if it
-# differs from its default, so that a new setting changes no digest and no trial's name.
+# Settings that every version has written and that a digest always includes. It includes others only if they differ from
+# their default, so a new setting changes neither digests nor names of trials.
 ALWAYS = frozenset(
     (
         *("env", "engine", "sampler", "weight_kernel", "metric", "num_envs", "cycles_per_epoch", "updates_per_cycle"),
@@ -38,7 +38,7 @@ ALWAYS = frozenset(
         *("her_k", "priority_fraction", "epsilon", "temperature", "obs_clip", "norm_clip", "norm_eps"),
     )
 )
-REMOVED = {"learner_kernels": "auto"}  # a setting that this version lacks, in the digests of the versions that had it
+REMOVED = {"learner_kernels": "auto"}  # a removed setting, which older digests include
 
 
 def settings(spec: RunSpec) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def settings(spec: RunSpec) -> dict[str, Any]:
 
 
 def groups(spec: RunSpec) -> dict[str, dict[str, Any]]:
-    """The settings that a run reads, and its seed, in the groups run, sizes and numbers."""
+    """Settings that a run reads, and its seed, in the groups run, sizes and numbers."""
     values = {**settings(spec), "seed": spec.seed}
     sizes, numbers = [field.name for field in dataclasses.fields(Config)], list(HParams._fields)
     names = {"run": [name for name in values if name not in (*sizes, *numbers)], "sizes": sizes, "numbers": numbers}
@@ -60,17 +60,17 @@ def groups(spec: RunSpec) -> dict[str, dict[str, Any]]:
 
 
 def text(value: Any) -> str:
-    """A setting's value as it is written on a command line."""
+    """A setting's value as on a command line."""
     if isinstance(value, (tuple, list)):
         return " ".join(map(str, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def sources(spec: RunSpec) -> dict[str, str]:
-    """Name and digest of the files of custom components and of demonstrations, by field: "push2d.py 3fa9c1d2e4".
+    """Names and digests of the files of custom components and demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
-    MJCFs beside a component that it names are included, and files that it imports are not. Each file is read once in a process,
-    as its module is.
+    A component's digest includes MJCF files in its folder that it names, but not the files that it imports. Each file is read
+    once per process, like its module.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
     if spec.demonstrations is not None:
@@ -106,7 +106,7 @@ def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
 
 
 def jax_flags() -> dict[str, Any]:
-    """Those of `JAX_FLAGS` that differ from JAX's defaults: as JAX has them or, before it is imported, will read them."""
+    """Flags in `JAX_FLAGS` that differ from JAX's defaults, from JAX if it is imported, else from the environment."""
     config, flags = getattr(sys.modules.get("jax"), "config", None), {}
     for name, default in JAX_FLAGS.items():
         value = os.environ.get(name) if config is None else getattr(config, name.lower(), None)
@@ -118,7 +118,7 @@ def jax_flags() -> dict[str, Any]:
 def identity(
     spec: RunSpec, physics: str, own_sources: Mapping[str, str], flags: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Everything that a run computes with, as JSON: settings, seed, physics, custom source files and JAX's flags."""
+    """Everything that determines a run's result, as JSON: settings, seed, physics, custom source files and JAX flags."""
     defaults = settings(RunSpec())
     kept = {name: x for name, x in settings(spec).items() if name in ALWAYS or x != defaults[name]}
     kept.pop("demonstrations", None)  # the file's digest is among the sources
@@ -134,7 +134,7 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 def trial_name(spec: RunSpec) -> str:
-    """Name of a trial's folder: readable settings, and a digest of all settings, custom code and JAX's flags."""
+    """Name of a trial's folder: readable settings, and a digest of all settings, custom code and JAX flags."""
     values, defaults = settings(spec), settings(RunSpec())
     kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]} | REMOVED
     kept.pop("demonstrations", None)
@@ -146,12 +146,12 @@ def trial_name(spec: RunSpec) -> str:
 
 
 def in_a_path(name: str) -> str:
-    """The name of an environment or a sampler for a file name: "Tasks:Mine" becomes tasks-mine."""
+    """Name of an environment or sampler as part of a file name: "Tasks:Mine" becomes tasks-mine."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower())
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:
-    """Differences between two identities, a sentence for each name: "gamma was 0.98 and is 0.1"."""
+    """Differences between two identities, one sentence per name: "gamma was 0.98 and is 0.1"."""
     defaults = {**settings(RunSpec()), "sources": {}, **JAX_FLAGS}
 
     def value(content: Mapping[str, Any], name: str) -> Any:

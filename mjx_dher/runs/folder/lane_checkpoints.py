@@ -1,4 +1,4 @@
-"""Checkpoints of runs that are trained side by side."""
+"""Checkpoints of parallel runs."""
 
 from __future__ import annotations
 
@@ -29,19 +29,17 @@ SHARE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class LaneCheckpoints:
-    """Checkpoints of runs side by side, in a folder of theirs in `shared`; those of a single run are in its own folder."""
+    """Checkpoints of parallel runs, in a folder in `shared`, or of a single run, in its own folder."""
 
     folders: Sequence[Path]  # of the runs
     lanes: int
     shared: Path
     keep: int
-    restart: bool  # start over if no checkpoint can be used, instead of raising
+    restart: bool  # start over if no checkpoint is usable, instead of raising
     report: Callable[[str], None]
     runs: Sequence[dict[str, Any]]  # `fingerprint.identity` of each
-    refused: list[Path] = dataclasses.field(default_factory=list)  # checkpoints that could not be used
-    failed: dict[int, tuple[int, str]] = dataclasses.field(
-        default_factory=dict
-    )  # lane -> the epoch in which it failed, and why
+    refused: list[Path] = dataclasses.field(default_factory=list)  # unusable checkpoints
+    failed: dict[int, tuple[int, str]] = dataclasses.field(default_factory=dict)  # epoch and reason of each failed lane
 
     @property
     def names(self) -> list[str]:
@@ -50,7 +48,7 @@ class LaneCheckpoints:
 
     @property
     def folder(self) -> Path:
-        """Folder that holds `checkpoints/`: an existing one of these runs, with any number of lanes, or a new one."""
+        """Folder that contains `checkpoints/`: an existing one of these runs, with any number of lanes, or a new one."""
         shared = self.shared / fingerprint.sha256_of([self.lanes, *self.names])[:10]
         if not shared.exists():
             others = (path.parent for path in sorted(self.shared.glob(f"*/{NAMES_FILE}")) if _names(path) == self.names)
@@ -58,37 +56,39 @@ class LaneCheckpoints:
         return shared if self.lanes > 1 or shared.exists() else self.folders[0]
 
     def restore(self, init: Callable[[], TrainState], will_save: bool) -> Start:
-        """Restores the newest checkpoint; without one, the runs start with what `init` makes.
+        """Restores the newest checkpoint. Without one, the runs start with the state from `init`.
 
         Raises:
-          FolderError: no checkpoint can be used, and not `restart`; or there is none, the runs `will_save` some, and the disk
-            is too full.
+          FolderError: no checkpoint is usable and `restart` is False, or there is none and the disk is too full for one that
+            the runs `will_save`.
         """
         state = init()
         if not processes.broadcast(functools.partial(self._find, state, will_save)):
             return Start(state)
         template = jax.tree.map(self._shape_of, state)
         hparams: Any = jax.tree.map(jnp.copy, state.hparams)
-        del state  # there may be no memory for two
+        del state  # memory may not suffice for two
         try:
             restored = self._read(template)
             self._compare(restored)
         except FolderError as error:
             if not self.restart:
                 raise
-            self.report(f"{error}; training these runs from their start")
+            self.report(f"{error}; these runs start over")
             self.refused.extend(run_folder.checkpoints(self.folder))
             return Start(init())
         for path, why in restored.refused.items():
             self.report(f"not used: {why}")
             self.refused.append(path)
         self.failed.update(restored.failed)
-        self.report(f"going on from {restored.path}, after epoch {restored.epoch}")
-        # A lane's number for its sampler depends on which others are left.
+        self.report(f"resuming from {restored.path}, after epoch {restored.epoch}")
+        # The index of a lane's sampler depends on the remaining runs.
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
 
     def _find(self, state: TrainState, will_save: bool) -> bool:
-        """Whether there is a checkpoint. Reports a disk too full for another; raises FolderError if that were the first."""
+        """Whether there is a checkpoint. Reports a disk too full for another one, or raises FolderError if there is none
+        yet.
+        """
         has_some = bool(run_folder.checkpoints(self.folder))
         if will_save and (lack := checkpoint.lack_of_space(self.folder, state)):
             if not has_some:
@@ -97,14 +97,14 @@ class LaneCheckpoints:
         return has_some
 
     def _read(self, template: TrainState) -> Restored:
-        """Returns the newest whole checkpoint; raises FolderError in all processes if one of them cannot read it."""
+        """Reads the newest undamaged checkpoint. Raises FolderError in all processes if one of them cannot read it."""
         problem: FolderError | None = None
         try:
             restored = checkpoint.restore(self.folder, template, [len(results.read_metrics(folder)) for folder in self.folders])
         except FolderError as error:
             problem = error
         if processes.any_process(problem is not None):
-            raise problem or FolderError(f"another process cannot read {self.folder}: all of them need the same file system")
+            raise problem or FolderError(f"another process cannot read {self.folder}: all must share one file system")
         processes.check_equal({"checkpoint": restored.path})
         return restored
 
@@ -113,9 +113,9 @@ class LaneCheckpoints:
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
     def _compare(self, restored: Restored) -> None:
-        """Reports changes of settings since the checkpoint. Raises FolderError for those that must not change."""
+        """Reports changes of settings since the checkpoint. Raises FolderError for settings that must not change."""
         if len(restored.runs) != len(self.runs):
-            raise FolderError(f"{restored.path} is of {len(restored.runs)} runs, not of {len(self.runs)}")
+            raise FolderError(f"{restored.path} has {len(restored.runs)} runs, not {len(self.runs)}")
         changed: dict[str, str] = {}
         for folder, before, now in zip(self.folders, restored.runs, self.runs):
             content = run_folder.read_config(folder)
@@ -128,11 +128,7 @@ class LaneCheckpoints:
             self.report(f"since {restored.path}: {text}")
 
     def save(self, progress: Progress) -> Path:
-        """Writes a checkpoint and returns its path.
-
-        Raises:
-          CheckpointError: it cannot be written.
-        """
+        """Writes a checkpoint. Returns its path. Raises CheckpointError if it cannot be written."""
         state = processes.collect(checkpoint.without_keys(progress.state))
         if state is None:
             return self.shared
@@ -141,7 +137,7 @@ class LaneCheckpoints:
             files.make_folder(folder)
             files.write_json(folder / NAMES_FILE, {"cells": self.names})
         for run in self.folders:
-            loggers.flush_logs(run)  # a checkpoint is of no use without the lines before it
+            loggers.flush_logs(run)  # a checkpoint is useless without the lines before it
         told: dict[str, Any] = {"runs": self.runs, "refused": tuple(self.refused), "failed": self.failed}
         path = checkpoint.save(folder, state, progress.epoch, progress.wall_seconds, self.keep, **told)
         self.refused.clear()
@@ -155,7 +151,7 @@ class LaneCheckpoints:
             self.report(str(error))
 
     def clear(self, keep_end: bool = False) -> None:
-        """Removes the checkpoints of these runs, and those in `shared` of runs that have all ended.
+        """Removes the checkpoints of these runs, and those in `shared` whose runs have all ended.
 
         With `keep_end`, the newest checkpoint in a run's own folder stays.
         """
@@ -174,7 +170,7 @@ class LaneCheckpoints:
 
 
 class Schedule:
-    """Times of checkpoints: by epochs, and by the clock, by which at most `SHARE` of the time is spent on them."""
+    """Times of checkpoints: by epochs, and by the clock. Saving by the clock takes at most a fraction `SHARE` of the time."""
 
     def __init__(self, epochs: int):
         self._epochs, self._due = epochs, time.monotonic() + SECONDS_TO_FIRST
@@ -185,14 +181,14 @@ class Schedule:
 
     @contextlib.contextmanager
     def saving(self) -> Iterator[None]:
-        """Times the block, which saves, and decides when the next one is due by the clock."""
+        """Times the block, which saves, and schedules the next checkpoint by the clock."""
         began = time.monotonic()
         yield
         self._due = time.monotonic() + max(SECONDS_BETWEEN, (time.monotonic() - began) / SHARE)
 
 
 def _names(path: Path) -> list[str]:
-    """Names of the runs that share a checkpoint; none if another process has just removed it, or if they are damaged."""
+    """Names of the runs that share a checkpoint. Empty if another process has just removed it, or if it is damaged."""
     try:
         names = files.read_json(path)["cells"]
         return names if all(name == Path(name).name for name in names) else []

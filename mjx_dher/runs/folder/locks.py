@@ -18,16 +18,16 @@ Run = tuple[RunSpec, Path]  # and its folder
 
 @dataclasses.dataclass(frozen=True)
 class Claims:
-    """Claims of one process on runs."""
+    """One process's claims on runs."""
 
     sweep: bool  # skip runs that have ended or that another process trains, instead of raising
     report: Callable[[str], None]
 
     def is_free(self, spec: RunSpec, folder: Path) -> bool:
-        """Whether a run is to be trained, as far as can be known before it is compiled.
+        """Whether to train a run, as far as known before compilation.
 
         Raises:
-          FolderError: it is not, and this is no sweep.
+          FolderError: it is not, and this is not a sweep.
         """
         if not folder.exists():
             return True
@@ -40,18 +40,18 @@ class Claims:
             return False
 
     def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
-        """Makes and locks the folders of the first `lanes` runs that are to be trained and that no other process trains.
+        """Makes and locks the folders of the first `lanes` runs that have not ended and that no other process trains.
 
         Args:
           stack: holds the locks.
           waiting: runs, in order.
-          lanes: at least 1.
+          lanes: number of runs, at least 1.
 
         Returns:
-          The claimed runs, and the waiting ones, of which those of other processes come last. Ended runs are in neither.
+          The claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither.
 
         Raises:
-          FolderError: a run has ended or another process trains it, and this is no sweep; or a folder is not writable.
+          FolderError: a run has ended or another process trains it, and this is not a sweep, or a folder is not writable.
         """
         claimed: list[Run] = []
         busy: list[Run] = []
@@ -72,10 +72,10 @@ class Claims:
         return claimed, busy
 
     def _is_due(self, spec: RunSpec, folder: Path) -> bool:
-        """Whether a locked run is to be trained.
+        """Whether to train a locked run.
 
         Raises:
-          FolderError: it is not, and this is no sweep.
+          FolderError: not, and this is not a sweep.
         """
         if not self.sweep and (folder / run_folder.CONFIG_FILE).exists():
             run_folder.check_same(folder, spec)
@@ -83,17 +83,17 @@ class Claims:
             return True
         problem = results.trial_problem(folder, spec) if self.sweep else results.result_problem(folder, with_policy=False)
         if self.sweep and problem is not None:
-            self.report(f"{problem}; it is trained again")
+            self.report(f"{problem}; training it again")
         if self.sweep:
             return problem is not None
         if problem is None and results.can_go_on(folder, spec.config.total_steps):
             return True
-        raise FolderError(problem or f"{folder} has ended; there is nothing to go on with")
+        raise FolderError(problem or f"{folder} has ended; there is nothing to resume")
 
 
 @contextlib.contextmanager
 def named(folder: Path) -> Iterator[None]:
-    """Turns an OSError into a FolderError that names the folder and its last checkpoint."""
+    """Converts an OSError to a FolderError that names the folder and its last checkpoint."""
     try:
         yield
     except OSError as error:
@@ -102,6 +102,6 @@ def named(folder: Path) -> Iterator[None]:
 
 
 def last_checkpoint(folder: Path) -> str:
-    """Clause of an error message about the run's newest checkpoint."""
+    """Part of an error message about the run's newest checkpoint."""
     paths = run_folder.checkpoints(folder)
-    return f"`{lookup.command_name()} resume {folder}` goes on from {paths[0]}" if paths else "there is no checkpoint"
+    return f"`{lookup.command_name()} resume {folder}` resumes from {paths[0]}" if paths else "there is no checkpoint"

@@ -1,4 +1,4 @@
-"""Loggers of a run's metrics: a CSV file, and on request JSON lines, TensorBoard or Weights & Biases."""
+"""Loggers of a run's metrics: a CSV file, and optionally JSON lines, TensorBoard or Weights & Biases."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DIGEST = "digest"  # the last column of metrics.csv
 
 
 class Sink(Protocol):
-    """Takes a row after each epoch."""
+    """Logger that takes one row per epoch."""
 
     def write(self, row: dict[str, Any]) -> None: ...
 
@@ -34,12 +34,12 @@ class Sink(Protocol):
 
 
 class CsvSink:
-    """metrics.csv: one line for each epoch, written before the next begins. The last column is the run's digest.
+    """metrics.csv, with one line per epoch, written before the next epoch begins. The last column is the run's digest.
 
     Args:
-      path: of the file.
-      epochs: epochs that had ended, if the run is resumed; their lines stay, and later lines are removed.
-      digest: of the run's settings; see `fingerprint.digest`.
+      path: the file.
+      epochs: epochs that had ended, if the run resumes. Later lines are removed.
+      digest: `fingerprint.digest` of the run.
 
     Raises:
       FolderError: the file lacks lines of these epochs.
@@ -49,7 +49,7 @@ class CsvSink:
         self._writer: csv.DictWriter[str] | None = None
         self._digest = digest
         if epochs and (whole := len(read_rows(path))) < epochs:
-            raise FolderError(f"{path} is damaged: {epochs} epochs had ended, and it has whole lines of {whole}")
+            raise FolderError(f"{path} is damaged: {epochs} epochs had ended, but it has complete lines of only {whole}")
         kept = _whole_lines(path)[: 1 + epochs] if epochs else []
         files.write(path, "".join(kept).encode())
         self._file = path.open("a", newline="", encoding="utf-8")
@@ -73,11 +73,11 @@ class CsvSink:
 
 
 class JsonlSink:
-    """metrics.jsonl: one object for each epoch; numbers that are not finite are null.
+    """metrics.jsonl, with one object per epoch. Numbers that are not finite are null.
 
     Args:
-      path: of the file.
-      epochs: epochs that had ended, if the run is resumed; missing lines are taken from metrics.csv beside it.
+      path: the file.
+      epochs: epochs that had ended, if the run resumes. Missing lines are taken from metrics.csv.
     """
 
     def __init__(self, path: Path, epochs: int = 0):
@@ -95,14 +95,14 @@ class JsonlSink:
 
 
 def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Reads the lines of a metrics.csv as numbers, up to the first that is truncated; the digest stays text.
+    """Reads the lines of a metrics.csv as numbers, up to the first truncated one. The digest stays text.
 
     Args:
-      path: of the file.
-      digests: those that the run has had, the first one first. None: unknown.
+      path: the file.
+      digests: digests that the run has had, in order, or None if unknown.
 
     Raises:
-      FolderError: a line is missing, has an invalid value, or is of another run.
+      FolderError: a line is missing, has an invalid value, or belongs to another run.
     """
     head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
     rows: list[dict[str, Any]] = []
@@ -116,13 +116,13 @@ def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str
             while left and left[0] != row.get(DIGEST):
                 del left[0]
             if digests is not None and not left:
-                raise ValueError(f"its digest {row.get(DIGEST)} is of another run; this one has {', '.join(digests)}")
+                raise ValueError(f"its digest {row.get(DIGEST)} belongs to another run; this one has {', '.join(digests)}")
         rows.append(row)
     return rows
 
 
 def _whole_lines(path: Path) -> list[str]:
-    """Head of metrics.csv, and its lines up to the first that is truncated."""
+    """Head of metrics.csv, and its lines up to the first truncated one."""
     head, *lines = files.whole_lines(path) or [""]
     if not head.startswith(",".join(FIRST_COLUMNS) + ","):
         return []
@@ -141,7 +141,7 @@ def _to_json(row: dict[str, Any]) -> str:
 
 
 def flush_logs(folder: Path) -> None:
-    """Flushes the CSV file and the JSON lines of the run in `folder` to the disk."""
+    """Flushes the CSV file and the JSON lines of the run in `folder` to disk."""
     for name in (METRICS_FILE, JSON_FILE):
         if (folder / name).exists():
             files.flush(folder / name)
@@ -149,7 +149,7 @@ def flush_logs(folder: Path) -> None:
 
 
 class TensorBoardSink:
-    """An event file for TensorBoard in `path`, over environment steps. Extra `tensorboard`."""
+    """Event file for TensorBoard in `path`, over environment steps. Needs the extra `tensorboard`."""
 
     def __init__(self, path: Path, env_steps: int = 0):
         from tensorboardX import SummaryWriter
@@ -167,18 +167,18 @@ class TensorBoardSink:
 
 
 class WandbSink:
-    """A run of Weights & Biases, set by its own variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
+    """A Weights & Biases run, configured by its environment variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
 
     Args:
-      folder: of the run; offline logs are kept in it, and a resumed run continues the same W&B run.
-      content: of config.json.
+      folder: run folder. It holds offline logs, and a resumed run continues the same W&B run.
+      content: content of config.json.
     """
 
     def __init__(self, folder: Path, content: dict[str, Any]):
         import wandb
 
         run = run_folder.to_spec(folder, content)
-        # A resumed run keeps its id, so settings that may change are not part of it.
+        # A resumed run keeps its id, which therefore excludes settings that may change.
         described = {name: x for name, x in run_folder.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
@@ -201,7 +201,7 @@ EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # extras, and their 
 
 
 def check_logs(logs: Sequence[str], installed: bool = True) -> None:
-    """Raises ValueError unless all names are in LOGS and their packages, if they must be, are installed."""
+    """Raises ValueError unless all names are in LOGS and their packages are installed, if they must be."""
     if not isinstance(logs, (list, tuple)):
         raise ValueError(f"log must be names among {', '.join(LOGS)}; got {logs!r}")
     for log in logs:
@@ -221,8 +221,8 @@ def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: in
 
 
 def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
-    """One row for the sinks, in the order of metrics.csv, from a `loop.Progress` and the metrics of one run."""
-    steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are alike
+    """Row for the sinks, in the order of metrics.csv, from a `loop.Progress` and the metrics of one run."""
+    steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are equal
     first = {name: metrics[name] for name in FIRST_COLUMNS if name in metrics}
     return {
         **{name: getattr(progress, name) for name in COUNTS},

@@ -1,4 +1,4 @@
-"""Results of runs that have ended, and checks that their files are whole."""
+"""Results of ended runs, and checks that their files are complete."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def has_result(folder: Path) -> bool:
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """Reads the result of a run that has ended.
+    """Reads the result of an ended run.
 
     Raises:
-      FolderError: it is missing, damaged or of another run.
+      FolderError: it is missing, damaged or belongs to another run.
     """
     path = folder / run_folder.RESULT_FILE
     with run_folder.checked(path):
@@ -30,38 +30,38 @@ def read_result(folder: Path) -> dict[str, Any]:
         numbers = {name: value for name, value in content.items() if value is not None}
         contents.check(numbers, contents.RESULT_FINISHED if content["status"] == FINISHED else contents.RESULT)
     if content["digest"] != (digest := run_folder.read_config(folder)["digest"]):
-        other = f"its digest is {content['digest']}, that of {run_folder.CONFIG_FILE} {digest}"
+        other = f"its digest is {content['digest']}, but {run_folder.CONFIG_FILE} has {digest}"
         raise FolderError(f"{path} is of a run with other settings: {other}")
     return content
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Reads the lines of metrics.csv, all of which must be of the run in `folder`.
+    """Reads metrics.csv, all lines of which must belong to the run in `folder`.
 
     Raises:
-      FolderError: no run folder, a line that is missing or has an invalid value, or one of another run.
+      FolderError: it is not a run folder, or a line is missing, invalid or belongs to another run.
     """
     path, content = folder / run_folder.METRICS_FILE, run_folder.read_config(folder)
     rows = loggers.read_rows(path, run_folder.digests(content))
     strange = {row.get(loggers.DIGEST) for row in rows} - {content["digest"]}
     if strange and "earlier" not in content:
         warnings.warn(
-            f"{path} has lines of digest {', '.join(map(str, strange))}, {run_folder.CONFIG_FILE} has {content['digest']}; the"
-            " version that wrote it kept no earlier digests, so the lines may be of another run",
+            f"{path} has lines with digest {', '.join(map(str, strange))}, but {run_folder.CONFIG_FILE} {content['digest']};"
+            " its version kept no earlier digests, so the lines may belong to another run",
             stacklevel=2,
         )
     return rows
 
 
 def earlier_digests(folder: Path, digest: str) -> list[str]:
-    """Digests that a run has had before it resumes with `digest`."""
+    """Digests that a run had before it resumed with `digest`."""
     content, lines = run_folder.read_config(folder), [row[loggers.DIGEST] for row in read_metrics(folder)]
     known = run_folder.digests(content) or [*dict.fromkeys(lines), content["digest"]]
     return [one for one, after in zip(known, [*known[1:], digest]) if one != after]
 
 
 def can_go_on(folder: Path, total_steps: int) -> bool:
-    """Whether a run that has ended can resume: it failed, or made fewer than `total_steps`, and it has a checkpoint.
+    """Whether an ended run can resume: it failed or made fewer than `total_steps`, and it has a checkpoint.
 
     Raises:
       FolderError: its result is damaged.
@@ -72,9 +72,9 @@ def can_go_on(folder: Path, total_steps: int) -> bool:
 
 
 def result_problem(folder: Path, with_policy: bool = True) -> str | None:
-    """Reason why a run with a result is not whole: its files are damaged, or are of other runs. None if it is whole.
+    """Reason why a run with a result is invalid: files are damaged or belong to other runs. None if it is valid.
 
-    A run can go on without its policy, and so can be looked at without it.
+    A run can resume without its policy, so the policy may be left out of the check.
     """
     try:
         result = read_result(folder)
@@ -89,7 +89,7 @@ def result_problem(folder: Path, with_policy: bool = True) -> str | None:
         return str(error)
     epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
     if len(rows) != epochs:
-        return f"{folder / run_folder.METRICS_FILE} has whole lines of {len(rows)} of {epochs} epochs"
+        return f"{folder / run_folder.METRICS_FILE} has complete lines of {len(rows)} of {epochs} epochs"
     if rows and rows[-1].get(loggers.DIGEST) != content["digest"]:
         return (
             f"{folder / run_folder.METRICS_FILE} ends with the digest {rows[-1].get(loggers.DIGEST)}, not {content['digest']}"
@@ -98,7 +98,7 @@ def result_problem(folder: Path, with_policy: bool = True) -> str | None:
 
 
 def trial_problem(folder: Path, spec: RunSpec) -> str | None:
-    """Reason why a trial of a sweep that has a result is not whole, or its folder holds another trial; None if it is right."""
+    """Reason why a trial with a result is invalid, or its folder holds another trial. None if it is valid."""
     try:
         run_folder.check_same(folder, spec, ("physics",))
     except FolderError as error:
@@ -107,5 +107,5 @@ def trial_problem(folder: Path, spec: RunSpec) -> str | None:
 
 
 def is_done(folder: Path, spec: RunSpec) -> bool:
-    """Whether a trial of a sweep has ended, and its files are whole."""
+    """Whether a trial of a sweep has ended with valid files."""
     return has_result(folder) and trial_problem(folder, spec) is None

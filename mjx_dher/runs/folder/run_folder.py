@@ -30,21 +30,21 @@ POLICY_FILE = "policy.npz"
 RESULT_FILE = "result.json"
 CHECKPOINTS = "checkpoints"
 MANIFEST = "manifest.json"  # of a checkpoint
-INFINITE = "inf"  # in place of an infinite number, which JSON lacks
-POLICY_RATIO = 20.0  # of a policy's arrays to its file, which is written without compression
+INFINITE = "inf"  # JSON has no infinite numbers
+POLICY_RATIO = 20.0  # largest ratio of a policy's arrays to its uncompressed file
 FINISHED, FAILED = contents.FINISHED, contents.FAILED
 
 
 @contextlib.contextmanager
 def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
-    """Makes and locks the folder for a new run: `out`, or a fresh one under runs/. Removes it if it stays empty.
+    """Makes and locks the folder of a new run: `out`, or a new one under runs/. Removes it if it stays empty.
 
     Raises:
       FolderError: `out` is not an empty folder, or another process has locked it.
       OSError: the folder cannot be made or written to.
     """
     if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
-        raise FolderError(f"out: {out} is there already and is no folder")
+        raise FolderError(f"out: {out} exists and is not a folder")
     while True:
         folder = _fresh(spec) if out is None else out
         with contextlib.ExitStack() as stack:
@@ -66,9 +66,9 @@ def _fresh(spec: RunSpec) -> Path:
 
 
 def engine_name(env: Any) -> str:
-    """Name of the physics of an environment: of its `engine`, or of another attribute that is one; "none" without any.
+    """Name of the engine of an environment: its `engine`, or another attribute that is an engine, or "none".
 
-    A wrapper has the environment within in its attribute `env`.
+    Wrappers have the inner environment in their attribute `env`.
     """
     own = getattr(env, "__dict__", {})
     if getattr(env, "engine", None) is None and "env" in own:
@@ -83,12 +83,12 @@ def write_config(
     """Makes the folder and writes config.json.
 
     Args:
-      path: of the folder.
+      path: run folder.
       spec: the run's description.
-      engine: the physics that runs (`spec.engine` may be auto).
-      extra: further entries, for the reader and for `resume`.
-      earlier: digests that the run had before it resumed with other settings, the first one first.
-      resumes: whether to leave a file that differs in nothing but versions as it is.
+      engine: engine that runs (`spec.engine` may be auto).
+      extra: additional entries, for the reader and for `resume`.
+      earlier: digests that the run had before it resumed with other settings, in order.
+      resumes: whether to keep a file that differs only in versions.
     """
     hparams = {name: INFINITE if value == math.inf else float(value) for name, value in spec.hparams._asdict().items()}
     description = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
@@ -120,28 +120,28 @@ def _versions() -> dict[str, str]:
 
 
 def changed_versions(content: Mapping[str, Any]) -> list[str]:
-    """Sentences about versions, of this program and of those that it needs, that differ from those in config.json."""
+    """Sentences about versions of this program and its dependencies that differ from config.json."""
     before, now = content.get("versions", {}), _versions()
     return [f"{name} was {before[name]} and is {now[name]}" for name in now if before.get(name, now[name]) != now[name]]
 
 
 def checkpoints(path: Path) -> list[Path]:
-    """Checkpoints of the run in `path`, the newest first."""
+    """Checkpoints of the run in `path`, newest first."""
     paths = (path / CHECKPOINTS).glob("epoch-*")
     return sorted((path for path in paths if path.name[6:].isdecimal()), key=epoch_of, reverse=True)
 
 
 def epoch_of(checkpoint: Path) -> int:
-    """Epochs that had ended when a checkpoint was made, from its name."""
+    """Ended epochs of a checkpoint, from its name."""
     return int(checkpoint.name[6:])
 
 
 def checkpoints_to_resume(path: Path) -> list[Path]:
-    """Checkpoints of the run in `path`, the newest first. Raises FolderError if there is none."""
+    """Checkpoints of the run in `path`, newest first. Raises FolderError if there is none."""
     if paths := checkpoints(path):
         return paths
     raise FolderError(
-        f"{path} has no checkpoint to go on from: it was stopped before it had saved any (see --checkpoint-every)"
+        f"{path} has no checkpoint to resume from: it was stopped before it had saved any (see --checkpoint-every)"
     )
 
 
@@ -150,12 +150,12 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
 
     Raises:
       FileNotFoundError: there is no such file.
-      FolderError: it cannot be read, or is of another schema.
+      FolderError: it cannot be read, or has another schema.
     """
     content = files.read_json(file)
     written = content.get("schema") if isinstance(content, dict) else None
     if written != schema:
-        raise FolderError(f"{file} is not of this program's schema {schema} (found {written!r})")
+        raise FolderError(f"{file} must have schema {schema}; got {written!r}")
     return content
 
 
@@ -163,7 +163,7 @@ def read_config(path: Path) -> dict[str, Any]:
     """Reads config.json of the run in `path`.
 
     Raises:
-      FolderError: no run folder, or one of another schema.
+      FolderError: it is not a run folder, or has another schema.
     """
     if not path.is_dir():
         raise FolderError(f"{path} is not a run folder: no such folder")
@@ -174,11 +174,11 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def read_config_file(file: Path) -> dict[str, Any]:
-    """Reads a run's config.json, wherever it lies and whatever its name is.
+    """Reads a run's config.json from any path.
 
     Raises:
       FileNotFoundError: there is no such file.
-      FolderError: it does not describe a run, or is of another schema.
+      FolderError: it does not describe a run, or has another schema.
     """
     content = read_versioned(file, SCHEMA)
     with checked(file, "does not describe a run"):
@@ -190,7 +190,7 @@ def read_config_file(file: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def checked(file: Path, problem: str = "is damaged") -> Iterator[None]:
-    """Turns the errors of a block that reads the content of `file` into a FolderError."""
+    """Converts errors of a block that reads the content of `file` to a FolderError."""
     try:
         yield
     except FolderError:
@@ -202,41 +202,41 @@ def checked(file: Path, problem: str = "is damaged") -> Iterator[None]:
 
 
 def read_spec(path: Path, trusted: bool = False) -> RunSpec:
-    """Reads the description of the run in `path`; raises FolderError as `read_run` does."""
+    """Reads the description of the run in `path`. Raises FolderError like `read_run`."""
     return read_run(path, trusted)[1]
 
 
 def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec]:
     """Reads config.json of the run in `path`: its content, and the run's description.
 
-    The code that it names is imported only if `trusted`, or if the user has trained with it (`trust`).
+    Code that it names is imported only if `trusted`, or if the user has trained with it (`trust`).
 
     Raises:
-      FolderError: no run folder, one of another schema, or a config.json that was edited.
+      FolderError: it is not a run folder, has another schema, or config.json was edited.
     """
     content = read_config(path)
     spec = to_spec(path, content, trusted)
     if edits := edited(path, content, spec):
-        raise FolderError(f"{path / CONFIG_FILE} is not as the run wrote it: {'; '.join(edits.values())}")
+        raise FolderError(f"{path / CONFIG_FILE} was edited: {'; '.join(edits.values())}")
     check_written(path, content, spec)
     return content, spec
 
 
 def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
-    """The `identity` of the run that config.json describes."""
+    """`identity` of the run that config.json describes."""
     own = fingerprint.identity(spec, content["physics"], content["sources"], content.get("jax_flags"))
     return {**own, **{name: content["config"].get(name, value) for name, value in fingerprint.REMOVED.items()}}
 
 
 def digests(content: Mapping[str, Any]) -> list[str] | None:
-    """Digests that a run has had, the first one first; None if config.json is of a version that did not keep them."""
+    """Digests that a run has had, in order, or None if its version did not keep them."""
     return [*content["earlier"], content["digest"]] if "earlier" in content else None
 
 
 def foreign(content: dict[str, Any], spec: RunSpec, written: Mapping[str, Any]) -> str | None:
-    """How a file's settings differ from any that the run has had; None if the file is the run's."""
+    """Differences between a file's settings and all settings that the run has had, or None if the file belongs to the run."""
     changed, known = fingerprint.differences(written, identity_of(content, spec)), digests(content)
-    if known is None:  # then a run that was resumed cannot be told from another one that differs in these
+    if known is None:  # then a resumed run is indistinguishable from another one that differs in these
         changed = {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
     elif fingerprint.digest(written) in known:
         return None
@@ -244,31 +244,31 @@ def foreign(content: dict[str, Any], spec: RunSpec, written: Mapping[str, Any]) 
 
 
 def check_written(path: Path, content: dict[str, Any], spec: RunSpec) -> None:
-    """Raises FolderError if the newest checkpoint, or else the policy, is of a run with other settings."""
+    """Raises FolderError if the newest checkpoint, or else the policy, belongs to a run with other settings."""
     file, written = written_identity(path)
     if written is not None and (other := foreign(content, spec, written)):
         raise FolderError(f"{file} is of a run with other settings: {other}")
 
 
 def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
-    """Settings in config.json that differ from those that the run was trained with: a sentence for each, by name."""
+    """Settings in config.json that differ from the trained ones, one sentence per name."""
     now = identity_of(content, spec)
     if content["digest"] == fingerprint.digest(now):
         return {}
     _, written = written_identity(path)
     changed = {} if written is None else fingerprint.differences(written, now)
-    return changed or {"digest": f"its digest is {content['digest']}, and that of its settings is {fingerprint.digest(now)}"}
+    return changed or {"digest": f"its digest is {content['digest']}, but its settings have {fingerprint.digest(now)}"}
 
 
 def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
-    """Sentences about custom source files, and flags of JAX, that have changed since the run was trained."""
+    """Sentences about custom source files and JAX flags that changed since the run was trained."""
     own = {**content["sources"], **fingerprint.sources(spec)}
     now = fingerprint.identity(spec, content["physics"], own, fingerprint.jax_flags())
     return list(fingerprint.differences(identity_of(content, spec), now).values())
 
 
 def check_same(path: Path, spec: RunSpec, may_change: Sequence[str] = fingerprint.MAY_CHANGE) -> None:
-    """Raises FolderError, which names the differences, if the folder holds a run with other settings than may change."""
+    """Raises FolderError, naming the differences, if the folder holds a run that differs in more than `may_change`."""
     content = read_config(path)
     before = identity_of(content, to_spec(path, content))
     now = fingerprint.identity(spec, content["physics"], content["sources"], fingerprint.jax_flags())
@@ -282,7 +282,7 @@ def read_manifest(checkpoint: Path) -> dict[str, Any]:
     with checked(checkpoint):
         content = read_versioned(checkpoint / MANIFEST, SCHEMA)
         if content.pop("sha256", None) != fingerprint.sha256_of(content):
-            raise ValueError(f"{MANIFEST} is not as it was written: SHA-256 differs")
+            raise ValueError(f"{MANIFEST} has changed: SHA-256 differs")
         contents.check(content, contents.MANIFEST)
         return content
 
@@ -294,23 +294,23 @@ def save_policy(path: Path, policy: Any, run: Mapping[str, Any], interface: Mapp
 
 
 def read_policy_settings(path: Path) -> dict[str, Any]:
-    """Reads the `identity` in policy.npz of the run in `path`. Raises FolderError if it has none, or is damaged."""
+    """Reads the `identity` in policy.npz of the run in `path`. Raises FolderError if it is missing or damaged."""
     file = path / POLICY_FILE
     with checked(file, "is damaged or not a policy of this program"):
         return policy_settings(npz.read(file, ("settings",), POLICY_RATIO))
 
 
 def policy_settings(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """The `identity` among the arrays of a policy.npz. Raises ValueError, KeyError or TypeError if there is none."""
+    """`identity` among the arrays of a policy.npz. Raises ValueError, KeyError or TypeError if there is none."""
     if "settings" not in arrays:
-        raise ValueError("it has no settings, which the policies of runs have")
+        raise ValueError("it has no settings, unlike the policies of runs")
     settings = json.loads(arrays["settings"].tobytes())
     contents.check(settings, contents.IDENTITY, "settings")
     return dict(settings)
 
 
 def written_identity(path: Path) -> tuple[Path, dict[str, Any] | None]:
-    """The run's newest checkpoint, or else its policy, and the `identity` in it; None without either."""
+    """The run's newest checkpoint, or else its policy, and the `identity` in it, or None without either."""
     for checkpoint in checkpoints(path):
         with contextlib.suppress(FolderError, ValueError):  # damaged, or of several runs
             (content,) = read_manifest(checkpoint)["runs"]
@@ -321,7 +321,7 @@ def written_identity(path: Path) -> tuple[Path, dict[str, Any] | None]:
 
 
 def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSpec:
-    """Makes the description of a run from the content of its config.json, at `path` or in the folder `path`.
+    """Description of a run from the content of its config.json, at `path` or in the folder `path`.
 
     Names of code and of demonstrations are marked as coming from a file, unless `trusted`.
 
@@ -332,7 +332,7 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
     with checked(file, "does not describe a run"):
         fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
-        if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default is not what was meant
+        if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default could be wrong
             raise ValueError(f"it lacks {', '.join(sorted(missing))}")
         spec = RunSpec(
             config=Config(**{name: value for name, value in config.items() if name not in fingerprint.REMOVED}),

@@ -1,4 +1,4 @@
-"""Running a training loop: compile it, check that it fits into memory, call it epoch by epoch."""
+"""Runs a training loop: compiles it, checks that it fits into memory, and calls it epoch by epoch."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
 from mjx_dher.types import Array, Env, Metrics, PRNGKey
 
-# Updates, of all runs side by side, from which on the compiler's search for the fastest matrix products pays: on one H100 it
-# takes half a minute, and Push's epochs then take 0.83 of the time (docs/design.md).
+# Updates, summed over parallel runs, from which the compiler's search for the fastest matrix products pays. On one H100 it
+# takes half a minute and shortens Push's epochs to 0.83 (docs/design.md).
 WORTH_A_SEARCH = 500_000
-# What XLA hands over to YNNPACK on a CPU.
+# Option for the operations that XLA hands over to YNNPACK on a CPU.
 _YNN, _PRODUCTS = "xla_cpu_experimental_ynn_fusion_type", "LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
 
 
 class Start(NamedTuple):
-    """Point from which a run, or L side by side, goes on."""
+    """Point from which a run, or L parallel runs, start or resume."""
 
     state: TrainState
     epoch: int = 0  # epochs that have ended
@@ -37,25 +37,25 @@ class Start(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Point that a run, or L side by side, has reached after an epoch."""
+    """Progress of a run, or of L parallel runs, after an epoch."""
 
     epoch: int  # from 1
     num_epochs: int
-    env_steps: int  # of each run
-    updates: int  # of each run
-    wall_seconds: float  # since the first epoch began: compilation is not counted
+    env_steps: int  # per run
+    updates: int  # per run
+    wall_seconds: float  # since the first epoch began, without compilation
     epoch_seconds: float
-    metrics: dict[str, Any]  # a float each; of runs side by side an array [L] each
-    state: TrainState  # valid until the next epoch begins, which takes over its memory
-    finite: Any  # [] or [L] bool, whether all of the learner's numbers are
+    metrics: dict[str, Any]  # floats, or arrays [L] for parallel runs
+    state: TrainState  # valid until the next epoch begins, which reuses its memory
+    finite: Any  # [] or [L] bool, whether all of the learner's floats are finite
 
 
 class Compiled(NamedTuple):
-    """A training loop, compiled."""
+    """A compiled training loop."""
 
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics, Array]]  # the last as `Progress.finite`
-    nbytes: int  # memory that an epoch takes on a device, as the compiler planned it; 0 where it does not tell
+    nbytes: int  # memory of an epoch per device, planned by the compiler; 0 if unknown
 
 
 def train(
@@ -70,21 +70,20 @@ def train(
 ) -> Iterator[Progress]:
     """Trains one run without a folder, yielding after every epoch.
 
-    `train_runs` adds folders, checkpoints, logs and runs side by side.
+    `train_runs` adds folders, checkpoints, logs and parallel runs.
 
     Args:
       env: the environment.
       config: sizes.
-      hparams: numbers. None: the defaults.
+      hparams: numbers.
       seed: random seed.
-      on_compile: called with None when compilation begins and with its seconds when it has ended.
-      start: point to resume from, as `checkpoint.restore` returns it. None: a new run.
-      devices: that share the run, or "all": each has an equal share of environments, ring and batches.
-      **parts: sampler, priority and learner, as `make_train` takes them.
+      on_compile: called with None when compilation begins, and with its duration in seconds when it ends.
+      start: point to resume from, as returned by `checkpoint.restore`.
+      devices: number of devices that share the run, or "all". Each has an equal part of environments, ring and batches.
+      **parts: sampler, priority and learner, as in `make_train`.
 
     Raises:
-      ValueError: invalid Config or HParams, too little memory, missing devices, or an error of `env.check`, before the first
-        epoch or after any.
+      ValueError: invalid Config or HParams, too little memory, missing devices, or an error of `env.check`.
     """
     hparams = HParams() if hparams is None else hparams
     validation.validate(config, hparams, env.episode_length)
@@ -106,10 +105,16 @@ def train(
 def run(
     env: Env, config: Config, compiled: Compiled, start: Start, fetch: Callable[[Any], Any] = jax.device_get
 ) -> Iterator[Progress]:
-    """Runs what `compile_program` has made, yielding after every epoch; metrics stay arrays.
+    """Runs a compiled program, yielding after every epoch. Metrics stay arrays.
 
-    The device works in a thread of its own, so that the caller's signal handlers run while an epoch is under way. `fetch` gives
-    arrays as NumPy's.
+    The device works in its own thread, so signal handlers can run during an epoch.
+
+    Args:
+      env: the environment.
+      config: sizes.
+      compiled: result of `compile_program`.
+      start: point to start or resume from.
+      fetch: converts a tree of arrays to NumPy.
 
     Raises:
       ValueError: an error of `env.check` after an epoch.
@@ -142,9 +147,14 @@ def run(
 
 
 def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0, layout: Layout = ONE) -> Compiled:
-    """Compiles `program` for one run, or for L side by side where `key` and `hparams` lead with [L].
+    """Compiles `program` for one run, or for L parallel runs if `key` and `hparams` lead with [L]. Their values do not matter.
 
-    Their values do not matter. The compiler takes more trouble for a run of many `updates`. `layout` says on which devices.
+    Args:
+      program: the training loop.
+      key: random key.
+      hparams: numbers.
+      updates: updates per run. For many updates, a longer search by the compiler pays.
+      layout: devices.
     """
 
     def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:
@@ -184,15 +194,16 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
 
 
 def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bool = False) -> jax.stages.Compiled:
-    """Compiles what `jax.jit(...).lower` gave, without what takes most of the time and gains little.
+    """Compiles a lowered function without passes that take long and gain little.
 
-    On a CPU a program of which physics takes nearly all the time need not be optimized (`plain`). On a GPU one pass makes
-    Triton kernels of what looks like a softmax, as a norm does, and from then on the compiler weighs, with many tilings each,
-    what else could go into them: a learner gains nothing by it. And only with `search` are Triton's matrix products compiled,
-    with many tilings each, to be timed against those of cuBLAS, which has its own ready.
+    Args:
+      lowered: result of `jax.jit(...).lower`.
+      search: whether to search for the fastest matrix products on a GPU, by timing Triton's with many tilings.
+      plain: whether to skip optimizations on a CPU, for programs whose time is spent in physics.
 
-    On a CPU XLA hands sums along an axis, as a norm has them, to a library (YNNPACK), too. Of small sums each call takes longer
-    than the sum: with layer normalization an update took two to three times as long. Only matrix products are handed over.
+    On a GPU, one pass turns anything like a softmax, such as a norm, into Triton kernels and then weighs many fusions, from
+    which a learner gains nothing. On a CPU, XLA hands small sums to a library (YNNPACK), whose calls take longer than the
+    sums: layer normalization made updates two to three times slower. Only matrix products are handed over here.
     """
     options: dict[str, Any] = {}
     if jax.default_backend() == "cpu":
@@ -209,7 +220,7 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
     except jax.errors.JaxRuntimeError as error:
         if _YNN not in options or _YNN not in str(error):
             raise
-    del options[_YNN]  # this version of the compiler does not have it: it is called experimental
+    del options[_YNN]  # this version of the compiler lacks the option, which is experimental
     return lowered.compile(compiler_options=options)
 
 
@@ -219,10 +230,10 @@ def state_template(program: Train) -> TrainState:
 
 
 def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
-    """Refuses a replay ring, or networks, that cannot fit, before anything is compiled; so many devices share the memory.
+    """Raises ValueError, before compilation, if replay ring or networks do not fit into the memory that `sharers` devices
+    share.
 
-    Raises:
-      ValueError: says what is needed, what is free and, for the ring, which replay_size would fit.
+    The message has the needed and the free memory and, for the ring, a replay_size that fits.
     """
     available = memory.available_bytes()
     if available is None:
@@ -240,10 +251,9 @@ def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
 
 
 def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
-    """Refuses a program that cannot fit, by the compiler's figure, before it runs; so many devices share the memory.
+    """Raises ValueError if a compiled program does not fit into the memory that `sharers` devices share.
 
-    Raises:
-      ValueError: says what is needed, what is free and which settings decide it.
+    The message has the needed and the free memory and the settings that decide it.
     """
     available = memory.available_bytes()
     nbytes = sharers * compiled.nbytes
@@ -251,10 +261,10 @@ def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
         settings = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes")
         raise ValueError(
             f"an epoch needs {memory.format_bytes(nbytes)}, but only {memory.format_bytes(available)} of memory"
-            f" is free; what decides it: {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
+            f" is free; it depends on {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
         )
 
 
 def to_float(value: Any) -> float:
-    """A float32 rounded to six digits: 0.95, where float() of a float32 is 0.949999988..."""
+    """A float32 rounded to six digits: 0.95 instead of 0.949999988..."""
     return float(f"{value:.6g}")

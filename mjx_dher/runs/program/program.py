@@ -1,4 +1,4 @@
-"""A compiled program for runs side by side: lanes of one `vmap`, or one run without a lane axis."""
+"""A compiled program for parallel runs: lanes of one `vmap`, or one run without a lane axis."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState
 from mjx_dher.types import Env, EnvSpec, PRNGKey
 
-# HParams, and which of a program's samplers, priorities and generators a lane uses; see `one_of` of each.
+# HParams, and the indices of a lane's sampler, priority and generator (`context.one_of`).
 Lane = collections.namedtuple("Lane", (*HParams._fields, "choice", "priority_choice", "generator_choice"))  # type: ignore[misc]
 EvaluateFn = Callable[[TrainState, Any], Outcome]
 
@@ -54,12 +54,12 @@ def _parts(spec: RunSpec) -> tuple[tuple[str, str, str, str], str, str]:
 
 
 def choices_of(specs: Sequence[RunSpec]) -> Choices:
-    """Components that the runs of a program use."""
+    """Components used by the runs of a program."""
     return Choices(*(list(dict.fromkeys(values)) for values in zip(*map(_parts, specs))))
 
 
 class Program(NamedTuple):
-    """A compiled program for runs side by side."""
+    """A compiled program for parallel runs."""
 
     lanes: int
     layout: Layout
@@ -67,11 +67,11 @@ class Program(NamedTuple):
     learner: Learner
     spec: EnvSpec
     compiled: Compiled
-    evaluate: concurrent.futures.Future[EvaluateFn]  # last evaluation of each lane
+    evaluate: concurrent.futures.Future[EvaluateFn]  # final evaluation of each lane
 
 
 def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -> Train:
-    """Makes the training loop of runs that share a program, with the components that they name."""
+    """Training loop of runs that share a program, with their components."""
     validation.check_parts(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
     distance = context.of_env(env, spec.hparams).goal_distance
@@ -94,7 +94,7 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
 
 
 def _join_generators(names: Sequence[str]) -> trainer.GoalsFn | None:
-    """The generators of these names, joined; None if all of them are the reset's own goals."""
+    """Joined generators of these names, or None if all are the reset's goals."""
     if set(names) == {"reset"}:
         return None
     from mjx_dher.contrib import generators
@@ -112,7 +112,7 @@ def compile_runs(
 ) -> Program:
     """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate.
 
-    The last evaluation may still be compiling, in a thread, while the runs are trained.
+    The final evaluation may still be compiling in a thread while the runs are trained.
 
     Raises:
       ValueError: too little memory for one run, or sizes that the devices do not divide.
@@ -122,9 +122,9 @@ def compile_runs(
     layout = mesh.arrange(devices, most)
     train = make_loop(env, spec, choices, layout)
     loop.check_memory(train, spec.config, layout.sharers)
-    lanes = math.ceil(most / layout.lanes)  # of a device, as are the bytes
+    lanes = math.ceil(most / layout.lanes)  # per device, like the bytes
     available = memory.available_bytes()
-    if available is not None:  # the rings alone must fit before the compiler is asked
+    if available is not None:  # the rings must fit before anything is compiled
         available //= layout.sharers
         lanes = max(1, min(lanes, int(available / train.replay_bytes)))
     while True:
@@ -142,10 +142,10 @@ def compile_runs(
 
 
 def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout: Layout) -> str:
-    apart = f"{layout.lanes} of them apart" if layout.lanes > 1 else ""
+    apart = f"{layout.lanes} groups" if layout.lanes > 1 else ""
     parts = f"{layout.shards} for each run" if layout.shards > 1 else ""
     number = f"{len(layout.devices)} devices ({', '.join(filter(None, (apart, parts)))}) of " if layout.devices else ""
-    together = f"{lanes} runs side by side, of {len(specs)}" if lanes > 1 else f"one run at a time, of {len(specs)}"
+    together = f"{lanes} parallel runs of {len(specs)}" if lanes > 1 else f"one run at a time of {len(specs)}"
     note = getattr(getattr(env, "engine", None), "note", "")  # how the engine runs this model
     physics = run_folder.engine_name(env) + (f" ({note})" if note else "")
     return (
@@ -177,7 +177,7 @@ def _compile(
 def _compile_evaluation(
     env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
 ) -> concurrent.futures.Future[EvaluateFn]:
-    """Compiles the last evaluation; with `beside`, in a thread while the runs are trained, which takes memory."""
+    """Compiles the final evaluation. With `beside`, a thread does so during training, which takes memory."""
     episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.shards)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
@@ -203,7 +203,7 @@ def _compile_evaluation(
 
 
 def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGKey, Any]:
-    """Keys and numbers of `lanes` runs, [lanes] each, or [] for one; missing runs repeat the last one."""
+    """Keys and numbers of `lanes` runs, [lanes] each, or [] for one. Missing runs repeat the last one."""
     padded = [specs[min(i, len(specs) - 1)] for i in range(lanes)]
     numbers: list[Any] = [spec.hparams for spec in padded]
     if any(len(own) > 1 for own in choices):
@@ -215,7 +215,7 @@ def stack(specs: Sequence[RunSpec], choices: Choices, lanes: int) -> tuple[PRNGK
 
 
 def lane_of(tree: Any, lane: int, lanes: int) -> Any:
-    """One run's slice of a pytree of `lanes` runs; a single lane has no axis."""
+    """One run's slice of a pytree of `lanes` runs. A single lane has no axis."""
     return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
 
 
@@ -227,10 +227,15 @@ def evaluate(
     episodes: int,
     fetch: Callable[[Any], Any] = jax.device_get,
 ) -> Outcome:
-    """Plays the last evaluation of each lane; returns the outcomes [lanes, episodes] as NumPy arrays.
+    """Outcomes [lanes, episodes] of the final evaluation of each lane, as NumPy arrays.
 
-    `keys` are those of the runs: chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`. `fetch` turns arrays of
-    all devices into NumPy arrays.
+    Args:
+      env: the environment.
+      program: the compiled program.
+      state: state of the runs.
+      keys: keys of the runs. Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`.
+      episodes: episodes per lane.
+      fetch: converts arrays of all devices to NumPy.
     """
 
     def key_of(number: int) -> Any:
