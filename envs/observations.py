@@ -13,7 +13,7 @@ from mjx_dher.envs.kinematics import Place, names_of
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 
-KINDS = ("site", "body", "rot", "vel", "angvel", "qpos", "qvel")
+KINDS = ("site", "body", "rot", "vel", "angvel", "qpos", "qvel", "sensor")
 
 
 class Entry:
@@ -32,6 +32,7 @@ class Entry:
             raise ValueError(f"observation {text!r} must subtract entries of equal sizes; got {sizes}")
         self.size = sizes[0]
         self.joints = self._parts[0].joints  # names of those whose coordinates it has
+        self.reads_sensors = any(part.kind == "sensor" for part in self._parts)
 
     def __call__(self, physics: Physics) -> Array:
         value, *others = [part(physics) for part in self._parts]
@@ -51,6 +52,10 @@ class _Part:
             self.joints = [str(names[joint]) for joint in joints]
             self.index = np.concatenate([_indices(model, joint, self.kind) for joint in joints])
             self.size = len(self.index)
+        elif self.kind == "sensor":
+            sensors = [model.sensor(i) for i in pick("sensor", name, names_of(model, "sensor"))]
+            self.index = np.concatenate([sensor.adr[0] + np.arange(sensor.dim[0]) for sensor in sensors])
+            self.size = len(self.index)
         else:
             self.place = Place(model, text if self.kind in ("site", "body") else name)
             self.size = 6 if self.kind == "rot" else 3
@@ -58,6 +63,8 @@ class _Part:
     def __call__(self, physics: Physics) -> Array:
         if self.kind in ("qpos", "qvel"):
             return getattr(physics, self.kind)[self.index]
+        if self.kind == "sensor":
+            return physics.sensors[self.index]  # type: ignore[index]
         if self.kind in ("vel", "angvel"):
             return self.place.motion(physics.qpos, physics.qvel)[self.kind == "angvel"]
         return self.place.rotation(physics.qpos) if self.kind == "rot" else self.place.position(physics.qpos)

@@ -18,6 +18,7 @@ from mjx_dher.envs import probes
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque
 from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines.sensors import Sensors
 from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.observations import Entry
@@ -65,6 +66,7 @@ class MujocoTask(GoalEnv):
     hz: float = 25.0  # actions per second
     episode_length: int = 50
     max_speed: float = 1000.0  # rad/s or m/s; the simulation has diverged if it is faster
+    _sensors: Sensors | None = None
 
     def __init__(
         self,
@@ -114,6 +116,10 @@ class MujocoTask(GoalEnv):
         ends = np.cumsum([0, *(entry.size for entry in self._entries)]).tolist()
         self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
         self.observation_size = ends[-1]
+        if any(entry.reads_sensors for entry in self._entries):
+            self._sensors = Sensors(self.engine.name, self.model, getattr(self.engine, "allow_cpu", False))
+            none: Any = np.zeros(self.model.nsensordata, np.float32)
+            self._rest = dataclasses.replace(self._rest, sensors=none)  # `_sensed` reads them
         check_number("max_speed", self.max_speed, "(0, inf)", float)
         rest = np.asarray(self._rest.qpos)
         probes.check_stable(self.model, rest, np.asarray(self._hold.ctrl), self.dt * self.episode_length)
@@ -159,6 +165,7 @@ class MujocoTask(GoalEnv):
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
         """First state of an episode that starts from `physics`, with a goal [G]."""
+        physics = self._sensed(physics)
         obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
             physics=physics,
@@ -202,11 +209,14 @@ class MujocoTask(GoalEnv):
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
         qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)
         physics = dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel))
+        physics = self._sensed(physics)
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
         return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
 
     def check(self) -> None:
         self.engine.check()
+        if self._sensors:
+            self._sensors.check()
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """Rewards [...] of goals [..., G]. Sparse: 0 if reached, else -1. Dense: minus the distance."""
@@ -240,7 +250,8 @@ class MujocoTask(GoalEnv):
 
     def advance(self, physics: Physics, action: Array) -> Physics:
         """Physics one step later."""
-        return self.engine.advance(physics, self.controls(physics, action))
+        controls = self.controls(physics, action)
+        return self._sensed(self.engine.advance(physics, controls), controls)
 
     def observed(self, physics: Physics) -> Physics:
         """Physics that is observed after a step. By default unchanged."""
@@ -263,6 +274,13 @@ class MujocoTask(GoalEnv):
         """Whether this is a possible state of the task, bool []. NaN is not."""
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(physics)]
         return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < self.max_speed)
+
+    def _sensed(self, physics: Physics, controls: Controls | None = None) -> Physics:
+        """The physics with its sensors, under these inputs or those of the start, if the task observes any."""
+        if self._sensors is None:
+            return physics
+        controls = jax.tree.map(jnp.asarray, self._hold) if controls is None else controls
+        return dataclasses.replace(physics, sensors=self._sensors.read(physics, controls))
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
         return self.reached(achieved_goal, desired_goal).astype(jnp.float32)

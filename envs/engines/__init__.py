@@ -63,7 +63,7 @@ def engine_options(name: str) -> list[str]:
     Raises:
       ValueError: as for `make_engine`.
     """
-    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps", "derived"})
+    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps", "derived", "sensors"})
 
 
 def _constructor(name: str) -> Callable[..., Engine]:

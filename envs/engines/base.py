@@ -19,6 +19,8 @@ class Physics:
     qvel: Array  # [nv]
     warmstart: Array  # [nv] first guess of the constraint solver (qacc_warmstart)
     act: Array  # [na] activations of actuators
+    # [nsensordata] in the state of a task that observes sensors, else None. Engines ignore it and return None.
+    sensors: Array | None = None
 
 
 @struct.dataclass

@@ -117,8 +117,20 @@ def _end(
     for i in range(nv):
         qvel_out[env, i] = qvel[env, i]
         rest_out[env, i] = warmstart[env, i]
-    for i in range(rest_out.shape[1] - nv):
+    for i in range(act.shape[1]):
         rest_out[env, nv + i] = act[env, i]
+
+
+@wp.kernel(enable_backward=False, module="mjx_dher_graph")
+def _end_sensors(
+    sensordata: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """Copies the sensors out of MuJoCo Warp's memory, to the end of the rows."""
+    env = wp.tid()
+    first = rest_out.shape[1] - sensordata.shape[1]
+    for i in range(sensordata.shape[1]):
+        rest_out[env, first + i] = sensordata[env, i]
 
 
 class Simulation:
@@ -130,13 +142,16 @@ class Simulation:
       substeps: timesteps an environment step.
       contacts: contacts that there is memory for, in each environment on average.
       rows: rows of constraints that there is memory for, in each environment.
+      sensors: whether `advance` also reads the sensors, in the state that it ends with.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, rows: int):
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, rows: int, sensors: bool = False):
         warp = private_api.mujoco_warp()
         model = copy.copy(model)
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # nobody reads them
+        if not sensors:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._step, self._model = warp.step, warp.put_model(model)
+        self._last = warp.forward if sensors else None
         # MuJoCo Warp takes the velocity term of equality constraints from the timestep before.
         self._before = (warp.kinematics, warp.com_pos, warp.com_vel) if model.neq else ()
         self._model.opt.warn_overflow = 0  # a kernel that prints waits for the host
@@ -145,7 +160,7 @@ class Simulation:
 
     def load(self) -> None:
         """Compiles the kernels, or takes them from Warp's cache."""
-        self._step(self._model, self._data)
+        (self._last or self._step)(self._model, self._data)
         wp.synchronize_device()
 
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
@@ -164,6 +179,8 @@ class Simulation:
         else:
             wp.capture_launch(self._graph)
         wp.launch(_end, dim=self._num_envs, inputs=held, outputs=list(result))
+        if self._last:
+            wp.launch(_end_sensors, dim=self._num_envs, inputs=[data.sensordata], outputs=[result[2]])
 
     def overflow(self) -> int:
         """Number of environments, since the last call, in which contacts or rows were left out because they did not fit."""
@@ -177,3 +194,5 @@ class Simulation:
             compute(self._model, self._data)
         for _ in range(self._substeps):
             self._step(self._model, self._data)
+        if self._last:
+            self._last(self._model, self._data)

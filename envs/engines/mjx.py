@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import io
 import re
 import warnings
@@ -144,6 +145,19 @@ def _geoms_in(model: mujoco.MjModel, message: str) -> list[int]:
     return []
 
 
+def _loaded(data: mjx.Data, physics: Physics, controls: Controls) -> mjx.Data:
+    """Returns `data` with the state and the inputs."""
+    return data.replace(
+        qpos=physics.qpos,
+        qvel=physics.qvel,
+        qacc_warmstart=physics.warmstart,
+        act=physics.act,
+        mocap_pos=controls.mocap[:, :3],
+        mocap_quat=controls.mocap[:, 3:],
+        ctrl=controls.ctrl,
+    )
+
+
 class MjxEngine:
     """MJX with impl="jax".
 
@@ -154,7 +168,9 @@ class MjxEngine:
 
     name = "jax"
 
-    def __init__(self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5):
+    def __init__(
+        self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5, sensors: bool = False
+    ):
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
         if ignored := beyond_defaults(model, _IGNORED.__contains__):
@@ -163,6 +179,8 @@ class MjxEngine:
         _grow_for_margins(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
+        if not sensors:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._mujoco_model, self._substeps, self._welds = model, substeps, _welds(model)
         try:
             self._model = mjx.put_model(model, impl="jax")
@@ -179,22 +197,21 @@ class MjxEngine:
         start = jax.tree.map(lambda x: x if x.size else jnp.asarray(x), self._data)
 
         def substep(_, p: Physics) -> Physics:
-            data = start.replace(
-                qpos=p.qpos,
-                qvel=p.qvel,
-                qacc_warmstart=p.warmstart,
-                act=p.act,
-                mocap_pos=controls.mocap[:, :3],
-                mocap_quat=controls.mocap[:, 3:],
-                ctrl=controls.ctrl,
-            )
+            data = _loaded(start, p, controls)
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
                 data = self._step(data) if self._welds else mjx.step(self._model, data)
             # MJX takes its own precision from jax_enable_x64; between substeps, as between steps, it is float32.
             return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act)))
 
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
-            return jax.lax.fori_loop(0, self._substeps, substep, physics)
+            return jax.lax.fori_loop(0, self._substeps, substep, dataclasses.replace(physics, sensors=None))
+
+    def read_sensors(self, physics: Physics, controls: Controls) -> Array:
+        """The values [nsensordata] of the model's sensors, for an engine that was made with `sensors`."""
+        check_shapes(self._mujoco_model, physics, controls)
+        data = _loaded(jax.tree.map(jnp.asarray, self._data), physics, controls)
+        with jax.default_matmul_precision("highest"):
+            return mjx.forward(self._model, data).sensordata.astype(jnp.float32)
 
     def check(self) -> None:
         pass  # no contact is lost: there is memory for all of them

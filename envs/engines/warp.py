@@ -44,6 +44,7 @@ class WarpEngine:
         large models half as many again as random controls cause.
       contacts: contacts that fit into memory, likewise; `graph` only.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
+      sensors: whether the object is for `read_sensors` instead of `advance`; `graph` only.
 
     Raises:
       ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the path does not support the model.
@@ -61,6 +62,7 @@ class WarpEngine:
         constraints: int | None = None,
         contacts: int | None = None,
         allow_cpu: bool = False,
+        sensors: bool = False,
     ):
         check_name("path of engine warp", path, PATHS)
         prepare()
@@ -70,7 +72,8 @@ class WarpEngine:
         for name, count in limits.items():
             if count is not None:
                 check_count(name, count)
-        self._model, self._substeps = copy.copy(model), substeps
+        self._model, self._substeps, self._sensors = copy.copy(model), substeps, sensors
+        self.allow_cpu = allow_cpu
         self.path, self.note = _choose(model, path, constraints)
         self.name = "warp" if self.path == "fused" else "warp graph"  # their numbers differ, so runs name them apart
         if self.path == "graph":
@@ -119,26 +122,34 @@ class WarpEngine:
             with me._lock:
                 me._simulation(qpos.device, qpos.shape[0]).advance((qpos, qvel, rest), inputs, (qpos_out, qvel_out, rest_out))
 
-        nq, nv, na = self._model.nq, self._model.nv, self._model.na
+        nq, nv, rest = self._model.nq, self._model.nv, self._model.nv + self._model.na
+        rest += self._model.nsensordata if self._sensors else 0
         return wp.jax_callable(
             advance_all,
             num_outputs=3,
             graph_mode=wp.JaxCallableGraphMode.NONE,
             vmap_method="broadcast_all",
-            output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "rest_out": (1, nv + na)},
+            output_dims={"qpos_out": (1, nq), "qvel_out": (1, nv), "rest_out": (1, rest)},
             module_preload_mode=wp.JaxModulePreloadMode.NONE,  # `_begin_loading` does it
         )
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
+        qpos, qvel, rest = self._advanced(physics, controls)
+        if not self._model.na:
+            return Physics(qpos=qpos, qvel=qvel, warmstart=rest, act=physics.act)
+        return Physics(qpos=qpos, qvel=qvel, warmstart=rest[: self._model.nv], act=rest[self._model.nv :])
+
+    def read_sensors(self, physics: Physics, controls: Controls) -> jax.Array:
+        """The values [nsensordata] of the model's sensors, for an engine that was made with `sensors`."""
+        return self._advanced(physics, controls)[2][self._model.nv + self._model.na :]
+
+    def _advanced(self, physics: Physics, controls: Controls) -> list[jax.Array]:
         check_shapes(self._model, physics, controls)
         self._begin_loading()
         rest = jnp.concatenate([physics.warmstart, physics.act]) if self._model.na else physics.warmstart
         rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, rest)]
         private_api.reset_call_id(self._call)
-        qpos, qvel, rest = (x[0] for x in self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None]))
-        if not self._model.na:
-            return Physics(qpos=qpos, qvel=qvel, warmstart=rest, act=physics.act)
-        return Physics(qpos=qpos, qvel=qvel, warmstart=rest[: self._model.nv], act=rest[self._model.nv :])
+        return [x[0] for x in self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None])]
 
     def check(self) -> None:
         """Checks that no contacts were lost since the last call; waits for the kernel to compile.
@@ -174,7 +185,8 @@ class WarpEngine:
 
     def _made(self, num_envs: int) -> simulation.Simulation | graph.Simulation:
         if self.path == "graph":
-            return graph.Simulation(self._model, num_envs, self._substeps, self._contacts, self._constraints)
+            sizes = (self._contacts, self._constraints)
+            return graph.Simulation(self._model, num_envs, self._substeps, *sizes, sensors=self._sensors)
         return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints)
 
     def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation | graph.Simulation:

@@ -1,0 +1,55 @@
+"""Reads a model's sensors on every engine, as `mj_forward` computes them for the present state and inputs."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from mjx_dher.envs.engines.base import Controls, Physics
+from mjx_dher.types import Array
+
+
+class Sensors:
+    """Sensors of a model, read by the implementation that an engine uses.
+
+    Args:
+      engine: an engine's name: "native", "jax", "warp" or "warp graph". For both paths of warp, MuJoCo Warp reads them.
+      model: the compiled MJCF.
+      allow_cpu: as for `WarpEngine`.
+
+    Raises:
+      ValueError: the implementation does not support the model.
+    """
+
+    def __init__(self, engine: str, model: mujoco.MjModel, allow_cpu: bool = False):
+        self._reader: Any
+        if engine == "native":
+            from mjx_dher.envs.engines.native import Simulator
+
+            self._reader = Simulator(model, derived=("sensordata",))
+            self._rest = jax.device_get(self._reader.make_data())
+        elif engine == "jax":
+            from mjx_dher.envs.engines.mjx import MjxEngine
+
+            self._reader = MjxEngine(model, 1, sensors=True)
+        else:
+            from mjx_dher.envs.engines.warp import WarpEngine
+
+            self._reader = WarpEngine(model, 0, path="graph", allow_cpu=allow_cpu, sensors=True)
+
+    def read(self, physics: Physics, controls: Controls) -> Array:
+        """The values [nsensordata] of all sensors, in the model's order."""
+        if not hasattr(self, "_rest"):
+            return self._reader.read_sensors(physics, controls)
+        state = {"qpos": physics.qpos, "qvel": physics.qvel, "act": physics.act, "qacc_warmstart": physics.warmstart}
+        mocap = {"mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
+        data = dataclasses.replace(jax.tree.map(jnp.asarray, self._rest), ctrl=controls.ctrl, **state, **mocap)
+        return self._reader.forward(data).derived["sensordata"]
+
+    def check(self) -> None:
+        """Raises ValueError if contacts were left out, as `Engine.check` does."""
+        self._reader.check()

@@ -1,0 +1,69 @@
+"""Sensors as observations, against MuJoCo's own."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from conftest import refuses
+
+from mjx_dher.envs.task import MujocoTask, Position
+
+PRESS = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom type="plane" size="2 2 .1"/>
+    <body name="finger" pos="0 0 .4"><joint name="lift" type="slide" axis="0 0 1" range="-.5 .2" damping="5"/>
+      <geom type="sphere" size=".05" mass="0.5"/><site name="pad" size=".06"/></body>
+    <body name="box" pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  </worldbody>
+  <actuator><position name="lift" joint="lift" kp="200" kv="20" ctrlrange="-.5 .2"/></actuator>
+  <sensor>
+    <framepos name="where" objtype="site" objname="pad"/><touch name="touch" site="pad"/><jointpos joint="lift"/>
+    <actuatorfrc name="push" actuator="lift"/><accelerometer name="acceleration" site="pad"/>
+  </sensor>
+</mujoco>"""
+
+
+class Press(MujocoTask):
+    """A finger that presses a box onto the floor."""
+
+    model = PRESS
+    goal = Position("body:box", (-0.3, -0.3, 0.1), (0.3, 0.3, 0.1))
+    observations = ("qpos:lift", "sensor:touch", "sensor:push where - sensor:push where", "sensor:sensor_2", "sensor:*")
+
+
+@pytest.mark.parametrize(
+    ("engine", "options"),
+    [
+        ("native", {}),
+        pytest.param("jax", {}, marks=pytest.mark.slow),
+        pytest.param("warp", {"allow_cpu": True}, marks=pytest.mark.slow),  # the fused kernel
+        pytest.param("warp", {"allow_cpu": True, "path": "graph"}, marks=pytest.mark.slow),
+    ],
+)
+def test_sensors_are_those_of_the_present_state(engine, options):
+    env = Press(engine=engine, **options)
+    data = mujoco.MjData(env.model)
+
+    def expected():
+        mujoco.mj_forward(env.model, data)  # mj_step leaves them a timestep behind
+        sensors = data.sensordata
+        return np.concatenate([data.qpos[:1], sensors[3:4], np.zeros(4), sensors[4:5], sensors])
+
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2))
+    np.testing.assert_allclose(state.obs["observation"][1], expected(), atol=1e-5)
+    step = jax.jit(jax.vmap(env.step))
+    data.ctrl[0] = -0.15 - 0.9 * 0.35
+    for _ in range(5):
+        state = step(state, jnp.full((2, 1), -0.9))
+        mujoco.mj_step(env.model, data, nstep=8)
+    assert data.sensordata[3] > 10.0  # N: it touches
+    np.testing.assert_allclose(state.obs["observation"][1], expected(), rtol=1e-3, atol=1e-3)
+    env.check()
+
+
+def test_a_sensor_that_is_missing_is_named():
+    with refuses("sensor", "'tuoch'", "touch"):
+        type("Wrong", (Press,), {"observations": ("sensor:tuoch",)})(engine="native")
