@@ -179,6 +179,9 @@ SHAPES = (
 )
 
 
+EGG = '<geom type="ellipsoid" size="0.06 0.05 0.08"/>'
+
+
 def robot(seed):
     """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random.
 
@@ -215,7 +218,8 @@ def robot(seed):
             )
         chain += f'<body pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
     boxes = "".join(
-        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/>{rng.choice(SHAPES)[:-2]} name="o{i}"'
+        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/>{(rng.choice(SHAPES) if i or seed % 4 else EGG)[:-2]}'
+        f' name="o{i}"'
         f' priority="{rng.integers(2)}" friction="{numbers(1, 0.3, 1)} 0.02 0.01" condim="{rng.choice([1, 3, 4, 6])}"'
         f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'
         for i in range(2)
@@ -236,7 +240,9 @@ def robot(seed):
     equal += f'<joint joint1="{third}" polycoef="0.05 0 0 0 0"/><tendon tendon1="t0" tendon2="t2" polycoef="{numbers(5)}"/>'
     few_terms = f"<tendon>{tendons}</tendon><equality>{equal}</equality>" if few else ""
     return mujoco.MjModel.from_xml_string(
-        f'''<mujoco>{few_terms}<option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12"/><worldbody>
+        f'''<mujoco>{few_terms}
+<option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12" ccd_tolerance="1e-9"/>
+<worldbody>
 <body name="t" mocap="true"/><geom name="floor" type="plane" size="2 2 0.1"/>{boxes}
 <body pos="0 0 0.3">{chain}{"</body>" * 5}</worldbody><contact>{pairs}</contact><actuator>{motors}</actuator></mujoco>'''
     )

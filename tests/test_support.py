@@ -28,6 +28,10 @@ OFF_CENTRE = """
 """
 
 
+EGGS = """
+<mujoco><worldbody><body><freejoint/><geom name="g" type="ellipsoid" size="1 1 1"/></body>
+<geom name="o" type="ellipsoid" size="1 1 1"/></worldbody></mujoco>
+"""
 SPATIAL = """
 <worldbody><site name="s"/><site name="u" pos="1 0 0"/></worldbody>
 <tendon><spatial name="far"><site site="s"/><site site="u"/></spatial></tendon>
@@ -46,7 +50,8 @@ def welded(extra="", shape="box", options="", gap=0.0):
 def test_unsupported_features_are_named_with_their_elements():
     motor = '<actuator><general name="m" joint="j" {}/></actuator>'
     cases = [
-        (welded(shape="ellipsoid"), ["contacts of ellipsoid and box", "'g'", "'o'"]),
+        (mujoco.MjModel.from_xml_string(EGGS), ["contacts of ellipsoid and ellipsoid", "'g'", "'o'"]),
+        (welded(shape="ellipsoid", options='<flag nativeccd="disable"/>'), ["ellipsoids with nativeccd", "'g'", "'o'"]),
         (mujoco.MjModel.from_xml_string(OFF_CENTRE), ["free bodies", "implicitfast", "'f'"]),
         (welded(shape="cylinder", options='<flag nativeccd="disable"/>', gap=0.1), ["gaps of cylinders", "'g'"]),
         (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
@@ -128,7 +133,7 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
 
 def test_an_unsupported_model_is_rejected():
     with refuses("engine", "warp", "ellipsoid"):
-        engines.make_engine("warp", welded(shape="ellipsoid"), 20, path="fused", allow_cpu=True)
+        engines.make_engine("warp", mujoco.MjModel.from_xml_string(EGGS), 20, path="fused", allow_cpu=True)
     with refuses("engine", "warp", "actuator_armature", "native"):
         model = welded('<actuator><motor name="m" joint="j" armature="1"/></actuator>')
         engines.make_engine("warp", model, 20, allow_cpu=True)

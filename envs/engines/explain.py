@@ -15,7 +15,8 @@ _CURES = {
     "elliptic": 'cone="pyramidal"',
     "noslip": 'noslip_iterations="0"',
     "solver": 'solver="Newton"',
-    "nativeccd": '<flag nativeccd="disable"/>',
+    "without nativeccd": '<flag nativeccd="disable"/>',
+    "with nativeccd": '<flag nativeccd="enable"/>',
     "stand_in": "add the geom that it names",
 }
 

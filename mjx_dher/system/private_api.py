@@ -84,7 +84,7 @@ def mujoco_warp_shapes() -> SimpleNamespace:
         if bare:  # so that others import the packages whole
             for name in [name for name in sys.modules if f"{name}.".startswith("mujoco.mjx.")]:
                 del sys.modules[name]
-    used = ("box_box", "plane_cylinder", "plane_sphere", "sphere_sphere", "sphere_capsule", "sphere_box")
+    used = ("box_box", "plane_cylinder", "plane_ellipsoid", "plane_sphere", "sphere_sphere", "sphere_capsule", "sphere_box")
     return SimpleNamespace(**{name: getattr(core, name) for name in (*used, "capsule_capsule", "capsule_box")})
 
 

@@ -6,11 +6,13 @@ from typing import Any
 from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
+from mjx_dher.envs.engines.fused.ellipsoid import collide_ellipsoids
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import (
     BOX_BOX,
     CYLINDER_BOX,
     PLANE_CAPSULE,
+    PLANE_ELLIPSOID,
     PLANE_SPHERE,
     Bodies,
     Contacts,
@@ -113,7 +115,9 @@ def _go_on(
 
 def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
     """Returns the function that finds contacts, for kinds of geom pairs. See `make`."""
-    boxes, cylinders, round_ones = BOX_BOX in kinds, CYLINDER_BOX in kinds, any(kind >= PLANE_SPHERE for kind in kinds)
+    boxes, cylinders = BOX_BOX in kinds, CYLINDER_BOX in kinds
+    round_ones = any(PLANE_SPHERE <= kind < PLANE_ELLIPSOID for kind in kinds)
+    ellipsoids = any(kind >= PLANE_ELLIPSOID for kind in kinds)
 
     @wp.func
     def collide(
@@ -142,6 +146,9 @@ def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
         if wp.static(round_ones):
             gather(wp.static(warps))
             collide_round(near, scratch, thread, threads)
+        if wp.static(ellipsoids):
+            gather(wp.static(warps))
+            collide_ellipsoids(near, scratch, thread, threads)
         held = contacts
         if wp.static(not few):
             gather(wp.static(warps))

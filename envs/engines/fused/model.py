@@ -6,9 +6,10 @@ from mjx_dher.system.warp_setup import wp
 
 # How a body moves against its parent.
 STILL, HINGE, SLIDE, FREE, MOCAP = range(5)
-# Pairs of geoms; those from PLANE_SPHERE on are of spheres and capsules.
+# Pairs of geoms; those from PLANE_SPHERE on are of spheres and capsules, and from PLANE_ELLIPSOID on of ellipsoids.
 PLANE_BOX, PLANE_CYLINDER, BOX_BOX, CYLINDER_BOX = range(4)
 PLANE_SPHERE, PLANE_CAPSULE, SPHERE_SPHERE, SPHERE_CAPSULE, SPHERE_BOX, CAPSULE_CAPSULE, CAPSULE_BOX = range(4, 11)
+PLANE_ELLIPSOID, SPHERE_ELLIPSOID, CAPSULE_ELLIPSOID, ELLIPSOID_BOX = range(11, 15)
 Polynomial = wp.types.vector(length=5, dtype=float)
 Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
 

@@ -7,13 +7,22 @@ constraints take later, and keeps those that touch. All lists are in the order o
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused.contacts import FAR, geom_of
-from mjx_dher.envs.engines.fused.model import PLANE_BOX, PLANE_CAPSULE, PLANE_CYLINDER, PLANE_SPHERE, Contacts, Layout, Memory
+from mjx_dher.envs.engines.fused.model import (
+    PLANE_BOX,
+    PLANE_CAPSULE,
+    PLANE_CYLINDER,
+    PLANE_ELLIPSOID,
+    PLANE_SPHERE,
+    Contacts,
+    Layout,
+    Memory,
+)
 from mjx_dher.envs.engines.fused.threads import all_of, earlier, floats, ints, sync, vec3s
 from mjx_dher.system.warp_setup import wp
 
 PAIR_WORDS, SLOT_WORDS = 7, 7  # memory of a pair, and of a slot, in floats
-_PLANES = (PLANE_BOX, PLANE_CYLINDER, PLANE_SPHERE, PLANE_CAPSULE)
-_PLANE_BOX, _PLANE_CYLINDER, _PLANE_SPHERE, _PLANE_CAPSULE = (wp.constant(kind) for kind in _PLANES)
+_PLANES = (PLANE_BOX, PLANE_CYLINDER, PLANE_SPHERE, PLANE_CAPSULE, PLANE_ELLIPSOID)
+_OF_PLANES = wp.constant(sum(1 << kind for kind in _PLANES))  # mask of kinds
 _SLOTS = wp.constant(1 << 16)  # one pair, as it is counted beside its slots
 
 
@@ -162,8 +171,7 @@ def _meet(contacts: Contacts, memory: Memory, p: int) -> bool:
     margin = contacts.margin[p]
     axes = wp.transpose(mat1) * mat2
     at1 = wp.transpose(mat1) * between
-    kind = contacts.kind[p]
-    if kind == _PLANE_BOX or kind == _PLANE_CYLINDER or kind == _PLANE_SPHERE or kind == _PLANE_CAPSULE:
+    if (_OF_PLANES >> contacts.kind[p]) & 1 == 1:
         return at1[2] <= wp.abs(axes[2, 0]) * half2[0] + wp.abs(axes[2, 1]) * half2[1] + wp.abs(axes[2, 2]) * half2[2] + margin
     if not (wp.length(between) <= contacts.geom_reach[geom1] + contacts.geom_reach[geom2] + margin):  # also if it is NaN
         return False

@@ -23,6 +23,10 @@ CONTACT_KINDS = {
     ("SPHERE", "BOX"): (kinds.SPHERE_BOX, 1),
     ("CAPSULE", "CAPSULE"): (kinds.CAPSULE_CAPSULE, 2),
     ("CAPSULE", "BOX"): (kinds.CAPSULE_BOX, 2),
+    ("PLANE", "ELLIPSOID"): (kinds.PLANE_ELLIPSOID, 1),
+    ("SPHERE", "ELLIPSOID"): (kinds.SPHERE_ELLIPSOID, 1),
+    ("CAPSULE", "ELLIPSOID"): (kinds.CAPSULE_ELLIPSOID, 1),
+    ("ELLIPSOID", "BOX"): (kinds.ELLIPSOID_BOX, 1),
 }  # types of two geoms -> (kind, most contacts)
 FEW = 64  # contacts of all pairs, up to which there is memory for all of them
 _NEAR, _NEAR_SLOTS = 64, 192  # pairs that may be near at once in other models, and slots for their contacts

@@ -128,6 +128,8 @@ def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
             what = f"contacts of {kind[0].lower()} and {kind[1].lower()}"
         elif kind == ("CYLINDER", "BOX") and not model.opt.disableflags & _OLDER_CCD:
             what = "contacts of cylinders and boxes without nativeccd=disable"
+        elif "ELLIPSOID" in kind and "PLANE" not in kind and model.opt.disableflags & _OLDER_CCD:
+            what = "contacts of ellipsoids with nativeccd=disable"
         elif kind == ("CYLINDER", "BOX") and (model.pair_gap.any() or model.geom_gap[list(ends)].any()):
             what = "gaps of cylinders and boxes"
         if what:
