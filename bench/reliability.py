@@ -224,7 +224,7 @@ def twice(runs, count, rng):
         time.sleep(0.01)
     second = runs.start(out)
     _, stderr = second.communicate()
-    expect(second.returncode == 2 and "is being trained by another program" in stderr, stderr)
+    expect(second.returncode == 2 and "is being trained by another process" in stderr, stderr)
     first.kill()
     first.communicate()
     runs.check(out)

@@ -291,7 +291,7 @@ def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     busy = subprocess.run([sys.executable, "train.py", "resume", out], cwd=ROOT, capture_output=True, text=True, check=False)
     first.kill()
     first.communicate()
-    assert (busy.returncode, busy.stderr) == (2, f"error: {out} is being trained by another program\n")
+    assert (busy.returncode, busy.stderr) == (2, f"error: {out} is being trained by another process\n")
     epochs = len(table(out)) - 1
     second = start("resume", out)
     wait_for(lambda: len(table(out)) - 1 > epochs + 3, second)

@@ -90,7 +90,7 @@ def test_a_second_train_on_a_folder_is_refused_before_it_writes(tmp_path, capsys
     (tmp_path / "run").mkdir()
     with held(tmp_path / "run"):
         assert cli.main([*TINY, "--out", str(tmp_path / "run")]) == 2
-    assert f"{tmp_path / 'run'} is being trained by another program" in capsys.readouterr().err
+    assert f"{tmp_path / 'run'} is being trained by another process" in capsys.readouterr().err
     assert names_in(tmp_path / "run") == [files.LOCK]
 
 

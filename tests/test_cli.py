@@ -273,7 +273,7 @@ def test_ctrl_c_keeps_what_was_learned_and_says_where(tmp_path):
     os.kill(process.pid, signal.SIGINT)
     stdout, stderr = process.communicate(timeout=120)
     assert process.returncode == 130, stdout + stderr
-    assert "stopping when this epoch has ended" in stdout
+    assert "stopping after this epoch" in stdout
     assert f"the policy so far is in {out}" in stdout
     assert stderr == ""
     mjx_dher.load_policy(out)
@@ -302,7 +302,7 @@ def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
     os.kill(process.pid, signal.SIGINT)
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130, stdout
-    assert stderr == f"stopped at once; what was saved is in {out}\n"
+    assert stderr == f"stopped at once; saved work is in {out}\n"
     assert "stopped after epoch" not in stdout
     mjx_dher.load_policy(out)
 

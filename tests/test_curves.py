@@ -229,7 +229,7 @@ def test_a_page_about_a_run_holds_all_that_it_shows(tmp_path, capsys):
         assert told in text
     assert cli.main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 0
     assert cli.main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists; pass another file" in capsys.readouterr().err
     assert cli.main(["report", str(run), "--out", str(tmp_path / "page.txt")]) == 2
 
 

@@ -86,7 +86,7 @@ def test_a_signal_ends_a_fleet_in_order_and_the_same_command_goes_on(bench, tmp_
         time.sleep(0.2)
     send(driver.pid, number)
     assert driver.wait(120) == 128 + number
-    assert "stopping when this epoch has ended" in log.read_text()
+    assert "stopping after this epoch" in log.read_text()
     assert list((tmp_path / "sweep" / "unfinished").glob("fleet-*/*/chunk.json"))
     bench.finished(bench.sweep(tmp_path / "sweep", *flags))
     assert "resuming from" in log.read_text()

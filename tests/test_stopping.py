@@ -101,7 +101,7 @@ with signals.held(said.append, "runs/here"), signals.cleaning(lambda: print("cle
     send(signal.SIGTERM)
     time.sleep(60)
 """
-    assert program(code)[:3] == (143, "cleaned\n", "stopped at once; what was saved is in runs/here\n")
+    assert program(code)[:3] == (143, "cleaned\n", "stopped at once; saved work is in runs/here\n")
 
 
 @pytest.mark.parametrize("block", ["signals.held(said.append, 'here', 0.5)", "signals.cleaning(list)"])

@@ -91,7 +91,7 @@ def test_a_signal_ends_the_sweep_after_the_epoch_and_keeps_what_is_done(tmp_path
     command = [*COMMAND, "--lanes", "2", "--out", str(tmp_path)]
     assert cli.main(command) == 128 + number
     said = capsys.readouterr().out
-    assert "stopping when this epoch has ended" in said
+    assert "stopping after this epoch" in said
     assert "stopped; 2 runs are done; run the same command again for the other 2" in said
     assert seen == [1, 2, 3, 4, 1]
     assert signal.getsignal(number) == handler

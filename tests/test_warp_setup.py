@@ -25,8 +25,8 @@ def test_without_a_folder_to_keep_kernels_in_a_warning_says_what_it_costs(tmp_pa
         cwd=ROOT,
     )
     is_there, folder = run.stdout.split()
-    assert "Warp cannot keep compiled kernels" in run.stderr
-    assert "WARP_CACHE_PATH names another folder" in run.stderr
+    assert "Warp cannot cache compiled kernels" in run.stderr
+    assert "set WARP_CACHE_PATH to another folder" in run.stderr
     assert is_there == "True"
     assert not os.path.exists(folder)  # it went with the program
 

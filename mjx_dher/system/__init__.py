@@ -1,1 +1,1 @@
-"""The machine that runs the program: memory, files, caches, libraries' internals. Nothing here knows of learning."""
+"""The machine that runs the program: memory, files, caches and internals of libraries. Independent of learning."""

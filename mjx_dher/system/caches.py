@@ -1,4 +1,4 @@
-"""The user's cache folder, and the compiled programs that JAX keeps in it."""
+"""The user's cache folder, and JAX's compiled programs in it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mjx_dher.system import limits, memory
 
 
 def user_cache() -> Path:
-    """Folder of this library in the user's cache. All of its files can be made again.
+    """Folder of this library in the user's cache. All of its files can be recreated.
 
     Raises:
-      OSError: the user has no home folder (a container's user without a line in /etc/passwd, say).
+      OSError: the user has no home folder (for example in a container, without a line in /etc/passwd).
     """
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher"
@@ -23,9 +23,9 @@ def user_cache() -> Path:
 
 
 def keep_compiled_programs() -> None:
-    """Makes JAX keep compiled programs in the user's cache folder, unless the user has chosen another.
+    """Makes JAX cache compiled programs in the user's cache folder, unless the user has chosen another one.
 
-    JAX cannot keep a program that calls back to Python, as one on a GPU with native physics does.
+    JAX cannot cache programs that call back to Python, such as those on a GPU with native physics.
     """
     import jax
 
@@ -35,29 +35,27 @@ def keep_compiled_programs() -> None:
         try:
             config.update("jax_compilation_cache_dir", str(user_cache() / "xla"))
         except OSError as error:
-            print(f"compiled programs are not kept: {error}", file=sys.stderr)
+            print(f"compiled programs are not cached: {error}", file=sys.stderr)
 
 
 def check_platform() -> None:
-    """Starts JAX's devices, with no more threads of a CPU than this process may use.
+    """Starts JAX's devices, with at most as many CPU threads as this process may use.
 
     Raises:
-      ValueError: the platform that JAX_PLATFORMS asks for does not exist on this machine.
+      ValueError: this machine lacks the platform in JAX_PLATFORMS.
     """
     import jax
 
     limits.limit_threads()
     try:
         jax.devices()
-    except (RuntimeError, AssertionError) as error:  # an AssertionError where the package of a platform is missing
+    except (RuntimeError, AssertionError) as error:  # AssertionError: the package of a platform is missing
         reason = (str(error).splitlines() or ["it is not installed"])[0]
         asked = os.environ.get("JAX_PLATFORMS", "")
-        raise ValueError(
-            f"JAX_PLATFORMS={asked!r}: JAX cannot start this platform ({reason}); unset it, or take cpu"
-        ) from error
+        raise ValueError(f"JAX_PLATFORMS={asked!r}: JAX cannot start this platform ({reason}); unset it, or use cpu") from error
 
 
 def prepare() -> None:
-    """Prepares a process that trains for hours: compiled programs are kept, freed memory is not."""
+    """Prepares a process for long training: it caches compiled programs, and returns freed memory."""
     memory.keep_heap_small()  # before JAX starts threads
     keep_compiled_programs()

@@ -1,4 +1,4 @@
-"""Files and folders: locks, writes that survive a power cut, and checks before anything slow happens."""
+"""Files and folders: locks, writes that survive a power cut, and early checks."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 LARGEST_JSON = 8 << 20  # bytes
 LONGEST_LINE = 100_000  # bytes; the module csv reads fields of 131,072
-PARTIAL = ".partial"  # ending of a file that is being written; what has this name is deleted first
-LOCK = ".lock"  # name of the file in a folder by which it is locked
-_MARKER = f"{LOCK}.soft"  # the same, on a file system without locks
+PARTIAL = ".partial"  # suffix of a file that is being written; an older one is deleted first
+LOCK = ".lock"  # name of a folder's lock file
+_MARKER = f"{LOCK}.soft"  # name on a file system without locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)  # filelock itself marks the folder for ENOSYS
 _NO_FLUSH = (errno.EINVAL, errno.EBADF, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # of a folder: CIFS, AFS, some of FUSE
 
-_LARGEST_BLOCK = 1 << 16  # bytes; NFS gives the size of its messages as that of a block
+_LARGEST_BLOCK = 1 << 16  # bytes; NFS reports its message size as block size
 
 
 class FolderError(ValueError):
-    """Error for a folder that is no run of this program, is damaged, or must not be written to."""
+    """A folder is not a run of this program, is damaged, or must not be written to."""
 
 
 class BusyError(FolderError):
-    """Error for a folder that another program is at work on."""
+    """Another process is using a folder."""
 
 
 def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
-    """Checks that the file `out` can and may be written, to fail before anything slow happens.
+    """Checks early that the file `out` can be written.
 
     Raises:
       FolderError: `out` ends in none of `endings`, is a folder, exists (without `overwrite`), or its folder does not exist.
@@ -51,21 +51,21 @@ def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
     if out.is_dir():
         raise FolderError(f"out: {out} is a folder")
     if out.exists() and not overwrite:
-        raise FolderError(f"out: {out} is there already; name another file or give --overwrite")
+        raise FolderError(f"out: {out} exists; pass another file or --overwrite")
     if not out.parent.is_dir():
         raise FolderError(f"out: there is no folder {out.parent}")
 
 
 def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
-    """Paths in a folder, none of which leads out of it.
+    """Paths in a folder, sorted, none of which may lead out of it.
 
     Raises:
-      FolderError: one of them is a link to elsewhere.
+      FolderError: a path is a link to elsewhere.
     """
     paths, root = sorted(paths), Path(os.path.realpath(folder))
     for path in paths:
         if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
-            raise FolderError(f"{path} is a link that leads out of {folder}: remove it, or put a copy in its place")
+            raise FolderError(f"{path} is a link that leads out of {folder}: remove it, or replace it by a copy")
     return paths
 
 
@@ -84,7 +84,7 @@ def read_json(file: Path) -> Any:
         if len(content) > LARGEST_JSON:
             raise ValueError(f"it is larger than {LARGEST_JSON >> 20} MB")
         value = json.loads(content.decode())
-        json.dumps(value, ensure_ascii=False).encode()  # half of a surrogate pair is no text: nothing can print it
+        json.dumps(value, ensure_ascii=False).encode()  # raises for half a surrogate pair, which cannot be printed
         return value
     except FileNotFoundError:
         raise
@@ -93,7 +93,7 @@ def read_json(file: Path) -> Any:
 
 
 def whole_lines(file: Path) -> list[str]:
-    """Lines of a text file, up to the first without an end in `LONGEST_LINE` bytes; none if there is no file.
+    """Lines of a text file, up to the first without an end within `LONGEST_LINE` bytes. Empty if there is no file.
 
     Raises:
       FolderError: it is a folder or a FIFO.
@@ -109,18 +109,18 @@ def whole_lines(file: Path) -> list[str]:
 
 @contextlib.contextmanager
 def lock(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Locks a folder against other programs, and other threads of this one. Who has the lock can take it again.
+    """Locks a folder against other processes and other threads. The owner can lock it again.
 
-    The system releases the lock when this process ends, however it ends. The file stays: who unlinks a file by which others
-    lock gives the lock to two of them. On a file system without locks, a file that names this process marks the folder.
+    The system releases the lock when this process ends. The file stays, because unlinking it could give the lock to two
+    processes. On a file system without locks, a file that names this process marks the folder.
 
     Args:
-      folder: it must exist.
-      wait: whether to wait until another program releases the lock.
+      folder: an existing folder.
+      wait: whether to wait until another process releases the lock.
 
     Raises:
-      BusyError: another program holds the lock, and `wait` is False.
-      FolderError: a link in it leads elsewhere, through which a file would be written or deleted.
+      BusyError: another process holds the lock, and `wait` is False.
+      FolderError: a link in the folder leads elsewhere, so a file there could be written or deleted.
       OSError: the folder does not exist or cannot be written to.
     """
     from filelock import FileLock, Timeout
@@ -132,7 +132,7 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
         with naming(path):
             held.acquire()
     except Timeout:
-        raise BusyError(f"{folder} is being trained by another program") from None
+        raise BusyError(f"{folder} is being trained by another process") from None
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
@@ -155,32 +155,32 @@ def _mark(folder: Path, timeout: float) -> BaseFileLock:
     try:
         held.acquire()
     except Timeout:
-        raise BusyError(f"{folder} is being trained by another program; if not, delete {held.lock_file}") from None
+        raise BusyError(f"{folder} is being trained by another process; if not, delete {held.lock_file}") from None
     return held
 
 
 @functools.cache
 def _tell_no_locks() -> None:
-    warnings.warn("a file system here has no locks: folders in use are marked by files", stacklevel=2)
+    warnings.warn("the file system has no locks: folders in use are marked by files", stacklevel=2)
 
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[None]:
-    """Makes a folder, locks it, and removes it again where the block has left nothing in it.
+    """Makes and locks a folder, and removes it if the block leaves nothing in it.
 
     Raises:
-      BusyError: another program holds the lock.
-      FolderError: it holds something already.
+      BusyError: another process holds the lock.
+      FolderError: the folder is not empty.
       OSError: it cannot be made or written to.
     """
 
     def unlink_lock() -> None:
         if not is_used(folder):
-            (folder / LOCK).unlink(missing_ok=True)  # none will wait for it: the folder goes, too
+            (folder / LOCK).unlink(missing_ok=True)  # nobody waits for it, because the folder is removed too
 
     with made(folder):
-        if not (folder / LOCK).exists():  # else another program may be at work on it, which says more
-            _refuse_used(folder)  # before a lock is left in what is someone else's
+        if not (folder / LOCK).exists():  # otherwise another process may use it, which `lock` reports
+            _refuse_used(folder)  # before a lock file is left in someone else's folder
         with lock(folder), signals.cleaning(unlink_lock):
             _refuse_used(folder)
             yield
@@ -192,17 +192,17 @@ def _refuse_used(folder: Path) -> None:
 
 
 def is_used(folder: Path) -> bool:
-    """Whether a folder holds anything but the file by which it is locked."""
+    """Whether a folder contains anything other than its lock file."""
     return not all(map(is_lock, folder.iterdir()))
 
 
 def is_lock(path: Path) -> bool:
-    """Whether a file is one by which `lock` locks its folder."""
+    """Whether a file is the lock file of its folder."""
     return path.name == LOCK or path.name.startswith(_MARKER)
 
 
 def make_folder(folder: Path) -> list[Path]:
-    """Makes a folder, and those above it that are missing, so that they survive a power cut; returns those that it made."""
+    """Makes a folder and its missing parents, such that they survive a power cut. Returns the new folders."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -216,7 +216,7 @@ def make_folder(folder: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Makes a folder, and those above it that are missing. Those of them that stay empty are removed at the end."""
+    """Makes a folder and its missing parents. Removes those that are empty at the end."""
     missing = make_folder(folder)
     with signals.cleaning(lambda: _remove_empty(missing)):
         yield
@@ -238,7 +238,7 @@ def temporary_folder(prefix: str, parent: str | None = None) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Gives an OSError that names no file this one: those of writing and flushing do not."""
+    """Adds the path to an OSError without a file name, such as from writing and flushing."""
     try:
         yield
     except OSError as error:
@@ -247,7 +247,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def flush(path: Path) -> None:
-    """Flushes a file's content, or the names in a folder if the file system can do that, onto the disk."""
+    """Flushes a file to disk, or the names in a folder if the file system supports it."""
     with naming(path):
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -260,7 +260,7 @@ def flush(path: Path) -> None:
 
 
 def flush_all(folder: Path) -> None:
-    """Flushes everything in a folder onto the disk, what is deepest first."""
+    """Flushes everything in a folder to disk, deepest first."""
     for root, _, names in os.walk(folder, topdown=False):
         for name in names:
             flush(Path(root, name))
@@ -268,20 +268,20 @@ def flush_all(folder: Path) -> None:
 
 
 def lack_of_space(folder: Path, sizes: Sequence[int]) -> str | None:
-    """Reason why files of these sizes, in bytes, do not fit on the disk of a folder, made or not; None if they do."""
+    """Reason why files of these sizes, in bytes, do not fit on the disk of a folder, or None if they do."""
     folder = folder.absolute()
     disk = os.statvfs(next(path for path in (folder, *folder.parents) if path.is_dir()))
     block = min(disk.f_frsize or 1, _LARGEST_BLOCK)
     needed, free = sum(-(-size // block) * block for size in sizes), disk.f_bavail * disk.f_frsize
-    if needed > free and disk.f_blocks:  # else the file system does not tell its size, or has no limit
-        return f"{memory.format_bytes(needed)}, and {memory.format_bytes(free)} of the disk are free"
+    if needed > free and disk.f_blocks:  # otherwise the file system's size is unknown or unlimited
+        return f"{memory.format_bytes(needed)}, but only {memory.format_bytes(free)} of the disk are free"
     if disk.f_files and len(sizes) > disk.f_favail:
-        return f"{len(sizes)} files, and the disk can have {disk.f_favail} more"
+        return f"{len(sizes)} files, but the disk can have only {disk.f_favail} more"
     return None
 
 
 def remove(path: Path) -> None:
-    """Removes a folder with all that is in it; of a link, the link alone."""
+    """Removes a folder with its content. Removes only the link if it is one."""
     if path.is_symlink():
         path.unlink()
     else:
@@ -289,12 +289,12 @@ def remove(path: Path) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes `content` as JSON, as `write` does; what is not finite becomes null."""
+    """Writes `content` as JSON, like `write`. Numbers that are not finite become null."""
     write(path, f"{json.dumps(_without_nan(content), indent=2, allow_nan=False, ensure_ascii=False)}\n".encode())
 
 
 def write(path: Path, content: bytes) -> None:
-    """Writes a file atomically, so that it survives a power cut."""
+    """Writes a file atomically, such that it survives a power cut."""
     with atomic_write(path) as partial:
         partial.write_bytes(content)
         flush(partial)
@@ -309,12 +309,12 @@ def _without_nan(content: Any) -> Any:
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yields a path to write to, which replaces `path` once the block ends.
+    """Yields a path to write to, which replaces `path` when the block ends.
 
-    After an error `path` stays as it was, and the new file is deleted.
+    After an error, `path` is unchanged and the new file is deleted.
     """
     partial = path.with_name(path.name + PARTIAL)
-    partial.unlink(missing_ok=True)  # what a kill has left, or a link, through which another file would be written
+    partial.unlink(missing_ok=True)  # left by a killed process, or a link to another file
     with signals.cleaning(lambda: partial.unlink(missing_ok=True)), naming(path):
         yield partial
         partial.replace(path)

@@ -1,4 +1,4 @@
-"""Cores and memory that this process may use: of the machine, or of its control groups (containers, Slurm, systemd) if less."""
+"""Cores and memory that this process may use: the machine's, or its control groups' (containers, Slurm, systemd) if less."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path("/")
-# Files of a memory group, in version 2 and in version 1: limits, use, and the parts of it that the kernel gives back on demand.
+# Files of a memory group in versions 2 and 1: limits, use, and the reclaimable parts of the use.
 _MEMORY = (
     (("memory.max", "memory.high"), "memory.current", ("inactive_file", "active_file", "slab_reclaimable")),
     (("memory.limit_in_bytes",), "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
@@ -16,19 +16,19 @@ _MEMORY = (
 
 
 def usable_cores(root: Path = ROOT) -> int:
-    """Number of cores that this process may use, which `taskset` or a container can limit. A quota is rounded up."""
+    """Number of cores that this process may use, considering `taskset` and containers. A quota is rounded up."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min([cores, *(max(1, math.ceil(quota)) for quota in _quotas(root))])
 
 
 def limit_threads() -> None:
-    """Keeps XLA to `usable_cores`. It knows of `taskset`, but not of quotas. Call this before JAX starts its devices."""
+    """Limits XLA to `usable_cores`, because it ignores quotas. Call this before JAX starts its devices."""
     if any(_quotas(ROOT)):
-        os.environ.setdefault("NPROC", str(usable_cores()))  # which XLA reads
+        os.environ.setdefault("NPROC", str(usable_cores()))  # read by XLA
 
 
 def free_bytes(root: Path = ROOT) -> int | None:
-    """Memory that can be allocated, including page cache, which the kernel gives back; None if unknown (Linux only)."""
+    """Allocatable memory, including reclaimable page cache, or None if unknown (Linux only)."""
     machine = _numbers(root / "proc/meminfo").get("MemAvailable:")
     known = [*_free_in_groups(root), *([] if machine is None else [machine * 1024])]
     return max(0, min(known)) if known else None
@@ -53,7 +53,7 @@ def _free_in_groups(root: Path) -> Iterator[int]:
 
 
 def _groups(root: Path, controller: str) -> Iterator[Path]:
-    """Folders of the control groups that this process is in, of both versions, each followed by its ancestors."""
+    """Folders of this process's control groups, of both versions, each followed by its ancestors."""
     mount = root / "sys/fs/cgroup"
     for line in _lines(root / "proc/self/cgroup"):
         _, controllers, path = (*line.split(":", 2), "", "")[:3]
@@ -61,7 +61,7 @@ def _groups(root: Path, controller: str) -> Iterator[Path]:
             continue
         names = [name for name in path.split("/") if name not in ("", "..")]
         for base in [mount / controller] if controllers else [mount, mount / "unified"]:
-            # A container may see its own group at the mount, under the path that the group has outside.
+            # A container may see its group at the mount, but with the group's outside path.
             starts = (base.joinpath(*names[skipped:]) for skipped in range(len(names) + 1))
             start = next((folder for folder in starts if folder.is_dir()), base)
             yield from (folder for folder in (start, *start.parents) if folder.is_relative_to(base))
@@ -79,5 +79,5 @@ def _words(path: Path) -> list[str]:
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """Numbers of a file that has a name and a number in each line."""
+    """Numbers in a file with a name and a number per line."""
     return {words[0]: int(words[1]) for line in _lines(path) if len(words := line.split()) > 1 and words[1].isdecimal()}

@@ -1,4 +1,4 @@
-"""Memory that is available and in use, and settings that make the C library give freed memory back."""
+"""Available and used memory, and settings that make the C library return freed memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HEAPS_A_CORE = 2
 
 
 def available_bytes() -> int | None:
-    """Returns the bytes that this process's first device can still allocate, or None where they are unknown.
+    """Bytes that this process's first device can still allocate, or None if unknown.
 
     On a CPU: the free memory of the machine, or of a container if that is less (Linux only).
     """
@@ -27,7 +27,7 @@ def available_bytes() -> int | None:
 
 
 def used_bytes() -> int | None:
-    """Returns the bytes that JAX uses on this process's first device; on a CPU, its own (Linux only). None where unknown."""
+    """Bytes that JAX uses on this process's first device, or on a CPU the process itself (Linux only). None if unknown."""
     import jax
 
     device = jax.local_devices()[0]
@@ -41,12 +41,11 @@ def used_bytes() -> int | None:
 
 
 def keep_heap_small() -> None:
-    """Makes the C library return freed blocks of a megabyte and more to the system, and keep smaller ones in few heaps.
+    """Makes the C library return freed blocks of at least a megabyte, and keep smaller ones in few heaps (Linux with glibc).
 
-    By default, glibc keeps freed blocks of up to 32 MB for reuse, in as many as eight heaps a core. The buffers of a checkpoint
-    leave holes that those of the next one, of other threads, do not fit into: each makes a long run grow by some MB. As few
-    heaps as cores are too few: the compiler's threads wait for one another, and Push is ready after 15 s instead of 10.
-    Call this before threads are started. It does nothing except on Linux with glibc.
+    By default, glibc keeps freed blocks of up to 32 MB, in up to eight heaps per core. Each checkpoint then leaves holes that
+    the next one does not fit into, and a long run grows by some MB each time. With one heap per core, the compiler's threads
+    wait for each other: Push is ready after 15 s instead of 10. Call this before any threads start.
     """
     if (library := _glibc()) is not None:
         library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
@@ -54,7 +53,7 @@ def keep_heap_small() -> None:
 
 
 def release() -> None:
-    """Returns freed memory that the C library has kept to the system (glibc only): hundreds of MB after compiling."""
+    """Returns freed memory to the system (glibc only): hundreds of MB after compiling."""
     if (library := _glibc()) is not None:
         library.malloc_trim(0)
 
@@ -68,7 +67,7 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def format_bytes(amount: float) -> str:
-    """Formats a number of bytes for people, such as "130.5 MB"."""
+    """Formats a number of bytes, such as "130.5 MB"."""
     for unit in ("B", "kB", "MB", "GB"):
         if amount < 1000:
             return f"{amount:.0f} {unit}" if unit == "B" else f"{amount:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""Reads .npz files, which may come from anyone: headers first, arrays only if they are as large as the headers say."""
+"""Reads untrusted .npz files: headers first, and arrays only if they match their headers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, EOFError, KeyError, TypeError, MemoryError, NotImplementedError, OverflowError),
-    *(RuntimeError, SyntaxError),  # RuntimeError: it asks for a password
+    *(RuntimeError, SyntaxError),  # RuntimeError: it needs a password
 )
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class Header(NamedTuple):
-    """Shape and type of an array that has not been read."""
+    """Shape and dtype of an array that has not been read."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -35,27 +35,27 @@ def read(
     ratio: float = math.inf,
     check: Callable[[Mapping[str, Header]], None] = lambda headers: None,
 ) -> dict[str, np.ndarray]:
-    """Reads the arrays of an .npz; nothing is unpickled.
+    """Reads the arrays of an .npz file without unpickling.
 
     Args:
-      path: of the file.
-      names: arrays to read. None: all.
-      ratio: most bytes of the arrays for each byte of the file; weights hardly compress, gigabytes of zeros do.
-      check: called with all headers before any array is read; raises ValueError for an array that is not wanted.
+      path: the file.
+      names: arrays to read. Default: all.
+      ratio: largest ratio of the arrays' bytes to the file's. Weights hardly compress, but gigabytes of zeros do.
+      check: called with all headers before any array is read. Raises ValueError for an unwanted array.
 
     Raises:
       OSError: it cannot be read.
-      ValueError: it is damaged, or not an .npz.
+      ValueError: it is damaged, or not an .npz file.
     """
     if path.exists() and not path.is_file():
-        raise ValueError("it is not a file")  # a reader of a FIFO would block
+        raise ValueError("it is not a file")  # reading a FIFO would block
     try:
         with zipfile.ZipFile(path) as archive:
             headers = {info.filename.removesuffix(".npy"): _header(archive, info) for info in archive.infolist()}
             if len(headers) != len(archive.infolist()):
-                raise ValueError("an array is there twice")
+                raise ValueError("an array occurs twice")
             if sum(info.file_size for info in archive.infolist()) > ratio * path.stat().st_size:
-                raise ValueError(f"its {path.stat().st_size} bytes would become more than {ratio:g} times as many")
+                raise ValueError(f"its {path.stat().st_size} bytes would expand by more than {ratio:g} times")
             check(headers)
             arrays = {}
             for name in headers if names is None else [name for name in names if name in headers]:
@@ -69,14 +69,14 @@ def read(
 
 
 def _header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
-    """Reads the header of an array. Raises ValueError unless it is one of plain numbers that fills its part of the file."""
+    """Header of an array. Raises ValueError unless the array consists of plain numbers and fills its part of the file."""
     if not info.filename.endswith(".npy") or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{info.filename} is not an array")
     with archive.open(info) as member:
         shape, _, dtype = _HEADERS[np.lib.format.read_magic(member)](member)
         size = member.tell() + math.prod(shape) * dtype.itemsize
     if dtype.hasobject or dtype.kind not in "biufcU":
-        raise ValueError(f"{info.filename} is not of numbers: {dtype}")
+        raise ValueError(f"{info.filename} must consist of numbers; got {dtype}")
     if size != info.file_size or min(shape, default=0) < 0:
-        raise ValueError(f"{info.filename} has {info.file_size} bytes, and its shape {list(shape)} takes {size}")
+        raise ValueError(f"{info.filename} has {info.file_size} bytes, but its shape {list(shape)} needs {size}")
     return Header(shape, dtype)

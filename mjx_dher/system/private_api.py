@@ -1,11 +1,11 @@
-"""Private names of MJX, MuJoCo Warp, Warp, orbax and viser: every one that this library uses, behind a function each.
+"""All private names of MJX, MuJoCo Warp, Warp, orbax and viser that this library uses, each behind a function.
 
-Each function says which names are private, why they are needed, and which versions need them. tests/test_private_api.py
-fails, naming the function to delete, once a newer version does without. The libraries are imported on the first call.
+Each function documents the private names, why they are needed, and by which versions. When a newer version no longer needs a
+function, tests/test_private_api.py fails and names it. Libraries are imported on the first call.
 
-Two dependencies on internals stay where they are used, because they are not names of Python:
+Two uses of internals stay where they are, because they are not Python names:
 
-- `runs.loop.compile_lowered` disables the pass triton-softmax-rewriter of XLA (jaxlib 0.10.2; no upstream issue known).
+- `runs.program.loop.compile_lowered` disables XLA's pass triton-softmax-rewriter (jaxlib 0.10.2; no upstream issue known).
 - envs/engines/fused/threads.py uses `wp::array_t` and `dynamic_smem_base` of Warp's C++ code (warp-lang 1.18.0; no upstream
   issue known).
 """
@@ -25,9 +25,9 @@ from typing import Any
 
 @contextlib.contextmanager
 def bodies_computed_once() -> Iterator[None]:
-    """Keeps XLA's CPU backend, while tracing, from computing each body's pose anew for each of its descendants.
+    """Prevents XLA's CPU backend from computing each body's pose again for each of its descendants, while tracing.
 
-    Private: `mujoco.mjx._src.scan.body_tree`, which is replaced meanwhile, for every thread.
+    Private: `mujoco.mjx._src.scan.body_tree`, which is replaced during the block, for every thread.
     Why: XLA's fusion emitters fuse MJX's walk along the arm into one loop that repeats all ancestors for every use of them:
       0.7 s instead of 0.9 ms for the kinematics of 16 environments on 2 cores. A barrier after each level ends the fusion.
     Needed by: mujoco-mjx 3.17.0 with jaxlib 0.10.2. The same slowdown is reported, since JAX 0.7, in
@@ -49,10 +49,10 @@ def bodies_computed_once() -> Iterator[None]:
 
 
 def shift_reference_acceleration(data: Any, shift: Any) -> Any:
-    """Returns `data` of MJX with `shift` [R] added to the reference acceleration of the first R constraint rows.
+    """MJX `data` with `shift` [R] added to the reference acceleration of the first R constraint rows.
 
     Private: `Data._impl.efc_aref`, and that equality constraints come first.
-    Why: MJX leaves J' qvel out of a weld's reference acceleration, which MuJoCo C and MuJoCo Warp put in.
+    Why: MJX leaves J' qvel out of a weld's reference acceleration, which MuJoCo C and MuJoCo Warp include.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known; https://github.com/google-deepmind/mujoco_warp/pull/1294 added the
       term to MuJoCo Warp.
     """
@@ -62,12 +62,12 @@ def shift_reference_acceleration(data: Any, shift: Any) -> Any:
 
 @functools.cache
 def mujoco_warp_shapes() -> SimpleNamespace:
-    """Returns the functions of MuJoCo Warp's kernels that find the contacts of two shapes.
+    """MuJoCo Warp's kernel functions that find the contacts of two shapes.
 
-    Private: all, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be imported
-      without what the packages around it import.
-    Why: the fused kernel's contacts of boxes are to be those of MuJoCo C, whose long algorithm MuJoCo Warp follows. To import
-      the packages takes 3.4 s, the module alone 0.3 s.
+    Private: all of them, in `mujoco.mjx.third_party.mujoco_warp._src.collision_primitive_core`, and that this module can be
+      imported without the imports of its parent packages.
+    Why: the fused kernel's contacts of boxes must match MuJoCo C, whose long algorithm MuJoCo Warp follows. Importing the
+      packages takes 3.4 s, the module alone 0.3 s.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
     import mujoco
@@ -81,7 +81,7 @@ def mujoco_warp_shapes() -> SimpleNamespace:
     try:
         core = importlib.import_module(f"{[*packages][-1]}.collision_primitive_core")
     finally:
-        if bare:  # so that others import the packages whole
+        if bare:  # so that other code imports the complete packages
             for name in [name for name in sys.modules if f"{name}.".startswith("mujoco.mjx.")]:
                 del sys.modules[name]
     used = ("box_box", "plane_cylinder", "plane_ellipsoid", "plane_sphere", "sphere_sphere", "sphere_capsule", "sphere_box")
@@ -90,11 +90,11 @@ def mujoco_warp_shapes() -> SimpleNamespace:
 
 @contextlib.contextmanager
 def drawing_with(backend: str) -> Iterator[None]:
-    """Has a `mujoco.Renderer` that is made meanwhile draw with "egl", "osmesa" or "glfw"; other names change nothing.
+    """Makes a new `mujoco.Renderer` draw with "egl", "osmesa" or "glfw" during the block. Other names change nothing.
 
-    Private: `GLContext` of the module `gl_context` that `mujoco.Renderer` uses, which is replaced meanwhile.
-    Why: MuJoCo reads MUJOCO_GL when it is first imported, and otherwise draws with glfw, which needs a screen. Any other code
-      of a program may import it first.
+    Private: `GLContext` of the module `gl_context` that `mujoco.Renderer` uses, which is replaced during the block.
+    Why: MuJoCo reads MUJOCO_GL when it is first imported, possibly by other code, and otherwise draws with glfw, which needs a
+      screen.
     Needed by: mujoco 3.17.0. No upstream issue known.
     """
     import mujoco
@@ -111,11 +111,12 @@ def drawing_with(backend: str) -> Iterator[None]:
 
 @functools.cache
 def mujoco_warp() -> Any:
-    """Returns MuJoCo Warp, which MJX has a copy of.
+    """MJX's copy of MuJoCo Warp.
 
     Private: `mujoco.mjx.third_party.mujoco_warp`.
-    Why: MJX makes a substep a call, with some 170 arrays that XLA hands in and takes back. The engine calls the step itself, in
-      a CUDA graph. The separate package is another version, and needs another Warp.
+    Why: MJX calls each substep separately, with some 170 arrays that XLA passes in and out. The engine calls the step in a
+    CUDA
+      graph instead. The separate package is another version, and needs another Warp.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # MJX may print a line
@@ -123,10 +124,10 @@ def mujoco_warp() -> Any:
 
 
 def overflow_of_memory() -> int:
-    """Returns the bits of `Data.overflow` of MuJoCo Warp that tell of contacts or rows without memory.
+    """Bits of MuJoCo Warp's `Data.overflow` for contacts or rows without memory.
 
     Private: `mujoco.mjx.third_party.mujoco_warp._src.types.OverflowType`.
-    Why: other bits tell of a solver that stopped at its limit of iterations, or of sensors.
+    Why: other bits report a solver at its iteration limit, or sensors.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
     kinds = importlib.import_module("mujoco.mjx.third_party.mujoco_warp._src.types").OverflowType
@@ -138,24 +139,24 @@ def reset_call_id(callable_: Any) -> None:
     """Numbers the next trace of a `warp.jax_callable` as its first.
 
     Private: `FfiCallable.call_id`.
-    Why: Warp writes the number of the trace into the program. JAX then finds no compiled program that it has kept.
+    Why: Warp writes the number of the trace into the program, so JAX finds no cached program.
     Needed by: warp-lang 1.18.0. No upstream issue known.
     """
     callable_.call_id = 0
 
 
 def array_checkpointer() -> Any:
-    """Returns an orbax checkpointer, which reads checkpoints of version 0.2.0 and before.
+    """Orbax checkpointer, which reads checkpoints of version 0.2.0 and before.
 
-    Private: nothing by its name, but `PyTreeCheckpointHandler` belongs to orbax's older interface.
-    Why: the folders that were written with it stay readable.
-    Needed by: orbax-checkpoint 0.12.8. https://github.com/google/orbax/issues/1624 (open) is to replace the interface.
+    Private: nothing by name, but `PyTreeCheckpointHandler` belongs to orbax's older interface.
+    Why: older folders stay readable.
+    Needed by: orbax-checkpoint 0.12.8. https://github.com/google/orbax/issues/1624 (open) will replace the interface.
     """
     import jax
     import orbax.checkpoint
 
     alone: dict[str, Any] = {}
-    if jax.process_count() > 1:  # else orbax would have all of them wait for one another
+    if jax.process_count() > 1:  # otherwise orbax would make all processes wait for each other
         own = jax.process_index()
         options = orbax.checkpoint.options.MultiprocessingOptions(primary_host=own, active_processes={own})
         alone = {"multiprocessing_options": options}
@@ -165,10 +166,11 @@ def array_checkpointer() -> Any:
 
 @contextlib.contextmanager
 def viser_served_with(adapt: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Iterator[None]:
-    """Has the server that viser starts meanwhile use the options that `adapt` makes from viser's own.
+    """Makes a viser server that starts during the block use the options that `adapt` makes from viser's.
 
-    Private: that viser calls `websockets.asyncio.server.serve` by that name, which is replaced meanwhile, for every thread.
-    Why: viser serves whoever calls, and has no option for a check of requests, a limit of clients or a log.
+    Private: that viser calls `websockets.asyncio.server.serve` by this name, which is replaced during the block, for every
+      thread.
+    Why: viser has no option for a check of requests, a limit of clients or a log.
     Needed by: viser 1.1.1. No upstream issue known.
     """
     from websockets.asyncio import server
@@ -182,10 +184,10 @@ def viser_served_with(adapt: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -
 
 
 def viser_control_id(control: Any) -> str:
-    """Returns the number by which browsers name a control of viser's.
+    """Id by which browsers name a viser control.
 
     Private: `_impl.uuid`.
-    Why: viser sets any attribute of a control to any value that a browser sends, before it calls anyone.
+    Why: viser sets any attribute of a control to any value from a browser, before it calls any handler.
     Needed by: viser 1.1.1. No upstream issue known.
     """
     return str(control._impl.uuid)

@@ -1,8 +1,8 @@
 """Ctrl-C, SIGTERM and SIGHUP. No other module handles them.
 
-Python calls a handler in the main thread, between two instructions: late while a library compiles, and an exception that it
-raises can be lost in a library's callback. So the interpreter writes each signal to a pipe, which a thread reads. The thread
-ends the process at once, unless a block is `held`, which ends in order.
+Python calls a handler in the main thread, between two instructions. This is late while a library compiles, and its exception
+can be lost in a library's callback. So the interpreter writes each signal to a pipe, which a thread reads. The thread ends the
+process at once, unless a block is `held`, which ends in order.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-SECONDS_OF_ONE = 0.5  # in which more signals are the same one: `timeout`, srun and uv run pass on what the group has had
-SECONDS_TO_END = 7.0  # after a signal, for what follows the held blocks
+SECONDS_OF_ONE = 0.5  # repeated signals within this time count once: `timeout`, srun and uv run pass them on
+SECONDS_TO_END = 7.0  # after a signal, for code after the held blocks
 SECONDS_TO_CLEAN = 1.5
-STOPPING = "stopping when this epoch has ended, with a checkpoint; again stops at once, with what is saved"
+STOPPING = "stopping after this epoch, with a checkpoint; a second signal stops at once"
 
-# The functions behind `signal.signal` work in any thread. They take and give the address of a handler in C.
+# The functions behind `signal.signal` work in any thread. They take and return the address of a handler in C.
 _GET, _SET = ctypes.pythonapi.PyOS_getsig, ctypes.pythonapi.PyOS_setsig
 _GET.restype = _SET.restype = ctypes.c_void_p
 _GET.argtypes, _SET.argtypes = [ctypes.c_int], [ctypes.c_int, ctypes.c_void_p]
 
 
 class Held:
-    """A block that looks at `asked` and ends in order; `alive` tells that it does not hang."""
+    """A block that checks `asked` and ends in order. It calls `alive` to show that it does not hang."""
 
     def __init__(self, report: Callable[[str], None], told: str, patience: float):
         self.report, self.told, self.patience = report, told, patience
@@ -45,20 +45,20 @@ class Held:
 
 
 class _Signals:
-    """The process's signals. The lock is for the main thread and the one that reads the pipe."""
+    """The process's signals. The lock is for the main thread and the thread that reads the pipe."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.pipe: tuple[int, ...] | None = None
-        self.before: dict[int, Any] = {}  # the handlers that ours have replaced
+        self.before: dict[int, Any] = {}  # original handlers
         self.ours: int | None = None  # address of Python's handler in C
         self.asked: int | None = None
         self.since = 0.0
-        self.blocks = [Held(lambda text: None, "stopped", SECONDS_TO_END)]  # the first is what is not held
+        self.blocks = [Held(lambda text: None, "stopped", SECONDS_TO_END)]  # the first stands for code outside held blocks
         self.cleaners: dict[object, Callable[[], object]] = {}
 
     def listen(self, read: int) -> None:
-        """Reads the pipe for as long as the process lives. A library that takes a signal, as Ray does, has it for 0.1 s."""
+        """Reads the pipe while the process lives. Takes back a signal that a library, such as Ray, has taken after 0.1 s."""
         signal.pthread_sigmask(signal.SIG_UNBLOCK, NUMBERS)
         while True:
             select.select([read], [], [], 0.1)
@@ -69,7 +69,7 @@ class _Signals:
                         _SET(number, self.ours)
 
     def look(self) -> None:
-        """Answers the signals that have come."""
+        """Handles the signals that have arrived."""
         with self.lock:
             for number in self.read():
                 if self.asked is None:
@@ -78,7 +78,7 @@ class _Signals:
                         self.end(number)
                     report = threading.Thread(target=self.blocks[-1].report, args=[STOPPING], daemon=True)
                     report.start()
-                    report.join(SECONDS_OF_ONE)  # a pipe that is full blocks whoever writes
+                    report.join(SECONDS_OF_ONE)  # writing to a full pipe blocks
                 elif time.monotonic() - self.since > SECONDS_OF_ONE:
                     self.end(number)
             block = self.blocks[-1]
@@ -86,19 +86,19 @@ class _Signals:
                 self.end(self.asked)
 
     def read(self) -> list[int]:
-        """Numbers of the signals that have come since the last call."""
+        """Numbers of the signals that have arrived since the last call."""
         with contextlib.suppress(BlockingIOError):
             return [number for number in os.read(self.pipe[0], 1024) if number in NUMBERS] if self.pipe else []
         return []
 
     def end(self, number: int) -> None:
-        """Ends the process, whatever its other threads are at. Open files are closed as by a kill."""
+        """Ends the process, whatever its other threads do. Open files are closed as by a kill."""
         limit = threading.Timer(SECONDS_TO_CLEAN, os._exit, [128 + number])
         limit.daemon = True
         limit.start()
         with contextlib.suppress(OSError):
             os.write(2, f"{self.blocks[-1].told}\n".encode())
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # other threads go on until the end, without what is cleaned away
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # other threads continue until the end and may fail
             if os.isatty(1):
                 os.write(1, b"\x1b[?25h")  # a progress bar hides the cursor
         for clean in (sys.stdout.flush, *reversed(list(self.cleaners.values())), _kill_children):
@@ -107,15 +107,15 @@ class _Signals:
         os._exit(128 + number)
 
     def before_fork(self) -> None:
-        """Keeps signals back until a child has its own handlers."""
+        """Blocks signals until a child has its own handlers."""
         self.mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
 
     def in_parent(self) -> None:
-        """Lets signals through again."""
+        """Unblocks signals."""
         signal.pthread_sigmask(signal.SIG_SETMASK, self.mask)
 
     def in_child(self) -> None:
-        """Gives a forked child the handlers that were there before. It has no thread that reads, and shares the pipe."""
+        """Restores the original handlers in a forked child. It has no reading thread, and shares the pipe."""
         if self.before:
             signal.set_wakeup_fd(-1)
             for number, handler in self.before.items():
@@ -124,7 +124,7 @@ class _Signals:
 
 
 def children() -> list[int]:
-    """Programs that this one has started, and that have not ended. Needs Linux."""
+    """Running child processes. Needs Linux."""
     pids: list[int] = []
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/children", encoding="ascii") as file:
@@ -133,7 +133,7 @@ def children() -> list[int]:
 
 
 def _kill_children() -> None:
-    """Kills the programs that libraries have started, but none with a session of its own, such as a browser."""
+    """Kills child processes that libraries have started, except those with their own session, such as a browser."""
     for pid in children():
         if os.getsid(pid) == os.getsid(0):
             os.kill(pid, signal.SIGKILL)
@@ -148,7 +148,7 @@ def take() -> None:
         return
     if _signals.pipe is None:
         ends = os.pipe()
-        _signals.pipe = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)  # not in place of a closed stdout
+        _signals.pipe = tuple(fcntl.fcntl(end, fcntl.F_DUPFD_CLOEXEC, 3) for end in ends)  # not instead of a closed stdout
         for end, own in zip(ends, _signals.pipe):
             os.close(end)
             os.set_blocking(own, False)
@@ -175,7 +175,7 @@ def _wake(number: int, frame: object) -> None:
 
 @contextlib.contextmanager
 def taken() -> Iterator[None]:
-    """Handles the signals within the block, if nobody has called `take`, and gives them back."""
+    """Handles the signals during the block, unless `take` has been called, and restores the original handlers."""
     if _signals.before or threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -194,31 +194,31 @@ def taken() -> Iterator[None]:
 
 
 def asked() -> int | None:
-    """The signal that asks the process to stop."""
+    """Signal that requests a stop, or None."""
     _signals.look()
     return _signals.asked
 
 
 def forget() -> None:
-    """Takes back the request to stop: all that was to be done has been done."""
+    """Clears a request to stop, because all work is done."""
     _signals.asked = None
 
 
 def are_asked() -> bool:
-    """Whether a signal asks the process to stop."""
+    """Whether a signal requests a stop."""
     return asked() is not None
 
 
 @contextlib.contextmanager
 def held(report: Callable[[str], None], place: object, patience: float = math.inf) -> Iterator[Held]:
-    """Lets the block end in order after a first signal; it must look at `asked`. A second signal ends the process at once.
+    """Lets the block end in order after a first signal. It must check `asked`. A second signal ends the process at once.
 
     Args:
-      report: called with a line when a signal comes.
-      place: what the block does is saved there.
-      patience: seconds after which the process ends, if the block has been asked and does not call `alive`.
+      report: called with a line when a signal arrives.
+      place: where the block saves its work.
+      patience: seconds after a signal until the process ends, unless the block calls `alive`.
     """
-    block = Held(report, f"stopped at once; what was saved is in {place}", patience)
+    block = Held(report, f"stopped at once; saved work is in {place}", patience)
     take_back()
     with _signals.lock:
         _signals.blocks.append(block)
@@ -226,14 +226,14 @@ def held(report: Callable[[str], None], place: object, patience: float = math.in
         yield block
     finally:
         with _signals.lock:
-            _signals.look()  # those that came in the block
+            _signals.look()  # signals that arrived in the block
             _signals.blocks.remove(block)
             _signals.blocks[-1].alive()
 
 
 @contextlib.contextmanager
 def cleaning(clean: Callable[[], object]) -> Iterator[None]:
-    """Calls `clean` at the end of the block, and also if a signal ends the process within the block."""
+    """Calls `clean` at the end of the block, even if a signal ends the process within it."""
     key = object()
     _signals.cleaners[key] = clean
     try:

@@ -1,4 +1,4 @@
-"""Programs run in processes of their own: their output, and in one line why they failed."""
+"""Subprocesses: their output, and the reason for a failure in one line."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ PACKAGE = Path(__file__).resolve().parents[1]  # the folder mjx_dher
 
 
 class Answer(NamedTuple):
-    """Output of a program that has ended."""
+    """Output of an ended subprocess."""
 
     out: str
     err: str
     failure: str | None  # one line; None if the program succeeded
 
     def last_json(self) -> Any:
-        """Returns the JSON value in the last line of `out`."""
+        """JSON value in the last line of `out`."""
         return json.loads(self.out.splitlines()[-1])
 
 
 @contextlib.contextmanager
 def started(command: Sequence[str], variables: Mapping[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
-    """Starts a program, with `variables` added to this one's environment, and kills it at the end of the block.
+    """Starts a subprocess, with `variables` added to its environment, and kills it at the end of the block.
 
-    Its output goes to files, because a program stops at a full pipe that nobody reads. It has a session of its own: a signal to
-    this program's group is this program's to answer.
+    Its output goes to files, because a process stops at a full pipe. It has its own session, so it does not receive signals
+    for this process's group.
     """
     environment = {**os.environ, **(variables or {})}
     with (
@@ -48,20 +48,20 @@ def started(command: Sequence[str], variables: Mapping[str, str] | None = None) 
 
 
 def kill(process: subprocess.Popen[Any]) -> None:
-    """Kills a program that leads a session, and those that it has started there."""
+    """Kills a process that leads a session, and the processes that it has started in it."""
     with contextlib.suppress(OSError):  # all have ended
         os.killpg(process.pid, signal.SIGKILL)
 
 
 def leaders() -> list[int]:
-    """Programs that this one has started, in sessions of their own. Needs Linux."""
+    """Child processes that lead their own session. Needs Linux."""
     with contextlib.suppress(OSError):
         return [pid for pid in signals.children() if os.getsid(pid) == pid]
     return []
 
 
 def kill_sessions(more: Sequence[int] = ()) -> None:
-    """Kills the processes, of any parent, in the sessions of `leaders` and of those given, which may have ended."""
+    """Kills all processes in the sessions of `leaders` and of `more`, which may have ended."""
     first = [*leaders(), *more]  # they start the others
     with contextlib.suppress(OSError):
         for pid in (*first, *(int(path.name) for path in Path("/proc").iterdir() if path.name.isdecimal())):
@@ -71,7 +71,7 @@ def kill_sessions(more: Sequence[int] = ()) -> None:
 
 
 def answer(process: subprocess.Popen[str], seconds: float | None = None) -> Answer:
-    """Waits for a program to end, and kills it after that many `seconds`."""
+    """Waits for a subprocess to end, and kills it after `seconds`."""
     failure = None
     try:
         process.wait(seconds)
@@ -91,7 +91,7 @@ def _written(file: IO[str] | None) -> str:
 
 
 def ask(command: Sequence[str], variables: Mapping[str, str] | None = None, seconds: float | None = None) -> Answer:
-    """Runs a program to its end; see `started` and `answer`. A program that cannot be started is a failure, too."""
+    """Runs a subprocess to its end; see `started` and `answer`. Failing to start is a failure too."""
     try:
         with started(command, variables) as process:
             return answer(process, seconds)

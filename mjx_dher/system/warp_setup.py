@@ -15,19 +15,19 @@ from mjx_dher.system.caches import user_cache
 with contextlib.redirect_stdout(io.StringIO()):
     import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING  # otherwise Warp prints a line for each kernel
+wp.config.log_level = wp.LOG_WARNING  # otherwise Warp prints a line per kernel
 
 
 @functools.cache
 def prepare() -> None:
-    """Starts Warp and sets how kernels are compiled. Call it before anything else of Warp's.
+    """Starts Warp and configures how kernels are compiled. Call it before using Warp.
 
-    They are kept as machine code: what Warp keeps by default, the driver would compile once more. If Warp's cache folder cannot
-    be used, a warning says so, and a folder of this process takes its place.
+    Kernels are cached as machine code, because the driver would recompile Warp's default format. If Warp's cache folder is
+    unusable, a warning is issued and a temporary folder replaces it.
     """
     try:
         if not (wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")):
-            user_cache()  # Warp itself would make a folder called ~ without a home folder
+            user_cache()  # raises without a home folder, where Warp would make a folder called ~
         wp.init()
         with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir):
             pass
@@ -35,8 +35,8 @@ def prepare() -> None:
         folder = tempfile.mkdtemp(prefix="warp-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         warnings.warn(
-            f"Warp cannot keep compiled kernels ({error}): each program compiles them anew, for a quarter of a minute;"
-            " WARP_CACHE_PATH names another folder",
+            f"Warp cannot cache compiled kernels ({error}): each process compiles them again, for a quarter of a minute;"
+            " set WARP_CACHE_PATH to another folder",
             stacklevel=2,
         )
         os.environ["WARP_CACHE_PATH"] = folder
@@ -48,11 +48,11 @@ def prepare() -> None:
 
 
 def load(module: Any, block: int | None = None) -> None:
-    """Compiles a module of Warp's for the current device, or takes it from the cache, unless what is there is damaged.
+    """Compiles a Warp module for the current device, or loads it from the cache. Recompiles if the cached one is damaged.
 
     Args:
       module: the module.
-      block: threads of a block, which the module is compiled for; Warp's default where None.
+      block: threads per block to compile for. Default: Warp's.
     """
     block = (1 if wp.get_device().is_cpu else module.options["block_dim"]) if block is None else block
     kept = os.path.join(str(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim=block))
@@ -62,6 +62,6 @@ def load(module: Any, block: int | None = None) -> None:
     except Exception as error:  # Warp has no narrower class
         if not was_there:
             raise
-        warnings.warn(f"{kept} cannot be used ({error}): its kernels are compiled anew", stacklevel=2)
+        warnings.warn(f"{kept} cannot be used ({error}): its kernels are compiled again", stacklevel=2)
         shutil.rmtree(kept, ignore_errors=True)
         module.load(wp.get_device(), block)

@@ -1,4 +1,4 @@
-"""Conformance tests for custom components: one function for each kind.
+"""Conformance tests for custom components, one function per kind.
 
 In a test:
 

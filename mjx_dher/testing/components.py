@@ -1,9 +1,8 @@
 """Checks of custom samplers, metrics, kernels, normalizations, priorities and goal generators, on random episodes.
 
-Each takes what the command line or a program takes in the component's place, and an environment. Further arguments are the
-run's numbers (None: the defaults) and an untrained learner whose values the component may read (None: `ddpg`); a `Trial` in
-place of the environment brings its own. Each returns a line on what it saw, and raises ComponentError, which names the first
-violation.
+Each function takes a component, as the command line or a program does, and an environment, or a `Trial`. Other arguments are
+the run's numbers (by default HParams()) and an untrained learner whose values the component may read (by default `ddpg`). Each
+returns a line about its findings, and raises ComponentError for the first violation.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ from mjx_dher.testing.learner import check_learner
 from mjx_dher.testing.trial import EPISODES, Trial, attempt, compiled, expect, expect_range, expect_same, run, trial_of
 from mjx_dher.types import Env, GoalObs, PRNGKey
 
-NUMBER = 8  # transitions that a priority is asked to choose
-BATCHES = 8  # of candidates that it chooses from, one after another
+NUMBER = 8  # transitions that a priority must choose
+BATCHES = 8  # batches of candidates to choose from
 
 
 def check_components(env: Env, spec: RunSpec, with_env: bool = True) -> Iterator[str]:
-    """Checks the custom components of a run, among them the environment if `with_env`; yields a line for each that passes."""
+    """Checks the custom components of a run, including the environment if `with_env`. Yields a line for each that passes."""
     custom = custom_components(spec)
     if "env" in custom and with_env:
         check_env(env)
@@ -71,10 +70,10 @@ def check_components(env: Env, spec: RunSpec, with_env: bool = True) -> Iterator
 def check_sampler(
     sampler: str | Sampler | LogWeightsFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
 ) -> str:
-    """Checks the log weights of every step of random episodes.
+    """Checks the log weights at every step of random episodes.
 
-    They must be floats [T+1], below +inf and not NaN, not all -inf at every step, and the same under `jax.vmap` as alone and in
-    a second call.
+    They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal under `jax.vmap`, alone, and in a
+    second call.
     """
     made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, learner)
     episodes, numbers = trial.episodes, trainer.as_arrays(trial.hparams)
@@ -93,7 +92,7 @@ def check_sampler(
 
 
 def _check_log_weights(values: NDArray, alone: NDArray) -> str:
-    """Checks log weights [N, T, T+1], and those of episode 0 at its last step, computed `alone`; returns a line."""
+    """Checks log weights [N, T, T+1], and those of episode 0 at its last step, computed `alone`. Returns a line."""
     wrong = np.argwhere(~(values < np.inf))  # NaN, too
     if len(wrong):
         n, t, i = wrong[0]
@@ -109,13 +108,15 @@ def _check_log_weights(values: NDArray, alone: NDArray) -> str:
 
 
 def _weights(log_weights: NDArray) -> NDArray:
-    """Weights [..., T+1] of which the largest is 1, from log weights [..., T+1]; 0 if all of these are -inf."""
+    """Weights [..., T+1] from log weights [..., T+1], scaled so that the largest is 1. All are 0 if all log weights are
+    -inf.
+    """
     largest = log_weights.max(axis=-1, keepdims=True)
     return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 
 
 def check_metric(metric: str | MetricFn | LearnedMetric, env: Env | Trial, learner: Learner | None = None) -> str:
-    """Checks the distances of random episodes' goals: [T+1], finite, not negative and not all alike."""
+    """Checks distances of random episodes' goals: [T+1], finite, not negative and not all equal."""
     made, trial = attempt("metric", samplers.make_metric, metric), trial_of(env, None, learner)
     if isinstance(made, LearnedMetric):
         sampler = samplers.make("closest", metric=made)
@@ -129,9 +130,9 @@ def check_metric(metric: str | MetricFn | LearnedMetric, env: Env | Trial, learn
 
 
 def check_kernel(kernel: str | KernelFn) -> str:
-    """Checks the log weights of relative distances from 0 to 3, at temperatures of 0.3, 1 and 3.
+    """Checks the log weights of relative distances from 0 to 3, at temperatures 0.3, 1 and 3.
 
-    They must be as many as the distances, below +inf and not NaN, not all -inf, and not all alike.
+    They must have the shape of the distances, be below +inf, not NaN, not all -inf and not all equal.
     """
     made = attempt("weight_kernel", components.load, "weight_kernel", kernel, "relative", "temperature")
     relative = jnp.linspace(0.0, 3.0, 31)
@@ -151,10 +152,10 @@ def check_kernel(kernel: str | KernelFn) -> str:
 
 
 def check_normalization(normalization: str | NormalizationFn) -> str:
-    """Checks the relative distances of 20 candidates among 30 distances, at scales of 0.01, 0.05 and 1.
+    """Checks the relative distances of 20 candidates among 30 distances, at scales 0.01, 0.05 and 1.
 
-    They must be as many floats as there are distances, not NaN, and finite for candidates: those whose distances are 0.01 to
-    0.2, which it must tell apart, or all 0.1, or all 0, and a single candidate.
+    They must be floats with the shape of the distances, not NaN, and finite for candidates. The candidates' distances are 0.01
+    to 0.2, which must be distinguished, all 0.1, all 0, or a single candidate's.
     """
     field = "weight_normalization"
     made = attempt(field, components.load, field, normalization, "distance", "candidates", "scale")
@@ -181,9 +182,9 @@ def check_normalization(normalization: str | NormalizationFn) -> str:
 def check_priority(
     priority: str | Priority | PriorityFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
 ) -> str:
-    """Checks the weights of random episodes, and renewed weights and chosen transitions if the priority has a say in them.
+    """Checks the weights of random episodes, and renewed weights and chosen transitions if the priority has these functions.
 
-    Weights must be scalars, finite and not negative. Indices must be those of candidates, and depend on these.
+    Weights must be scalars, finite and not negative. Indices must refer to candidates, and depend on these.
     """
     made, trial = priorities.whole(attempt("priority", priorities.make, priority)), trial_of(env, hparams, learner)
     if made.uses_values and trial.learner is not None:
@@ -211,7 +212,7 @@ def check_priority(
 
 
 def _check_picks(choose: ChooseFn, trial: Trial) -> None:
-    """Checks the indices that `choose` gives of the candidates of several batches."""
+    """Checks the indices from `choose` for the candidates of several batches."""
     ring, context = trial.ring, trial.context
 
     def pick(key: PRNGKey) -> jax.Array:
@@ -237,8 +238,8 @@ def check_generator(
 ) -> str:
     """Checks the goals of random resets, with an empty ring and with random episodes in it.
 
-    They must be floats [N, G], the same for the same key, and finite for some reset once there are episodes. The environment
-    must have `with_goal`.
+    They must be floats [N, G], equal for equal keys, and finite for some reset once there are episodes. The environment must
+    have `with_goal`.
     """
     made, trial = attempt("generator", generators.make, generator), trial_of(env, hparams, learner)
     attempt("generator", check_with_goal, trial.env)

@@ -1,4 +1,4 @@
-"""A conformance test for environments: it tries everything that the library relies on."""
+"""Conformance test for environments, which tests everything that the library relies on."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from mjx_dher.testing.trial import TOLERANCE, attempt, compiled, expect, expect_
 from mjx_dher.types import Env, EnvSpec
 
 GOALS = ("achieved_goal", "desired_goal")
-DERIVED = ("reward", "success")  # what a state has besides, which a goal may change
+DERIVED = ("reward", "success")  # other fields that a goal may change
 STARTS = 8  # episodes in a batch
 
 
 def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
-    """Plays `env` with random actions, compiled, and raises at the first violation of `types.Env`.
+    """Plays compiled episodes of random actions, and raises an error at the first violation of `types.Env`.
 
     - The spec agrees with the arrays (`contract.env_spec`). States keep structure, shapes and dtypes, as `lax.scan` requires.
-    - Observations are float32 or uint8. Goals [G], reward [] and success [] are float32. All are finite; success is 0 or 1.
-    - `reset` and `step` are pure: when they are traced or called twice, the same arguments give the same results, alone and
-      under `jax.vmap`, and stay unchanged.
-    - Starts or goals differ from key to key, and the goal is constant in an episode.
+    - Observations are float32 or uint8. Goals [G], reward [] and success [] are float32. All are finite, and success is 0 or
+      1.
+    - `reset` and `step` are pure. Traced or called twice, alone and under `jax.vmap`, equal arguments give equal results and
+      stay unchanged.
+    - Starts or goals differ between keys, and the goal is constant in an episode.
     - Actions outside [-1, 1] are accepted.
     - `compute_reward`, and `reached` and `goal_distance` if present, take any leading axes and are pure. `step` gives the same
-      reward. Rewards of desired and of achieved goals lie in the spec's `reward_range`. A goal that is achieved exactly has the
-      greatest reward and is reached; distances are not negative.
-    - If all rewards are at an end of the range, success is never 1 at the low end, and not 0 at every reward of the high end.
-      They need not agree at each step: an environment may require more for a success, such as rest.
-    - An episode has one step or more. With `EnvSpec.ends`, states after its end are ignored, as are those with `failed`.
-    - `with_goal`, if present, gives a first state another desired goal, which it keeps, and changes nothing else.
+      reward. Rewards of desired and of achieved goals lie in the spec's `reward_range`. An exactly achieved goal has the
+      greatest reward and is reached. Distances are not negative.
+    - If all rewards are at an end of the range, success is never 1 at the low end, and not always 0 at the high end. They need
+      not agree at each step, because an environment may require more for a success, such as rest.
+    - An episode has at least one step. States after its end (`EnvSpec.ends`) and states with `failed` are ignored.
+    - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else.
 
     Args:
       env: the environment. Its method `check()`, if present, is called at the end.
@@ -42,7 +43,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
       tolerance: largest difference between results that should be equal, relative to the larger of 1 and the value.
 
     Raises:
-      ComponentError: names the first violation and what is expected.
+      ComponentError: names the first violation and the expectation.
     """
     spec: EnvSpec = attempt("reset", contract.env_spec, env)
     keys, actions = _draw(jax.random.key(seed), (spec.episode_length, STARTS, spec.action_size))
@@ -59,14 +60,14 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
 
 @functools.partial(jax.jit, static_argnums=1)
 def _draw(key: jax.Array, shape: tuple[int, int, int]) -> tuple[jax.Array, jax.Array]:
-    """Keys of starts [N], and actions of `shape`, which is [T, N, A]."""
+    """Keys of starts [N], and actions of `shape` [T, N, A]."""
     reset_key, action_key = jax.random.split(key)
     actions = jax.random.uniform(action_key, shape, jnp.float32, minval=-1.0, maxval=1.0)
     return jax.random.split(reset_key, shape[1]), actions
 
 
 def _outputs(state: Any) -> dict[str, Any]:
-    """The arrays of a state that the library reads, by name; each leaf of the observation has its own."""
+    """Arrays of a state that the library reads, by name, with one entry per leaf of the observation."""
     flags = {name: getattr(state, name) for name in contract.FLAGS if hasattr(state, name)}
     obs = {name: state.obs[name] for name in ("observation", *GOALS)}
     named = {**obs, "reward": state.reward, "success": state.success, **flags}
@@ -86,7 +87,7 @@ def _check_goal_functions(env: Any, goal_size: int) -> None:
 
 
 def _play(env: Env, keys: jax.Array, actions: jax.Array) -> Any:
-    """Plays N episodes to their maximum length, whether they end or not; their states lead with [T+1, N]."""
+    """Plays N episodes to their maximum length, even if they end. The states lead with [T+1, N]."""
 
     @jax.jit
     def play(keys: jax.Array, actions: jax.Array) -> Any:
@@ -102,7 +103,7 @@ def _play(env: Env, keys: jax.Array, actions: jax.Array) -> Any:
 
 
 def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDArray:
-    """Checks whole episodes; returns which of their states [T+1, N] count."""
+    """Checks whole episodes. Returns a mask [T+1, N] of the states that count."""
     for name, values in played.items():
         allowed = ("float32", "uint8") if name.startswith("observation") else ("float32",)
         fits = name in contract.FLAGS or values.dtype in allowed
@@ -135,7 +136,7 @@ def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDAr
 
 
 def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tolerance: float) -> None:
-    """Compares single resets and steps with those of the batch, from the same states; sets goals, and acts out of bounds."""
+    """Compares single resets and steps with the batch's, from the same states. Also sets goals and acts out of bounds."""
 
     def alone(key: jax.Array, state: Any, action: jax.Array) -> Any:
         before = jax.tree.leaves(state)
@@ -169,7 +170,7 @@ def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tol
 
 
 def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:
-    """Checks the functions of goals on those of episodes, of which the states in the mask `valid` [T+1, N] count."""
+    """Checks the goal functions on the goals of the states in the mask `valid` [T+1, N]."""
     achieved, desired = (played[name] for name in GOALS)
 
     def ask(achieved: jax.Array, desired: jax.Array) -> dict[str, Any]:

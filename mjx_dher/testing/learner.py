@@ -1,4 +1,4 @@
-"""A check of a custom learner or custom networks: one update on random episodes."""
+"""Check of a custom learner or custom networks: one update on random episodes."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ def check_learner(
 ) -> None:
     """Makes a learner, lets it act, explore and learn from one batch, and checks the results.
 
-    - `init` gives a pytree of arrays, `noise` arrays that lead with [T, N].
-    - `act` and `explore` give finite actions [N, A] in [-1, 1]; `act` takes any leading axes.
-    - `value`, if present, gives one finite number for each action, for any leading axes.
-    - `update`, `update_target` and `update_normalizers` keep the state's structure, shapes and types, as `lax.scan` needs, and
-      numbers finite; `update` changes it. `act`, `explore` and `update` give the same in a second call.
-    - Metrics of `update` and `summary` are dicts of scalars, with names that nothing else is logged by.
-    - `update_normalizers` ignores observations that are not valid.
-    - `export` gives a `policy.Policy` that acts as `act` does, or None.
+    - `init` returns a pytree of arrays, and `noise` returns arrays that lead with [T, N].
+    - `act` and `explore` return finite actions [N, A] in [-1, 1]. `act` takes any leading axes.
+    - `value`, if present, returns one finite number per action, for any leading axes.
+    - `update`, `update_target` and `update_normalizers` keep the state finite, with the same structure, shapes and dtypes.
+      `update` changes it. `act`, `explore` and `update` are deterministic.
+    - Metrics of `update` and `summary` are dicts of scalars with unique names.
+    - `update_normalizers` ignores invalid observations.
+    - `export` returns a `policy.Policy` that acts like `act`, or None.
 
     Args:
-      learner: what `learners.make` takes.
+      learner: learner, as in `learners.make`.
       env: the environment, or a `Trial`.
-      config: sizes; None for the defaults.
-      hparams: numbers; None for the defaults.
-      networks: what `networks.make` takes.
+      config: sizes.
+      hparams: numbers.
+      networks: networks, as in `networks.make`.
 
     Raises:
       ComponentError: names the first violation.
@@ -85,7 +85,7 @@ def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> N
 
 
 def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
-    """The state that a method of the learner gives, checked to be like `state` and finite."""
+    """State after a method of the learner. It must be finite and like `state`."""
     after = attempt(f"learner.{name}", function, state, *args)
     learners.check_kept(name, state, after)
     expect_finite(f"the state that learner.{name} gives", after)
@@ -93,7 +93,7 @@ def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
 
 
 def _check_acting(made: Learner, state: Any, episodes: Episode, spec: EnvSpec, hparams: HParams) -> PyTree:
-    """Checks actions and values for the first observations of the episodes; returns these."""
+    """Checks actions and values for the first observations of the episodes. Returns these observations."""
     start: Any = {"observation": episodes.observation, "achieved_goal": episodes.achieved_goal}
     obs = {**jax.tree.map(lambda x: x[:, 0], start), "desired_goal": episodes.desired_goal}
     noise = attempt("learner.noise", made.noise, jax.random.key(2), spec.episode_length, EPISODES, hparams)

@@ -1,4 +1,4 @@
-"""What the checks share: random episodes, and calls whose errors become one line."""
+"""Shared parts of the checks: random episodes, and calls whose errors become one line."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Env, Episode
 
-EPISODES = 16  # random ones
+EPISODES = 16  # random episodes
 TOLERANCE = 1e-3
-# Folders of code that is not the user's.
+# Folders of code that does not belong to the user.
 _OURS = os.path.dirname(os.path.dirname(__file__)) + os.sep
 _INNER = (_OURS, *(os.path.dirname(str(module.__file__)) + os.sep for module in (jax, flax, np)))
 
 
 class ComponentError(ValueError):
-    """Error of a custom component: what is wrong, and what is expected."""
+    """A custom component violates its contract. The message has the violation and the expectation."""
 
 
 def expect(condition: Any, message: str) -> None:
@@ -50,21 +50,21 @@ def expect_finite(what: str, value: Any) -> None:
 
 
 def expect_range(what: str, values: NDArray) -> str:
-    """Raises ComponentError unless numbers are finite and not negative; returns their range as text."""
+    """Raises ComponentError unless numbers are finite and not negative. Returns their range as text."""
     expect_finite(what, values)
     expect(values.min() >= 0, f"{what} must not be negative; the least is {values.min():.3g}")
     return f"from {values.min():.3g} to {values.max():.3g}"
 
 
 def compiled(what: str, function: Callable[..., Any], *args: Any, tolerance: float = TOLERANCE) -> Callable[..., Any]:
-    """Compiles a pure function for arguments like `args`, arrays all of them.
+    """Compiles a pure function of arrays for arguments like `args`.
 
     Raises:
-      ComponentError: it raises an error, or a second trace of it, or a second call, gives another result for `args`.
+      ComponentError: the function raises an error, or a second trace or call gives another result for `args`.
     """
-    traces = [attempt(what, jax.jit(functools.partial(function)).lower, *args) for _ in range(2)]  # two objects: two traces
+    traces = [attempt(what, jax.jit(functools.partial(function)).lower, *args) for _ in range(2)]  # two objects, two traces
     program = attempt(what, traces[0].compile)
-    # Two traces are compared as programs, because most are the same, and compiling takes longest.
+    # The traces are compared as programs, because most are equal, and compiling takes longest.
     other = program if traces[0].as_text() == traces[1].as_text() else attempt(what, traces[1].compile)
     first, second = (attempt(what, again, *args) for again in (program, other))
     expect_same(f"{what}, called twice with the same arguments,", first, second, tolerance)
@@ -72,7 +72,7 @@ def compiled(what: str, function: Callable[..., Any], *args: Any, tolerance: flo
 
 
 def run(what: str, function: Callable[..., Any], *args: Any) -> Any:
-    """Result of a pure function of arrays, compiled; raises ComponentError as `compiled` does."""
+    """Result of a compiled pure function of arrays. Raises ComponentError like `compiled`."""
     return compiled(what, function, *args)(*args)
 
 
@@ -90,11 +90,11 @@ def expect_same(what: str, result: Any, expected: Any, tolerance: float = TOLERA
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """What components are tried on: random episodes of an environment, in the middle of a run of an untrained learner."""
+    """Test data for components: random episodes of an environment, in the middle of a run of an untrained learner."""
 
     env: Env
     hparams: HParams = HParams()  # noqa: RUF009 - a tuple
-    learner: Learner | None = None  # whose values may be read; None for `ddpg`
+    learner: Learner | None = None  # source of values; None: `ddpg`
 
     @functools.cached_property
     def episodes(self) -> Episode:
@@ -103,7 +103,7 @@ class Trial:
 
     @functools.cached_property
     def context(self) -> Context:
-        """What methods may look at."""
+        """Context of the run."""
         made = self.learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_spec(self.env))
         numbers = trainer.as_arrays(self.hparams)
         values = learners.values_of(made, made.init(jax.random.key(0)), numbers) if hasattr(made, "value") else None
@@ -111,22 +111,22 @@ class Trial:
 
     @functools.cached_property
     def empty_ring(self) -> ReplayState:
-        """A ring with room for twice as many episodes."""
+        """Empty ring with room for twice as many episodes."""
         return replay.init(jax.tree.map(lambda x: x[0], self.episodes), 2 * EPISODES, env_spec(self.env).ends)
 
     @functools.cached_property
     def ring(self) -> ReplayState:
-        """A ring that holds the episodes, half of its rows empty."""
+        """Ring with the episodes, half of whose rows are empty."""
         return replay.add(self.empty_ring, self.episodes)
 
 
 def trial_of(env: Env | Trial, hparams: HParams | None, learner: Learner | None) -> Trial:
-    """A trial in an environment, or the one that is given in its place."""
+    """Trial in an environment, or `env` itself if it is a trial."""
     return env if isinstance(env, Trial) else Trial(env, hparams or HParams(), learner)
 
 
 def random_episodes(env: Env, seed: int = 0) -> Episode:
-    """Plays 16 episodes of uniformly random actions; leaves lead with [16]. Raises ComponentError if it cannot."""
+    """Plays 16 episodes of uniformly random actions; leaves lead with [16]. Raises ComponentError if it fails."""
     attempt("env", check_env_parts, env)
     key, action_key = jax.random.split(jax.random.key(seed))
     shape = (env.episode_length, EPISODES, env.action_size)
@@ -136,9 +136,9 @@ def random_episodes(env: Env, seed: int = 0) -> Episode:
 
 
 def attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:
-    """Calls `function`; an error of any kind becomes a ComponentError with what was tried, the error and its place.
+    """Calls `function`. An error becomes a ComponentError with `what`, the error and its place.
 
-    The library's own ValueErrors keep their message.
+    The library's ValueErrors keep their message.
     """
     try:
         return function(*args)
@@ -151,7 +151,7 @@ def attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:
 
 
 def _describe(error: Exception) -> str:
-    """An error's type, the first line of its message, and the last place in it that is neither JAX's nor this library's."""
+    """An error's type, the first line of its message, and its last place outside JAX and this library."""
     reason = (str(error).strip().splitlines() or [""])[0]
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_inner(frame.filename)]
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""

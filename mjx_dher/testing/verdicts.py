@@ -1,4 +1,4 @@
-"""Verdicts of the checks: components that have passed are not checked again until something that they depend on changes."""
+"""Cached verdicts: components that have passed are not checked again until one of their dependencies changes."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from mjx_dher.system.subprocesses import PACKAGE
 from mjx_dher.testing.components import check_components
 from mjx_dher.types import Env
 
-KEPT_SECONDS = 90 * 24 * 3600.0  # for which a verdict is kept
+KEPT_SECONDS = 90 * 24 * 3600.0  # lifetime of a verdict
 
 
 def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[str]:
-    """Checks the custom components of runs of `env`, each once; yields a line for the screen before it begins, and for results.
+    """Checks the custom components of runs of `env`, each once. Yields lines for the screen.
 
     Args:
-      env: the environment of all the runs.
+      env: environment of all runs.
       specs: the runs.
-      again: whether to check what has passed before.
+      again: whether to check components that have passed before.
 
     Raises:
       ComponentError: names the component and the first violation.
@@ -46,7 +46,7 @@ def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[s
     names = ", ".join(dict.fromkeys(f"{field} {name}" for run in runs for field, name in custom_components(run).items()))
     verdict = _verdict(env, runs)
     if verdict is not None and verdict.is_file() and not again:
-        yield f"{names}: passed before, and nothing has changed since"
+        yield f"{names}: passed before, unchanged since"
         return
     yield f"testing {names} on random episodes ..."
     for number, run in enumerate(runs):
@@ -57,7 +57,7 @@ def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[s
 
 
 def _read(spec: RunSpec) -> RunSpec:
-    """A run with the settings that its custom components may read, others at their defaults."""
+    """The run with only the settings that its custom components may read. Others have their defaults."""
     if custom_components(spec).keys() == {"env"}:
         return RunSpec(env=spec.env, env_kwargs=spec.env_kwargs, engine=spec.engine)
     config = dataclasses.replace(spec.config, total_steps=Config().total_steps)
@@ -65,10 +65,10 @@ def _read(spec: RunSpec) -> RunSpec:
 
 
 def _verdict(env: Any, runs: Sequence[RunSpec]) -> Path | None:
-    """File that is there if these components have passed; None if what they depend on cannot be told.
+    """File that exists if these components have passed, or None if their dependencies are unknown.
 
-    Its name is a digest of the settings, the environment as it is compiled (so also of what it has read from files), the code
-    of this library and of modules that were not installed, and the versions of installed packages.
+    Its name is a digest of the settings, the compiled environment (which includes data from files), the code of this library
+    and of modules that are not installed, and the versions of installed packages.
     """
     content = hashlib.sha256(repr(runs).encode())
     try:
@@ -86,12 +86,12 @@ def _verdict(env: Any, runs: Sequence[RunSpec]) -> Path | None:
         for file in sorted({*PACKAGE.rglob("*.py"), *_own_files()}):
             content.update(f"{file}".encode() + file.read_bytes())
         return user_cache() / "checked" / content.hexdigest()
-    except Exception:  # of the component, which its check reports; or of the cache
+    except Exception:  # from the component, whose check reports it, or from the cache
         return None
 
 
 def _own_files() -> Iterator[Path]:
-    """Files of loaded modules outside of Python's folders."""
+    """Files of loaded modules outside Python's folders."""
     installed = tuple(sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)

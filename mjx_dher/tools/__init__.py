@@ -1,1 +1,1 @@
-"""What is done with a trained policy, or to find out what works here. Kept empty: `originals` runs where only NumPy is."""
+"""Tools for trained policies and for this machine. Empty, so that `transfer` runs with NumPy alone."""

@@ -1,4 +1,4 @@
-"""Learning curves of single runs: read from their folders, drawn one by one or together."""
+"""Learning curves of single runs: read from their folders, and drawn one by one or together."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import figures
 
-CURVE = "curve"  # the picture of one run, without its ending
+CURVE = "curve"  # stem of the picture of one run
 NOT_ENDED = "not ended"
-# Panels of a run's picture: heading, curves by column, and whether the axis is logarithmic. Those without columns are left out.
+# Panels of a run's picture: heading, curves by column, and whether the axis is logarithmic. Empty panels are left out.
 _PANELS = (
     ("mean return", {"return_mean": "evaluation", "train_return_mean": "exploring"}, False),
     ("mean value of a transition", {"q_mean": "critic"}, False),
@@ -32,14 +32,14 @@ class Curve(NamedTuple):
 
     folder: Path
     spec: RunSpec
-    content: dict[str, Any]  # of config.json
+    content: dict[str, Any]  # content of config.json
     status: str  # finished, failed or not ended
-    reason: str  # of a run that failed
+    reason: str  # why the run failed, or ""
     rows: list[dict[str, Any]]  # metrics of each epoch
-    result: dict[str, Any]  # of result.json; empty for a run that has not ended
+    result: dict[str, Any]  # content of result.json; empty if the run has not ended
 
     def column(self, name: str) -> NDArray:
-        """A metric [P] of all epochs; NaN if an epoch lacks it."""
+        """A metric of all epochs, shape [P]; NaN if an epoch lacks it."""
         return np.array([row.get(name, math.nan) for row in self.rows], float)
 
 
@@ -47,7 +47,7 @@ def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
     """Reads the curve of the run in `folder`, finished or not.
 
     Raises:
-      FolderError: no run folder, a damaged one, or no epoch has ended and not `allow_empty`.
+      FolderError: it is not a run folder, it is damaged, or no epoch has ended and `allow_empty` is False.
     """
     content, spec = run_folder.read_run(folder)
     result: dict[str, Any] = {}
@@ -64,7 +64,7 @@ def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
 
 
 def title(curve: Curve) -> str:
-    """One line about a run: its settings, and how far it came."""
+    """One line about a run: its settings and progress."""
     spec = curve.spec
     parts = [spec.env, *spec.env_kwargs, f"sampler {spec.sampler}", f"learner {spec.learner}", f"seed {spec.seed}"]
     steps = f"{curve.rows[-1]['env_steps']:,} steps in {curve.rows[-1]['wall_seconds']:,.0f} s" if curve.rows else "no epoch"
@@ -73,7 +73,7 @@ def title(curve: Curve) -> str:
 
 
 def draw_curve(curve: Curve) -> Any:
-    """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values, and losses."""
+    """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values and losses."""
     panels = [
         (label, {name: text for name, text in columns.items() if np.isfinite(curve.column(name)).any()}, log)
         for label, columns, log in _PANELS
@@ -105,7 +105,7 @@ def draw_curve(curve: Curve) -> Any:
 
 
 def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
-    """Draws the success of evaluation, exploration, the last evaluation, and the resets."""
+    """Draws the success of evaluation, exploration, final evaluation and resets."""
     rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
     bounds = [stats.wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
     low, high = np.reshape(bounds, (-1, 2)).T
@@ -132,7 +132,7 @@ def _unit(curves: Sequence[Curve]) -> tuple[float, str]:
 
 
 def labels(curves: Sequence[Curve]) -> list[str]:
-    """A name for each run: the settings in which the runs differ, or else their folders."""
+    """Name of each run: the settings in which the runs differ, or else their folders."""
     settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
     varying = [name for name in settings[0] if len({str(each[name]) for each in settings}) > 1 and name != "engine"]
     told = [", ".join(_value(name, each[name]) for name in varying) for each in settings]
@@ -165,7 +165,7 @@ def draw_together(curves: Sequence[Curve]) -> Any:
 
 def curves_table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
     """Table of several runs: its head, and cells with settings, progress and success."""
-    head = ["run", "what differs", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
+    head = ["run", "differences", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
     cells = []
     for curve, name in zip(curves, labels(curves)):
         last, final = curve.rows[-1] if curve.rows else {}, ""

@@ -1,7 +1,7 @@
-"""The report for a bug report: versions, devices, and the engines and drawing backends that work on this machine.
+"""Report for bug reports: versions, devices, and working engines and drawing backends.
 
-JAX and MuJoCo are loaded in child processes with a time limit, so a driver that hangs or crashes costs one line of the report.
-A child process is this file: `python -m mjx_dher.tools.doctor machine|native|jax|warp`.
+JAX and MuJoCo are loaded in child processes with a time limit, so a driver that hangs or crashes costs only one line. A child
+process runs this file: `python -m mjx_dher.tools.doctor machine|native|jax|warp`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Report = dict[str, dict[str, Any]]
 
 
 def examine(seconds: float) -> Report:
-    """Examines the machine. On a GPU, Warp keeps the kernels that it compiles; nothing else is left behind.
+    """Examines the machine. On a GPU, Warp caches the kernels that it compiles; nothing else is left behind.
 
     Args:
       seconds: time limit of each child process.
 
     Returns:
-      Sections `versions`, `machine`, `engines`, `drawing` and `folders`. Each value is a text, or for an engine a text for each
-      stage that it came through; the text of a failure begins with "error: ".
+      Sections `versions`, `machine`, `engines`, `drawing` and `folders`. Each value is a text, or for an engine one text per
+      completed stage. The text of a failure begins with "error: ".
     """
     requested = os.environ.get("MUJOCO_GL", "")
     backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])
@@ -60,7 +60,7 @@ def examine(seconds: float) -> Report:
 
 
 def works(engine: Mapping[str, str]) -> bool:
-    """Whether a trial of an engine came to its end."""
+    """Whether a test of an engine was completed."""
     return "error" not in engine
 
 
@@ -77,7 +77,7 @@ def lines(report: Report) -> list[str]:
 
 
 def _versions() -> dict[str, str]:
-    """Versions of this library and the packages that it requires; an extra's package that is missing names the extra."""
+    """Versions of this library and its requirements. A missing package of an extra names the extra."""
     versions = {"mjx_dher": __version__, "python": platform.python_version(), "platform": platform.platform()}
     versions |= dict.fromkeys(("jax", "jaxlib", "jax-cuda12-plugin", "mujoco"), "not installed")
     with contextlib.suppress(metadata.PackageNotFoundError):  # a checkout that is not installed
@@ -92,11 +92,11 @@ def _versions() -> dict[str, str]:
 
 
 def ask(topic: str, seconds: float) -> dict[str, str]:
-    """Runs a child process, which prints one JSON object per line, and returns their union.
+    """Runs a child process, which prints one JSON object per line. Returns their union.
 
-    A failure is the value of "error", beside the results from before it.
+    A failure is the value of "error", next to earlier results.
     """
-    command = [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]  # -P: no file here takes a library's place
+    command = [sys.executable, "-P", "-m", "mjx_dher.tools.doctor", topic]  # -P: local files do not replace libraries
     variables = {
         "PYTHONPATH": os.pathsep.join(filter(None, [str(subprocesses.PACKAGE.parent), os.environ.get("PYTHONPATH")])),
         # Otherwise JAX would reserve three quarters of a GPU's memory, which a training run may be using.
@@ -111,7 +111,7 @@ def ask(topic: str, seconds: float) -> dict[str, str]:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Runs a child process: prints each result as soon as it is known, one JSON object per line."""
+    """Runs a child process, which prints each result at once as a JSON object on a line."""
     (topic,) = argv
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # for what libraries print
@@ -139,7 +139,7 @@ def _examine_machine() -> Iterator[tuple[str, str]]:
 
 
 def _try_engine(engine: str) -> Iterator[tuple[str, str]]:
-    """Tries an engine with one step of `reach`; yields the name and the duration of each stage."""
+    """Tests an engine with one step of `reach`. Yields the name and duration of each stage."""
     start = time.perf_counter()
     import jax
     import jax.numpy as jnp
@@ -152,7 +152,7 @@ def _try_engine(engine: str) -> Iterator[tuple[str, str]]:
     env = envs.make("reach", engine=engine)
     yield "build", f"{time.perf_counter() - start:.1f} s"
     if engine == "jax":  # its step takes some 20 s to compile on two cores, that of native 1 s
-        yield "step", "not tried, because it takes long to compile"
+        yield "step", "not tested, because it takes long to compile"
         return
     start = time.perf_counter()
     action = jnp.ones(env.action_size)
@@ -161,7 +161,7 @@ def _try_engine(engine: str) -> Iterator[tuple[str, str]]:
     env.check()
     moved = after.obs["achieved_goal"] - before.obs["achieved_goal"]
     if after.failed or not (moved > 0).all():
-        raise ValueError(f"a step that asks the gripper to move by 5 cm along x, y and z moved it by {moved.tolist()} m")
+        raise ValueError(f"a step must move the gripper by about 5 cm along x, y and z; it moved by {moved.tolist()} m")
     yield "step", f"{time.perf_counter() - start:.1f} s"
 
 
@@ -173,7 +173,7 @@ def _guarded(part: Callable[[], str]) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Formats a caught error in one line, with its type and place unless it is a ValueError, whose text is enough."""
+    """Formats a caught error in one line, with its type and place unless it is a ValueError."""
     text = str(error)
     if type(error) is not ValueError:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -196,7 +196,7 @@ def _originals() -> str:
 
 
 def _brief(path: str | Path) -> str:
-    """A path that can be shown to others: without the user's home folder."""
+    """A path without the user's home folder, so that it can be shared."""
     path, home = Path(path), os.path.expanduser("~")  # "~" without a home folder
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 

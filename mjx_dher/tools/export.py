@@ -1,4 +1,4 @@
-"""Export of a run's policy for other programs, as an ONNX graph or as safetensors (extra `export`).
+"""Exports a run's policy for other programs, as an ONNX graph or as safetensors (extra `export`).
 
 docs/policies.md describes both files. Neither writing nor reading them needs JAX or MuJoCo.
 """
@@ -18,13 +18,13 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 
 FORMAT_VERSION = 1  # version of names, shapes and meanings in both files
-OPSET = 17  # ONNX opset; later ones add nothing that this graph needs, and fewer programs read them
-TOLERANCE = 1e-5  # largest allowed difference between actions: float32 sums may be in another order
-CHECKED = 1000  # number of observations that a written file is checked with
+OPSET = 17  # ONNX opset; later ones add nothing to this graph, and fewer programs support them
+TOLERANCE = 1e-5  # largest allowed difference between actions, because the order of float32 sums may differ
+CHECKED = 1000  # number of observations to check a file with
 
 
 class Contents(NamedTuple):
-    """Contents of an exported file that was read back."""
+    """Contents of an exported file after reading it back."""
 
     act: Callable[[np.ndarray, np.ndarray], np.ndarray]  # (observation [N, D], goal [N, G]) -> actions [N, A]
     about: dict[str, str]  # `metadata`
@@ -32,7 +32,7 @@ class Contents(NamedTuple):
 
 
 def check(file_format: str, out: Path, overwrite: bool) -> None:
-    """Raises if the arguments are not allowed, before anything slow happens.
+    """Checks the arguments early.
 
     Raises:
       ValueError: `file_format` is unknown, its package is not installed, or `out` cannot or must not be written.
@@ -43,7 +43,7 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
 
 
 def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
-    """Returns the metadata of an exported file."""
+    """Metadata of an exported file."""
     observation_size, goal_size, action_size = sizes(policy)
     content = {
         "format": "mjx-dher policy",
@@ -66,24 +66,24 @@ def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
 
 
 def sizes(policy: Policy) -> tuple[int, int, int]:
-    """Returns the sizes of observation, goal and action: D, G and A."""
+    """Sizes D, G and A of observation, goal and action."""
     return len(policy.observation_mean), len(policy.goal_mean), len(policy.layers[-1][1])
 
 
 def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
-    """Writes the policy to `out`, reads it back, and compares. Unless it passes, an existing file stays as it was.
+    """Writes the policy to `out`, reads it back and compares. If this fails, an existing file stays unchanged.
 
     Args:
       policy: policy of the run.
       run: settings of the run, for the metadata.
       file_format: one of FORMATS.
-      out: path of the file; see `check`.
+      out: file to write; see `check`.
 
     Returns:
-      The largest difference between the actions of the file and of the policy, over CHECKED observations.
+      The largest difference between actions of the file and of the policy, over CHECKED observations.
 
     Raises:
-      ValueError: `out` cannot be written, or the file read back differs from the policy.
+      ValueError: `out` cannot be written, or the file differs from the policy.
     """
     to_bytes, read = FORMATS[file_format]
     about = metadata(policy, run)
@@ -96,7 +96,7 @@ def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
 
 
 def _compare(policy: Policy, about: dict[str, str], contents: Contents) -> float:
-    """Returns the largest difference between actions; raises ValueError if the file differs from the policy."""
+    """Largest difference between actions. Raises ValueError if the file differs from the policy."""
     if contents.about != about:
         raise ValueError(f"nothing was written: the file's metadata came back as {contents.about}")
     for name, array in policy.arrays().items():
@@ -112,10 +112,10 @@ def _compare(policy: Policy, about: dict[str, str], contents: Contents) -> float
 
 
 def observations(policy: Policy, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draws observations [number, D] and goals [number, G] to compare actions with, always the same for a policy.
+    """Draws observations [number, D] and goals [number, G] to compare actions with. Always the same for a policy.
 
-    Their distances from the mean range from a tenth to thousands of standard deviations. Every fourth is drawn with a
-    standard deviation of ten times `obs_clip` instead.
+    Their distances from the mean range from a tenth to thousands of standard deviations. Every fourth has a standard deviation
+    of ten times `obs_clip` instead.
     """
     rng = np.random.default_rng(0)
     spread = 10 ** rng.uniform(-1, 3.5, (number, 1))
@@ -159,7 +159,7 @@ def _to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
 
 
 def _operations(policy: Policy) -> Iterator[tuple[str, list[str], str, dict[str, Any]]]:
-    """Yields the graph's operations in order: ONNX operator, inputs, output and attributes."""
+    """Operations of the graph in order: ONNX operator, inputs, output and attributes."""
     for source, name in (("observation", "observation"), ("desired_goal", "goal")):
         yield "Clip", [source, "minus_obs_clip", "obs_clip"], f"{name}_clipped", {}
         yield "Sub", [f"{name}_clipped", f"{name}_mean"], f"{name}_centred", {}
@@ -204,7 +204,7 @@ def _read_safetensors(path: Path) -> Contents:
     return Contents(from_arrays(arrays).forward, about, arrays)
 
 
-# Writer and reader of each format; a format has the name of the package that it needs.
+# Writer and reader of each format, which is named after the package that it needs.
 FORMATS: dict[str, tuple[Callable[[Policy, dict[str, str]], bytes], Callable[[Path], Contents]]] = {
     "onnx": (_to_onnx, _read_onnx),
     "safetensors": (_to_safetensors, _read_safetensors),

@@ -1,4 +1,4 @@
-"""What all pictures share: line styles, and figures that need no screen. Matplotlib is loaded when the first is made."""
+"""Shared parts of all pictures: line styles, and figures without a screen. Matplotlib is loaded with the first figure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 from mjx_dher import lookup
 from mjx_dher.system import files
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart, from dark to light; each with its own line and marker.
+# Okabe and Ito's palette for colour-blind readers, from dark to light, each colour with its own line and marker.
 _STYLES = (
     ("#000000", "-", "o"),
     ("#0072B2", "--", "s"),
@@ -31,7 +31,7 @@ DPI = 130
 
 
 def check(formats: Sequence[str], feature: str = "plot") -> None:
-    """Raises ValueError if Matplotlib is not installed or a format is not one of FORMATS."""
+    """Raises ValueError if Matplotlib is not installed or a format is not in FORMATS."""
     unknown = [name for name in formats if name not in FORMATS]
     if unknown or not formats:
         raise ValueError(f"formats must be among {', '.join(FORMATS)}; got {', '.join(unknown) or 'none'}")
@@ -39,24 +39,24 @@ def check(formats: Sequence[str], feature: str = "plot") -> None:
 
 
 def is_there() -> bool:
-    """Returns whether Matplotlib is installed."""
+    """Whether Matplotlib is installed."""
     return importlib.util.find_spec("matplotlib") is not None
 
 
 @functools.cache
 def preload() -> None:
-    """Loads Matplotlib, if it is there, in a thread, for a program that waits for the device and draws later."""
+    """Loads Matplotlib in a thread, if installed, for a program that draws later."""
     if is_there():
         threading.Thread(target=importlib.import_module, args=("matplotlib.backends.backend_agg",), daemon=True).start()
 
 
 def styles(number: int) -> list[tuple[Any, Any, str]]:
-    """Returns colour, line and marker for each of `number` curves."""
+    """Colour, line and marker of each of `number` curves."""
     return [_STYLES[i % len(_STYLES)] for i in range(number)]
 
 
 def subplots(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:
-    """Makes a figure, in inches, and returns it with its axes, row by row; `options` as for Matplotlib."""
+    """Makes a figure of a size in inches. Returns it with its axes, row by row. `options` are Matplotlib's."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -68,7 +68,7 @@ def subplots(rows: int, columns: int, width: float, height: float, **options: An
 def label_success(
     figure: Any, axes: Sequence[Any], units: Sequence[str], names: Sequence[str], columns: int, title: str
 ) -> None:
-    """Labels axes of success rates over other units, and names the curves, which all axes have, below them."""
+    """Labels axes of success rates over several units, and adds one legend for all of them."""
     for axis, unit in zip(axes, units):
         axis.set_xlabel(unit)
         axis.set_xlim(left=0)
@@ -81,9 +81,9 @@ def label_success(
 
 
 def write(figure: Any, path: Path) -> None:
-    """Writes a figure in the format that the path ends in, atomically.
+    """Writes a figure atomically, in the format of the path's suffix.
 
-    There is no date in it, and ids are fixed, so that the same figure gives the same file.
+    Without dates and with fixed ids, so that equal figures give equal files.
     """
     import matplotlib
 
@@ -93,7 +93,7 @@ def write(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any, number: int) -> str:
-    """Returns a figure as an SVG element for a page, which refers to nothing outside; `number` keeps its ids apart."""
+    """A figure as a self-contained SVG element for an HTML page. `number` makes its ids unique."""
     import matplotlib
 
     text = io.StringIO()
@@ -105,5 +105,5 @@ def to_svg(figure: Any, number: int) -> str:
 
 
 def folded(title: str, width: float) -> str:
-    """Returns a title in as many lines as a figure `width` inches wide takes."""
+    """Title folded to the width of a figure, in inches."""
     return textwrap.fill(title, int(11.5 * width))

@@ -1,4 +1,4 @@
-"""An environment's functions for gymnasium, compiled once for all instances that are alike."""
+"""An environment's functions for Gymnasium, compiled once for all equal instances."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ class Programs:
     options: tuple[tuple[str, Any], ...]
     env: GoalEnv
     spec: EnvSpec
-    fps: float  # steps in a second
+    fps: float  # steps per second
     reset: Callable[[Any], State]  # seed [] -> state
     step: Callable[[State, np.ndarray], State]  # state, action [A] -> state
     reset_all: Callable[[Any], State]  # seeds [N] -> states [N, ...]
     step_all: Callable[[State, np.ndarray], State]  # states, actions [N, A] -> states
-    restart: Callable[[State, Any, Any], State]  # states, seeds [N], which to reset [N] -> states
-    ended: Callable[[State], tuple[Any, Any]]  # state, or states [N] -> terminated, truncated; bool, of that shape
+    restart: Callable[[State, Any, Any], State]  # states, seeds [N], mask of states to reset [N] -> states
+    ended: Callable[[State], tuple[Any, Any]]  # state or states [N] -> terminated, truncated; bool [] or [N]
     reward: Callable[[np.ndarray, np.ndarray], Any]  # achieved [M, G], desired [M, G] -> [M]
     reached: Callable[[Any, Any], Any]  # achieved [..., G], desired [..., G] -> bool [...]
 
     def check(self) -> None:
-        """Raises ValueError if the environment found a fault in the steps so far."""
+        """Raises ValueError if the environment found a fault in earlier steps."""
         if callable(check := getattr(self.env, "check", None)):
             check()
 
     def __reduce__(self) -> Any:
-        """Returns how a copy, or a pickle, is made: compiled functions cannot be copied, but made again, or shared."""
+        """Copies and pickles make or share the functions again, because compiled functions cannot be copied."""
         return _compile, (self.name, self.options)
 
 
 def programs(name: str, options: dict[str, Any]) -> Programs:
-    """Returns the functions that all instances of an environment share; arguments as for `envs.make`.
+    """Functions shared by all instances of an environment. Arguments are as in `envs.make`.
 
     Raises:
-      ValueError: as for `envs.make`, or an option has another name in gymnasium.
+      ValueError: as in `envs.make`, or an option has another name in Gymnasium.
     """
     if "episode_length" in options:
         raise ValueError("episode_length is called max_episode_steps in gymnasium.make and gymnasium.make_vec")
@@ -58,12 +58,12 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
     for key, value in options.items():
         if not isinstance(value, Hashable):
             raise ValueError(f"option {key} must be a single value; got {value!r}")
-    if "engine" in options or not is_import_path(name):  # auto shares the programs of the engine it stands for
+    if "engine" in options or not is_import_path(name):  # auto shares the programs of its engine
         options = {**options, "engine": resolve_engine(options.get("engine", "auto"))}
     return _compile(name, tuple(sorted(options.items())))
 
 
-@functools.lru_cache(maxsize=16)  # an environment holds its own for as long as it lives
+@functools.lru_cache(maxsize=16)  # a living environment keeps its own
 def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
     import jax
 

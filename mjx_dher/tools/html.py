@@ -1,4 +1,4 @@
-"""Pieces of a self-contained HTML page: no file, script, font or address outside of it."""
+"""Parts of a self-contained HTML page, without external files, scripts, fonts or addresses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
-LARGEST = 50_000_000  # bytes of a video that a page takes in
+LARGEST = 50_000_000  # bytes of an embedded video
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff }
@@ -33,17 +33,17 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def text(value: object) -> str:
-    """Text of a value, escaped."""
+    """Escaped text of a value."""
     return html.escape(str(value))
 
 
 def element(name: str, words: object, kind: str = "") -> str:
-    """An element such as h2, p or code around a text, of a class if one is given."""
+    """An element such as h2, p or code with a text and, if given, a class."""
     return f"<{name}{f' class={kind}' if kind else ''}>{text(words)}</{name}>"
 
 
 def facts(values: Iterable[tuple[str, str]]) -> str:
-    """Figures side by side, each with its name."""
+    """Named numbers in a row."""
     return '<div class="facts">' + "".join(f"<div>{element('b', v)}{text(name)}</div>" for name, v in values) + "</div>"
 
 
@@ -54,7 +54,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def details(summary: str, inside: str) -> str:
-    """HTML that a click opens."""
+    """Content that a click opens."""
     return f"<details>{element('summary', summary)}\n{inside}\n</details>"
 
 
@@ -64,7 +64,7 @@ def figure(content: str, caption: str = "") -> str:
 
 
 def video(path: Path) -> str:
-    """An element that holds a video, a file of one of VIDEOS."""
+    """An embedded video with a suffix in VIDEOS."""
     kind = VIDEOS[path.suffix.lower()]
     source = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
     if kind.startswith("image"):

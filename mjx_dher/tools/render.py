@@ -1,6 +1,6 @@
 """Rendering of episodes without a screen, as a video or as stills.
 
-The modules that draw are slow to import, so the functions import them.
+Functions import the modules that draw, because these are slow to import.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from mjx_dher import lookup
 from mjx_dher.system import files, private_api, signals, subprocesses
 from mjx_dher.validation import check_all
 
-MOST_FPS = 50  # frames per second of a file: what a GIF can show
-HOLD_SECONDS = 0.4  # for which an episode's last frame is shown, so that the eye can compare object and goal
+MOST_FPS = 50  # largest frame rate of a file, the limit of GIF
+HOLD_SECONDS = 0.4  # display time of an episode's last frame, to compare object and goal
 STILLS = 5  # pictures side by side in a .png
 SIZES = range(64, 2049, 2)  # allowed widths and heights, pixels; H.264 requires even ones
 GL = ("egl", "osmesa", "glfw")  # values of MUJOCO_GL on Linux, in the order in which they are tried
-GL_SECONDS = 60.0  # time limit of trying one
+GL_SECONDS = 60.0  # time limit of a test
 _DRAWN: set[str] = set()  # backends that have drawn in a child process
-GOAL_RADIUS = 0.03  # m; large enough to be seen around an object that has reached the goal
+GOAL_RADIUS = 0.03  # m; visible around an object at the goal
 GOAL_RGBA = (1.0, 0.1, 0.1, 0.6)
 
-# Options of ffmpeg for each format. GIF: one palette for all frames and no dithering, so that pixels at rest cost nothing.
+# Options of ffmpeg by format. GIF uses one palette and no dithering, so that constant pixels cost nothing.
 _PALETTE = "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
 FORMATS = {
     ".mp4": ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"],
@@ -41,7 +41,7 @@ FORMATS = {
 
 
 def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
-    """Raises ValueError for invalid arguments, before anything slow happens."""
+    """Raises ValueError early for invalid arguments."""
     sizes = [(_check_size, "width", width), (_check_size, "height", height)]
     check_all((files.check_file, out, FORMATS, overwrite), *sizes)
 
@@ -63,9 +63,9 @@ def ffmpeg() -> str:
 
 
 def choose_gl() -> str:
-    """Sets MUJOCO_GL to the first backend that can draw without a screen on this machine, and returns its name.
+    """Sets MUJOCO_GL to the first backend that can draw without a screen here, and returns its name.
 
-    If the user has set MUJOCO_GL, only that backend is tried. A backend is tried once in a process.
+    If the user has set MUJOCO_GL, only that backend is tested. A backend is tested once per process.
 
     Raises:
       ValueError: no backend works.
@@ -88,17 +88,17 @@ def choose_gl() -> str:
 
 
 def try_gl(name: str, seconds: float = GL_SECONDS) -> str | None:
-    """Reason, in one line, why MuJoCo cannot draw with MUJOCO_GL=`name`; None if it can.
+    """Reason in one line why MuJoCo cannot draw with MUJOCO_GL=`name`, or None if it can.
 
-    A child process tries it, because MuJoCo chooses only once, at its import, and a failed attempt may crash.
+    A child process tests it, because MuJoCo chooses a backend only when imported, and a failed attempt may crash.
     """
     probe = "import mujoco as m\nwith m.Renderer(m.MjModel.from_xml_string('<mujoco/>'), 16, 16) as r: r.render()"
-    variables = {"MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # nothing is worth keeping
+    variables = {"MUJOCO_GL": name, "MESA_SHADER_CACHE_DISABLE": "true"}  # no cache is needed
     return subprocesses.ask([sys.executable, "-P", "-c", probe], variables, seconds).failure
 
 
 def check_drawable(env: Any) -> None:
-    """Raises ValueError unless `env` has what `record_episodes` and `draw_frames` need."""
+    """Raises ValueError unless `env` has the attributes that `record_episodes` and `draw_frames` need."""
     import jax
 
     start = jax.eval_shape(env.reset, jax.random.key(0))
@@ -112,7 +112,7 @@ def check_drawable(env: Any) -> None:
 def goal_marks(env: Any, qpos: np.ndarray, goal: np.ndarray) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Marks of a goal [G]: the environment's `goal_marks`, else a ball at a goal of size 3, else none.
 
-    A mark is a body, or -1 for a ball, its position [3], m, and its orientation [4] (w, x, y, z).
+    A mark is a body, or -1 for a ball, its position [3] in m, and its orientation [4] (w, x, y, z).
     """
     if hasattr(env, "goal_marks"):
         return env.goal_marks(qpos, goal)
@@ -128,10 +128,10 @@ def record_episodes(
       env: an environment with a MuJoCo `model` and states with `physics.qpos`.
       act: (observations [N, ...], key) -> actions [N, A].
       seed: seed of starts, goals and the keys of `act`.
-      num_episodes: N.
+      num_episodes: number of episodes N.
 
     Returns:
-      qpos [N, T+1, nq] in the layout of the model, desired goals [N, G], success at the end [N].
+      qpos [N, T+1, nq] in the layout of the model, desired goals [N, G], and success at the end [N].
 
     Raises:
       ValueError: the environment cannot be drawn.
@@ -154,7 +154,9 @@ def record_episodes(
 
 
 def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
-    """Yields the frames [height, width, 3] uint8 of all episodes, the last of each for `HOLD_SECONDS`. Arguments: `stills`."""
+    """Yields frames [height, width, 3] uint8 of all episodes, and holds each last one for `HOLD_SECONDS`. Arguments as in
+    `stills`.
+    """
     for episode, goal in zip(qpos, goals):
         for frame in draw_frames(env, episode, goal, width, height):
             yield frame
@@ -163,21 +165,21 @@ def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int,
 
 
 def stills(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Draws pictures of the first episode, from start to end, side by side: [height, STILLS * width, 3] uint8.
+    """Draws pictures of the first episode side by side, from start to end: [height, STILLS * width, 3] uint8.
 
     Args:
       env: the environment.
-      qpos: [N, T+1, nq].
-      goals: [N, G].
-      width, height: size of one picture, pixels.
+      qpos: configurations [N, T+1, nq].
+      goals: goals [N, G].
+      width, height: size of one picture in pixels.
     """
-    # Closer together at first, when a trained policy moves most.
+    # Closer together at the start, where a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)
     return np.concatenate(list(draw_frames(env, qpos[0, chosen], goals[0], width, height)), axis=1)
 
 
 def draw_frames(env: Any, qpos: Iterable[np.ndarray], goal: np.ndarray, width: int, height: int) -> Iterator[np.ndarray]:
-    """Yields a picture [height, width, 3] uint8 of each configuration [nq]; arguments as for `Painter`."""
+    """Yields a picture [height, width, 3] uint8 of each configuration [nq]. Arguments as in `Painter`."""
     with contextlib.closing(Painter(env, width, height)) as painter:
         for configuration in qpos:
             yield painter.draw(configuration, goal)
@@ -187,8 +189,8 @@ class Painter:
     """Draws configurations of a model. Close it before the program ends.
 
     Args:
-      env: an environment with a `mujoco.MjModel`, `model`, whose camera "front" looks at it; else a free camera does.
-      width, height: size of a picture, pixels.
+      env: an environment with a `mujoco.MjModel` as `model`. Its camera "front" is used if it exists, else a free camera.
+      width, height: size of a picture in pixels.
 
     Raises:
       ValueError: MuJoCo cannot draw in this process.
@@ -197,18 +199,18 @@ class Painter:
     def __init__(self, env: Any, width: int, height: int):
         import mujoco
 
-        model = copy.copy(env.model)  # the buffer size is set below; that of the environment's model must not change
+        model = copy.copy(env.model)  # the environment's buffer size must not change
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._env, self._model, self._data = env, model, mujoco.MjData(model)
         backend = choose_gl()
         try:
             with private_api.drawing_with(backend):
                 self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # of any library that draws
+        except Exception as error:  # from any drawing library
             raise ValueError(f"MuJoCo cannot draw in this process with MUJOCO_GL={backend}: {error}") from error
 
     def draw(self, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """A picture [height, width, 3] uint8 of a configuration [nq], with the goal [G] as a red ball or ghost."""
+        """Picture [height, width, 3] uint8 of a configuration [nq], with the goal [G] as a red ball or ghost."""
         import mujoco
 
         self._data.qpos[:] = qpos
@@ -247,13 +249,13 @@ class Painter:
 
 
 def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Writes `frames`, [height, width, 3] uint8 each and `fps` a second, in the format of the suffix of `out`.
+    """Writes frames, [height, width, 3] uint8 each, in the format of the suffix of `out`.
 
-    Of more than `MOST_FPS` frames a second some are left out. An error leaves an existing file as it was.
-    (imageio_ffmpeg.write_frames reports no error if ffmpeg fails at the end.)
+    Above `MOST_FPS` frames per second, some are left out. After an error an existing file is unchanged.
+    (imageio_ffmpeg.write_frames does not report a failure of ffmpeg at the end.)
 
     Raises:
-      ValueError: the file cannot be written; the message includes ffmpeg's.
+      ValueError: the file cannot be written. The message includes ffmpeg's.
     """
     frames = iter(frames)
     first = next(frames)

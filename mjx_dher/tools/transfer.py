@@ -1,4 +1,4 @@
-"""Zero-shot transfer to the original Fetch and hand tasks, which need an older MuJoCo in a virtual environment of its own.
+"""Zero-shot transfer to the original Fetch tasks, which need an older MuJoCo in a separate virtual environment.
 
 In that environment this file is a program that plays episodes and prints their outcomes. It needs gymnasium-robotics and
 NumPy, but neither JAX nor this library's MuJoCo:
@@ -50,10 +50,10 @@ def default_environment() -> Path:
 
 
 def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
-    """Creates a virtual environment with the original tasks, unless it is complete already.
+    """Creates a virtual environment with the original tasks, unless it is complete.
 
     Raises:
-      ValueError: pip failed; the message includes its output.
+      ValueError: pip failed. The message includes its output.
     """
     if is_ready(interpreter(environment), requirements):
         return
@@ -76,11 +76,11 @@ def check_original(env_name: str, python: Path) -> str:
       ValueError: the task has no original, or `python` does not have the original tasks.
     """
     if env_name not in ORIGINALS:
-        raise ValueError(f"{env_name} has no original to transfer to; the tasks that have: {', '.join(ORIGINALS)}")
+        raise ValueError(f"{env_name} has no original to transfer to; tasks with an original: {', '.join(ORIGINALS)}")
     if not is_ready(python):
         raise ValueError(
-            f"the original tasks need {' and '.join(REQUIREMENTS)} in a virtual environment of their own, and {python} does"
-            " not have them: create one with --set-up (a download of 200 MB), or name the Python of yours with --python"
+            f"the original tasks need {' and '.join(REQUIREMENTS)} in a separate virtual environment, and {python} does"
+            " not have them: create one with --set-up (a download of 200 MB), or pass your Python with --python"
         )
     return ORIGINALS[env_name]
 
@@ -88,16 +88,23 @@ def check_original(env_name: str, python: Path) -> str:
 def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) -> dict[str, np.ndarray]:
     """Plays a run's policy in its original task, in `workers` processes of another Python.
 
+    Args:
+      run: run folder.
+      python: Python of the virtual environment.
+      episodes: number of episodes.
+      seed: seed of the first episode. Others follow.
+      workers: number of processes.
+
     Returns:
       Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.
 
     Raises:
-      ValueError: a process failed; the message includes the end of its output.
+      ValueError: a process failed. The message includes the end of its output.
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]
     with files.temporary_folder("mjx-dher-transfer-") as folder, contextlib.ExitStack() as stack:
-        # A folder with this package only, without its neighbours: the other Python has its own NumPy and MuJoCo.
+        # A folder with only this package, because the other Python has its own NumPy and MuJoCo.
         (folder / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
         processes = []
         for first, end in itertools.pairwise(bounds):
@@ -114,7 +121,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
 
 
 def play_original(run: Path, episodes: int, first_seed: int) -> dict[str, list[Any]]:
-    """Plays a run's policy in its original task in this process: episode i uses the seed `first_seed` + i."""
+    """Plays a run's policy in its original task in this process. Episode i uses the seed `first_seed` + i."""
     warnings.filterwarnings("ignore")
     import gymnasium
     import gymnasium_robotics
