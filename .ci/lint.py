@@ -7,7 +7,7 @@ ruff checks style, mypy types, and lint-imports the layers. This script checks t
 - lengths of files and functions
 - names that say nothing
 - public functions and constants of the algorithm that only their own module uses, and the index of public names
-- habits of wording that make prose hard to read, per 1,000 words (lower the limit as the tree improves)
+- prose that is hard to read, by prose.py (lower the limits as the tree improves)
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import argparse
 import ast
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import prose
 
 ROOT = Path(__file__).resolve().parents[1]
 FILE_LINES = 350
@@ -33,21 +34,13 @@ Every public name of the algorithm's modules. `python .ci/lint.py --write-names`
 |---|---|---|
 """
 MAX_VALUE = 60  # characters of a constant's value in the table
-HABITS_PER_1000_WORDS = {"pages": 8.0, "docstrings": 6.0}
+HABITS_PER_1000_WORDS = {"pages": 2.5, "docstrings": 6.0}
+LONG_SENTENCES = {"pages": 0.05, "docstrings": 0.05}  # share
 CORE = {
     *("types", "config", "validation", "spec", "context", "replay", "samplers", "relabel", "normalizer", "networks"),
     *("contract", "rollout", "evaluate", "trainer", "learners", "contrib", "distance_normalization", "priorities"),
     "demonstrations",
 }
-HABITS = re.compile(
-    r"\b(?:of|with|in|by|from|to|for|on|and|says?|than|as|is|are|has|have|gives?|returns?|takes?|sees?) what\b"
-    r"|(?:^|[.;:] )what\b(?![^.?!]*\?)|\breturns? (?:whether|how|by what|which)\b"  # a clause in place of a noun
-    r"|[;,] (?:None|nothing|all|none) where\b|\bwhere (?:there (?:is|are)|it (?:is|has|was|does)|none|no )\b"  # if, when
-    r"|\b(?:of|with) (?:one's|your|its|their|a user's|our) own\b|\bone's own\b"  # custom
-    r"|\b(?:anew|likewise|hence|so many|as such|but for|save for|all but|by name|refuse[sd]?|go(?:es)? on|told|lest|mends?)\b",
-    re.MULTILINE | re.IGNORECASE,
-)
-
 Add = Callable[[Path, int, str], None]
 
 
@@ -148,51 +141,21 @@ def names_page(names: list[tuple[Path, ast.stmt, str]]) -> str:
     return NAMES_HEAD + "\n".join(re.sub(r"(?<=\w) *\|(?= *\w)", " or ", line) for line in lines) + "\n"
 
 
-def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-            text = ast.get_docstring(node)
-            yield from [(node.body[0].lineno, text)] if text else []
-
-
-def paragraphs(path: Path) -> Iterator[tuple[int, str]]:
-    """A page's lines with their numbers; without code, tables and addresses."""
-    text = re.sub(
-        r"```.*?```|<!--.*?-->", lambda match: re.sub(r"[^\n]", "", match[0]), path.read_text(encoding="utf-8"), flags=re.DOTALL
-    )
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.lstrip().startswith(("|", "![", "    ")):
-            yield number, re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)
-
-
 def check_prose(trees: dict[Path, ast.Module], add: Add, listing: bool) -> Iterator[str]:
-    kinds = {
-        "pages": [(path, *piece) for path in pages() for piece in paragraphs(path)],
-        "docstrings": [(path, *piece) for path, tree in trees.items() for piece in docstrings(tree)],
-    }
-    for kind, pieces in kinds.items():
-        words, habits = Counter[Path](), Counter[Path]()
-        for path, line, text in pieces:
-            plain = re.sub(r"`[^`]*`", "code", text)
-            words[path] += len(plain.split())
-            for match in HABITS.finditer(plain):
-                habits[path] += 1
-                if listing:
-                    add(path, line + plain.count("\n", 0, match.start()), f"{match[0].strip()!r} is hard to read")
-        rate, limit = 1000 * habits.total() / words.total(), HABITS_PER_1000_WORDS[kind]
-        if rate > limit:
-            path = max(habits, key=lambda path: habits[path])
-            add(
-                path,
-                1,
-                f"{kind} have {rate:.2f} hard-to-read habits per 1,000 words; the limit is {limit} (this file: {habits[path]})",
-            )
-        yield f"{kind}: {rate:.2f} hard-to-read habits per 1,000 words (limit {limit})"
+    for kind, paths in {"pages": pages(), "docstrings": list(trees)}.items():
+        found = prose.count(paths)
+        rate, share = 1000 * len(found.habits) / found.words, len(found.long) / found.sentences
+        if rate > HABITS_PER_1000_WORDS[kind] or share > LONG_SENTENCES[kind]:
+            limits = f"{HABITS_PER_1000_WORDS[kind]} habits and {100 * LONG_SENTENCES[kind]:.0f} % are allowed"
+            add(paths[0], 1, f"{kind} are hard to read: {found}; {limits} (--list)")
+        yield f"{kind}: {found}"
+        if listing:
+            yield from found.habits + found.long
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--list", action="store_true", help="print each habit that is counted")
+    parser.add_argument("--list", action="store_true", help="print each habit and each long sentence")
     parser.add_argument("--write-names", action="store_true", help=f"write {NAMES_PAGE.relative_to(ROOT)}")
     arguments = parser.parse_args()
     violations = []
