@@ -15,7 +15,6 @@ from mjx_dher.envs.engines.fused.memory import carve
 from mjx_dher.envs.engines.fused.model import Memory
 from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps
 from mjx_dher.envs.engines.fused.sparse import sparse_of
-from mjx_dher.envs.engines.fused.support import unsupported
 from mjx_dher.system.warp_setup import wp
 
 TASKS = ["slide", *(pytest.param(task, marks=pytest.mark.slow) for task in ("reach", "push", "pick_and_place"))]
@@ -171,107 +170,6 @@ def test_fields_of_memory_follow_one_another():
         assert begin["mass"] >= begin["pos"] + model.nv**2  # neither of them reaches into what stays
         assert 0 <= layout.size - begin["change"] - rows <= 1
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
-
-
-SHAPES = (
-    *('<geom type="box" size="0.05 0.04 0.06"/>', '<geom type="sphere" size="0.06"/>'),
-    *('<geom type="capsule" size="0.06 0.05"/>', '<geom type="capsule" size="0.06 0.05" euler="90 10 0"/>'),
-)
-
-
-EGG = '<geom type="ellipsoid" size="0.06 0.05 0.08"/>'
-
-
-def robot(seed):
-    """A chain with several joints a body, boxes and a floor that meet by contype, servos and motors: all at random.
-
-    Half of them have friction, tendons, and equalities of joints and tendons.
-    """
-    rng = np.random.default_rng(seed)
-
-    def numbers(size, low=-1.0, high=1.0):
-        return " ".join(f"{x:.3f}" for x in rng.uniform(low, high, size))
-
-    def some(text):
-        return text if rng.random() < 0.5 else ""
-
-    chain, motors, names = "", "", []
-    few = seed % 2 == 0  # whether there are rows with few terms
-    for link in range(4):
-        joints = ""
-        for j in range(rng.integers(1, 4)):
-            name, kind = f"j{link}{j}", rng.choice(["hinge", "hinge", "slide"])
-            names.append(name)
-            joints += (
-                f'<joint name="{name}" type="{kind}" axis="{numbers(3)}" pos="{numbers(3, -0.1, 0.1)}"'
-                f' damping="{numbers(1, 0.1, 1)}" armature="{numbers(1, 0.05, 0.1)}"'
-                f" {some(f'stiffness={chr(34)}{numbers(1, 0, 2)}{chr(34)}')}"
-                f" {some(f'range={chr(34)}-0.3 0.3{chr(34)}')} {some(f'actuatorfrcrange={chr(34)}-0.5 0.7{chr(34)}')}"
-                f" {some(f'frictionloss={chr(34)}{numbers(1, 0, 0.3)}{chr(34)}') if few else ''}/>"
-            )
-            motors += rng.choice(
-                [
-                    f'<position joint="{name}" kp="{numbers(1, 1, 20)}" kv="{numbers(1, 0, 2)}" gear="{numbers(1)}"/>',
-                    f'<motor joint="{name}" gear="{numbers(1, -2, 2)}" forcerange="-0.3 0.4" ctrlrange="-0.5 0.5"/>',
-                    f'<general joint="{name}" gainprm="3" biastype="affine" biasprm="0.1 -2 -1" forcerange="-1 1"/>',
-                ]
-            )
-        chain += f'<body pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
-    boxes = "".join(
-        f'<body pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/>{(rng.choice(SHAPES) if i or seed % 4 else EGG)[:-2]}'
-        f' name="o{i}"'
-        f' priority="{rng.integers(2)}" friction="{numbers(1, 0.3, 1)} 0.02 0.01" condim="{rng.choice([1, 3, 4, 6])}"'
-        f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'
-        for i in range(2)
-    )
-    pairs = "".join(
-        f'<pair geom1="{geom1}" geom2="{geom2}" condim="{rng.choice([1, 3, 4, 6])}"'
-        f' friction="{numbers(2, 0.3, 1)} {numbers(3, 0.01, 0.1)}"'
-        f' margin="{numbers(1, 0, 0.01)}" gap="{numbers(1, 0, 0.02)}" solref="-900 -40" solimp="0.8 0.9 0.01 0.4 3"/>'
-        for geom1, geom2 in (("floor", "o0"), ("o1", "o0"))
-    )
-    tendons, equal = "", ""
-    for number in range(4):
-        terms = "".join(f'<joint joint="{name}" coef="{numbers(1)}"/>' for name in rng.permutation(names)[: 1 + number])
-        friction = some('frictionloss="0.2" solreffriction="0.03 1.5"')
-        tendons += f'<fixed name="t{number}" range="-0.05 0.1" margin="0.01" {friction}>{terms}</fixed>'
-    first, second, third = rng.permutation(names)[:3]
-    equal += f'<joint joint1="{first}" joint2="{second}" polycoef="{numbers(5, -0.1, 0.1)}" solref="0.05 1"/>'
-    equal += f'<joint joint1="{third}" polycoef="0.05 0 0 0 0"/><tendon tendon1="t0" tendon2="t2" polycoef="{numbers(5)}"/>'
-    few_terms = f"<tendon>{tendons}</tendon><equality>{equal}</equality>" if few else ""
-    return mujoco.MjModel.from_xml_string(
-        f'''<mujoco>{few_terms}
-<option integrator="{rng.choice(["Euler", "implicitfast"])}" tolerance="1e-12" ccd_tolerance="1e-9"/>
-<worldbody>
-<body name="t" mocap="true"/><geom name="floor" type="plane" size="2 2 0.1"/>{boxes}
-<body pos="0 0 0.3">{chain}{"</body>" * 5}</worldbody><contact>{pairs}</contact><actuator>{motors}</actuator></mujoco>'''
-    )
-
-
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
-def test_a_timestep_of_a_random_robot_is_mujoco_c_s(seed, monkeypatch):
-    """With two of four seeds, pairs that are near are looked for, as in models with many pairs."""
-    monkeypatch.setattr(setup, "FEW", 64 * (seed % 4 // 2))
-    model = robot(seed)
-    assert unsupported(model) == []
-    rng = np.random.default_rng(seed)
-    data = mujoco.MjData(model)
-    qpos, qvel = np.tile(model.qpos0, (NUM, 1)), 0.3 * rng.standard_normal((NUM, model.nv))
-    qpos[:, 14:] += 0.2 * rng.standard_normal((NUM, model.nq - 14))
-    qpos[:, [0, 1, 7, 8]] += 0.1 * rng.standard_normal((NUM, 4))
-    qpos[:, [*range(3, 7), *range(10, 14)]] += 0.02 * rng.standard_normal((NUM, 8))  # no parallel capsules
-    inputs = np.concatenate([np.tile([0, 0, 0, 1, 0, 0, 0], (NUM, 1)), rng.uniform(-1, 1, (NUM, model.nu))], axis=1)
-    there = in_c(model, qpos, qvel, inputs)
-    here = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]
-    state = floats(qpos), floats(qvel), floats(np.zeros((NUM, model.nv)))
-    simulation = Simulation(model, NUM, substeps=1)
-    simulation.advance(state, floats(inputs), tuple(here))
-    assert simulation.overflow() == 0
-    assert there[0].max() > 12
-    assert data.nefc == 0
-    for name, a, b, scale in zip(("qpos", "qvel", "qacc"), here, there[:0:-1], (1e-6, 1e-4, 1e-4)):
-        error = np.quantile(np.abs(a.numpy() - b).max(axis=1), 0.8)
-        assert error < scale * np.abs(b).max(), name
 
 
 def test_most_rows_are_what_all_pairs_can_give_at_once():

@@ -67,7 +67,7 @@ def test_unsupported_features_are_named_with_their_elements():
         (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints"]),
         (welded(motor.format('dyntype="filter"')), ["activations", "actuators with a state", "'m'"]),
         (welded(motor.format('delay="0.006" nsample="4"')), ["delays", "'m'"]),
-        (welded('<equality><connect name="c" body1="b" anchor="0 0 0"/></equality>'), ["other than one weld", "'c'"]),
+        (welded('<equality><weld name="c" body1="b" torquescale="2"/></equality>'), ["equality constraints other than", "'c'"]),
         (mujoco.MjModel.from_xml_string("<mujoco/>"), ["degrees of freedom"]),
     ]
     for model, parts in cases:

@@ -1,6 +1,6 @@
-"""Rows of constraints of a substep: the weld, joint limits, contacts.
+"""Rows of constraints of a substep: welds, connected bodies, joint limits, contacts.
 
-A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' qvel for the weld), as far as its weight
+A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' qvel for equalities), as far as its weight
 D = imp / ((1 - imp) times its inverse inertia) has it: https://mujoco.readthedocs.io/en/3.17.0/computation/index.html.
 """
 
@@ -72,50 +72,74 @@ def _at(motion: wp.spatial_vector, arm: wp.vec3) -> wp.vec3:
 
 @wp.func
 def weld(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
-    """Sets the first six rows: the target's position less the body's, and the rotation between them. Without a weld they have
-    no weight.
-    """
-    body, target, nv = world.weld_body, world.weld_target, dofs.number
-    if body < 0:
-        for i in range(thread, 6 * nv, threads):
-            memory.jacobian[i] = 0.0
-        for k in range(thread, 6, threads):
-            memory.weight[k] = 0.0
-            memory.residual[k] = 0.0
-        return
-    arm = memory.pos[body] - memory.pos[bodies.root[body]]
-    q = memory.quat[body]
-    inverse = wp.vec4(q[0], -q[1], -q[2], -q[3])
-    goal = memory.quat[target]
-    moved_by = bodies.moved_by[body]
-    for i in range(thread, nv, threads):
-        along, about = wp.vec3(0.0), wp.vec3(0.0)
-        if (moved_by >> i) & 1 == 1:
-            motion = memory.motion[i]
-            along = -_at(motion, arm)
-            axis = wp.spatial_top(motion)
-            turn = times(times(inverse, wp.vec4(0.0, axis[0], axis[1], axis[2])), goal)
-            about = -0.5 * wp.vec3(turn[1], turn[2], turn[3])
-        for k in range(3):
-            memory.jacobian[k * nv + i] = along[k]
-            memory.jacobian[(3 + k) * nv + i] = about[k]
-    for k in range(thread, 3, threads):
-        place = memory.pos[target] - memory.pos[body]
-        between = times(inverse, goal)
-        turn_left = wp.vec3(between[1], between[2], between[3])
-        depth = wp.sqrt(wp.length_sq(place) + wp.length_sq(turn_left))
-        velocity = memory.velocity[body]
-        bias = memory.bias[body]
-        omega, alpha = wp.spatial_top(velocity), wp.spatial_top(bias)
-        speed = _at(velocity, arm)
-        spin = times(times(inverse, wp.vec4(0.0, omega[0], omega[1], omega[2])), goal)
-        # With qacc 0: the body's acceleration, and the second derivative of the turn.
-        bend = _at(bias, arm) + wp.cross(omega, speed)
-        curl = times(times(inverse, wp.vec4(0.25 * wp.dot(omega, omega), 0.5 * alpha[0], 0.5 * alpha[1], 0.5 * alpha[2])), goal)
-        _ask(memory, k, world.weld_soft, place[k], depth, world.weld_weight[0], -speed[k])
-        memory.residual[k] = memory.residual[k] + bend[k]
-        _ask(memory, 3 + k, world.weld_soft, turn_left[k], depth, world.weld_weight[1], -0.5 * spin[k + 1])
-        memory.residual[3 + k] = memory.residual[3 + k] + curl[k + 1]
+    """Sets six rows of each weld: the target's position less the body's, and the rotation between them."""
+    nv = dofs.number
+    for w in range(world.welds):
+        body, target, row = world.weld_body[w], world.weld_target[w], 6 * w
+        arm = memory.pos[body] - memory.pos[bodies.root[body]]
+        q = memory.quat[body]
+        inverse = wp.vec4(q[0], -q[1], -q[2], -q[3])
+        goal = memory.quat[target]
+        moved_by = bodies.moved_by[body]
+        for i in range(thread, nv, threads):
+            along, about = wp.vec3(0.0), wp.vec3(0.0)
+            if (moved_by >> i) & 1 == 1:
+                motion = memory.motion[i]
+                along = -_at(motion, arm)
+                axis = wp.spatial_top(motion)
+                turn = times(times(inverse, wp.vec4(0.0, axis[0], axis[1], axis[2])), goal)
+                about = -0.5 * wp.vec3(turn[1], turn[2], turn[3])
+            for k in range(3):
+                memory.jacobian[(row + k) * nv + i] = along[k]
+                memory.jacobian[(row + 3 + k) * nv + i] = about[k]
+        for k in range(thread, 3, threads):
+            place = memory.pos[target] - memory.pos[body]
+            between = times(inverse, goal)
+            turn_left = wp.vec3(between[1], between[2], between[3])
+            depth = wp.sqrt(wp.length_sq(place) + wp.length_sq(turn_left))
+            bias = memory.bias[body]
+            omega, alpha = wp.spatial_top(memory.velocity[body]), wp.spatial_top(bias)
+            speed = _at(memory.velocity[body], arm)
+            spin = times(times(inverse, wp.vec4(0.0, omega[0], omega[1], omega[2])), goal)
+            # With qacc 0: the body's acceleration, and the second derivative of the turn.
+            bend = _bend(memory, body, arm)
+            twist = wp.vec4(0.25 * wp.dot(omega, omega), 0.5 * alpha[0], 0.5 * alpha[1], 0.5 * alpha[2])
+            curl = times(times(inverse, twist), goal)
+            _ask(memory, row + k, world.weld_soft[w], place[k], depth, world.weld_weight[w][0], -speed[k])
+            memory.residual[row + k] = memory.residual[row + k] + bend[k]
+            _ask(memory, row + 3 + k, world.weld_soft[w], turn_left[k], depth, world.weld_weight[w][1], -0.5 * spin[k + 1])
+            memory.residual[row + 3 + k] = memory.residual[row + 3 + k] + curl[k + 1]
+
+
+@wp.func
+def _bend(memory: Memory, body: int, arm: wp.vec3) -> wp.vec3:
+    """Acceleration of a point of a body with qacc 0, without gravity; its offset from the tree's origin is `arm`."""
+    velocity = memory.velocity[body]
+    return _at(memory.bias[body], arm) + wp.cross(wp.spatial_top(velocity), _at(velocity, arm))
+
+
+@wp.func
+def connect(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
+    """Sets three rows of each pair of connected bodies: the first one's anchor less the second one's."""
+    nv = dofs.number
+    for c in range(world.connects):
+        body1, body2, row = world.connect_body1[c], world.connect_body2[c], world.equalities - 3 * (world.connects - c)
+        place1 = memory.pos[body1] + memory.mat[body1] * world.connect_anchor1[c]
+        place2 = memory.pos[body2] + memory.mat[body2] * world.connect_anchor2[c]
+        moved1, moved2 = bodies.moved_by[body1], bodies.moved_by[body2]
+        for i in range(thread, nv, threads):
+            origin = memory.pos[bodies.root[dofs.body[i]]]
+            along = float((moved1 >> i) & 1) * _at(memory.motion[i], place1 - origin)
+            along -= float((moved2 >> i) & 1) * _at(memory.motion[i], place2 - origin)
+            for k in range(3):
+                memory.jacobian[(row + k) * nv + i] = along[k]
+        for k in range(thread, 3, threads):
+            apart = place1 - place2
+            arm1, arm2 = place1 - memory.pos[bodies.root[body1]], place2 - memory.pos[bodies.root[body2]]
+            speed = _at(memory.velocity[body1], arm1) - _at(memory.velocity[body2], arm2)
+            bend = _bend(memory, body1, arm1) - _bend(memory, body2, arm2)
+            _ask(memory, row + k, world.connect_soft[c], apart[k], wp.length(apart), world.connect_weight[c], speed[k])
+            memory.residual[row + k] = memory.residual[row + k] - bend[k]
 
 
 @wp.func
@@ -129,7 +153,7 @@ def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: w
         memory.touching[s] = wp.where(memory.distance[s] < contacts.margin[pair], _edges(contacts.dim[pair]), 0)
     sync(threads)
     if thread == 0:
-        rows = int(6)
+        rows = int(world.equalities)
         for k in range(dofs.limits):
             memory.limited[k] = -1
             if _past_limit(dofs, memory, k) < 0.0:

@@ -3,7 +3,7 @@
 import functools
 from typing import Any
 
-from mjx_dher.envs.engines.fused.constraints import limit, number, press, touch, weld
+from mjx_dher.envs.engines.fused.constraints import connect, limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
 from mjx_dher.envs.engines.fused.ellipsoid import collide_ellipsoids
@@ -180,6 +180,7 @@ def _constraining(kinds: tuple[int, ...], edges: int, few: bool, warps: int) -> 
         number(world, dofs, held, memory, lost, thread, threads)
         gather(wp.static(warps))
         weld(world, bodies, dofs, memory, thread, threads)
+        connect(world, bodies, dofs, memory, thread, threads)
         gather(wp.static(warps))
         limit(dofs, held, memory, thread, threads)
         gather(wp.static(warps))

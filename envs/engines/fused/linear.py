@@ -23,7 +23,7 @@ _ON_A_GPU = """
         }
         for (int row = 0; row < rows; ++row) {
             const float lacks = residual.data[row];
-            if (row < 6 || lacks < 0.0f) {
+            if (row < equal || lacks < 0.0f) {
                 const float* const j_row = jacobian.data + row * n;
                 const float w = weight.data[row], left = w * lacks;
                 #pragma unroll
@@ -110,7 +110,7 @@ _ON_A_CPU = """
     }
     for (int row = 0; row < rows; ++row) {
         const float lacks = residual.data[row], w = weight.data[row], left = w * lacks;
-        if (row < 6 || lacks < 0.0f) {
+        if (row < equal || lacks < 0.0f) {
             const float* const j_row = jacobian.data + row * n;
             for (int i = 0; i < n; ++i) {
                 solution.data[i] -= j_row[i] * left;
@@ -154,6 +154,7 @@ def direction(
     solution: wp.array(dtype=float),
     n: int,
     rows: int,
+    equal: int,
     stiff: int,
     summed: int,
     thread: int,
@@ -161,7 +162,7 @@ def direction(
 ) -> float:
     """Solves (M + J' D J) x = right - J' D residual, without J' D J if `stiff` is 0.
 
-    D is the weight of rows that act: the first six, and those whose residual is below 0.
+    D is the weight of rows that act: the first `equal` ones, and those whose residual is below 0.
 
     Args:
       matrix: M [n * n], symmetric.

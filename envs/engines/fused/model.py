@@ -126,10 +126,19 @@ class World:
 
     timestep: float
     gravity: wp.vec3
-    weld_body: int  # -1 if there is no weld
-    weld_target: int
-    weld_soft: Softness
-    weld_weight: wp.vec2  # inverse inertia of translation and rotation
+    equalities: int  # rows of welds and of connected bodies, which come first
+    welds: int  # of each, by its number:
+    weld_body: _ints
+    weld_target: _ints
+    weld_soft: _soft
+    weld_weight: wp.array(dtype=wp.vec2)  # inverse inertia of translation and rotation
+    connects: int
+    connect_body1: _ints
+    connect_body2: _ints
+    connect_anchor1: _vec3s  # in the body's frame
+    connect_anchor2: _vec3s
+    connect_soft: _soft
+    connect_weight: _floats
     rows: int  # of constraints that there is room for
     tolerance: float
     iterations: int  # of Newton's method, at most

@@ -30,6 +30,7 @@ CONTACT_KINDS = {
 }  # types of two geoms -> (kind, most contacts)
 FEW = 64  # contacts of all pairs, up to which there is memory for all of them
 _NEAR, _NEAR_SLOTS = 64, 192  # pairs that may be near at once in other models, and slots for their contacts
+CONNECT, WELD, JOINT, TENDON = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT", "TENDON"))
 _JOINTS = {
     int(mujoco.mjtJoint.mjJNT_HINGE): kinds.HINGE,
     int(mujoco.mjtJoint.mjJNT_SLIDE): kinds.SLIDE,
@@ -142,8 +143,7 @@ def bodies_of(model: mujoco.MjModel) -> Any:
 
 def is_sparse(model: mujoco.MjModel) -> bool:
     """Whether the model has rows of `Sparse`. Limits of joints are then among them."""
-    equal = np.isin(model.eq_type, [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)])
-    return bool(np.any(model.dof_frictionloss > 0) or model.ntendon or np.any(equal))
+    return bool(np.any(model.dof_frictionloss > 0) or model.ntendon or np.any(model.eq_type >= JOINT))
 
 
 def dofs_of(model: mujoco.MjModel) -> Any:
@@ -266,18 +266,34 @@ def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]
 
 def other_rows(model: mujoco.MjModel) -> int:
     """The most rows of `Memory.jacobian` that are not of contacts."""
-    return 6 + (0 if is_sparse(model) else int(np.count_nonzero(model.jnt_limited)))
+    equal = 6 * np.count_nonzero(model.eq_type == WELD) + 3 * np.count_nonzero(model.eq_type == CONNECT)
+    return int(equal) + (0 if is_sparse(model) else int(np.count_nonzero(model.jnt_limited)))
+
+
+def _equalities_of(model: mujoco.MjModel, links: _Links) -> dict[str, Any]:
+    """The fields of `World` that describe welds and connected bodies."""
+    welds, connects = np.flatnonzero(model.eq_type == WELD), np.flatnonzero(model.eq_type == CONNECT)
+    first, second = model.eq_obj1id, model.eq_obj2id
+    inverse = [model.body_invweight0[first[each]] + model.body_invweight0[second[each]] for each in (welds, connects)]
+    return {
+        "equalities": 6 * len(welds) + 3 * len(connects),
+        "welds": len(welds),
+        "weld_body": links.last[second[welds]],
+        "weld_target": links.last[first[welds]],
+        "weld_soft": [softness(model, model.eq_solref[eq], model.eq_solimp[eq]) for eq in welds],
+        "weld_weight": inverse[0],
+        "connects": len(connects),
+        "connect_body1": links.last[first[connects]],
+        "connect_body2": links.last[second[connects]],
+        "connect_anchor1": model.eq_data[connects, :3],
+        "connect_anchor2": model.eq_data[connects, 3:6],
+        "connect_soft": [softness(model, model.eq_solref[eq], model.eq_solimp[eq]) for eq in connects],
+        "connect_weight": inverse[1][:, 0],
+    }
 
 
 def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     """Returns `World` of a model, with room for up to `most_rows` rows of constraints."""
-    welds = {}
-    for eq in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
-        body, target = int(model.eq_obj2id[eq]), int(model.eq_obj1id[eq])
-        welds = {
-            "weld_soft": softness(model, model.eq_solref[eq], model.eq_solimp[eq]),
-            "weld_weight": wp.vec2(*(model.body_invweight0[body] + model.body_invweight0[target])),
-        }
     links = links_of(model)
     edges = edges_of(contacts.dim.numpy()[contacts.pair.numpy()])
     contact_rows = int(np.sort(edges)[len(edges) - contacts.slots :].sum())
@@ -285,9 +301,7 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
         World,
         timestep=model.opt.timestep,
         gravity=wp.vec3(*model.opt.gravity),
-        weld_body=int(links.last[body]) if welds else -1,
-        weld_target=int(links.last[target]) if welds else -1,
-        **welds,
+        **_equalities_of(model, links),
         rows=min(most_rows, other_rows(model) + contact_rows),
         tolerance=model.opt.tolerance,
         iterations=model.opt.iterations,

@@ -1,6 +1,6 @@
 """The accelerations that constraints allow: Newton's method with an exact line search, and the implicit Euler step.
 
-Minimized is 1/2 (a - a0)' M (a - a0) + 1/2 sum of D min(J a - aref, 0)^2 (the weld's rows without the min), where M a0 are all
+Minimized is 1/2 (a - a0)' M (a - a0) + 1/2 sum of D min(J a - aref, 0)^2 (without the min for equalities), where M a0 are all
 other forces: convex and quadratic in pieces, so that Newton's step from a point in the right piece ends at the minimum.
 E. Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops on its own.
 """
@@ -13,7 +13,6 @@ from mjx_dher.envs.engines.fused.threads import sync, total
 from mjx_dher.system.warp_setup import wp
 
 _FREE = wp.constant(FREE)
-_EQUALITIES = wp.constant(6)  # rows that hold from both sides, the first ones
 _SLOPE = wp.constant(1e-4)  # of the cost along the search direction, relative to that at its start, at which a search ends
 _ROUNDING = wp.constant(1e-10)  # a step's energy relative to that of the accelerations: what single precision leaves unsure
 _UNSURE = wp.constant(6e-14)  # the square of four roundings of single precision
@@ -21,9 +20,9 @@ _WHOLE = wp.constant(1e-3)  # how near to 1 a step counts as Newton's own
 
 
 @wp.func
-def _pull(row: int, residual: float, weight: float) -> float:
-    """Weight of a row if it acts, else 0."""
-    return wp.where(row < _EQUALITIES or residual < 0.0, weight, 0.0)
+def _pull(world: World, row: int, residual: float, weight: float) -> float:
+    """Weight of a row if it acts, else 0. The first ones, of equalities, always do."""
+    return wp.where(row < world.equalities or residual < 0.0, weight, 0.0)
 
 
 @wp.func
@@ -37,6 +36,7 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 @wp.func
 def _slopes(
+    world: World,
     sparse: Sparse,
     memory: Memory,
     has_sparse: bool,
@@ -53,7 +53,7 @@ def _slopes(
     for row in range(thread, rows, threads):
         change = memory.change[row]
         left = memory.residual[row] + at * change
-        pull = _pull(row, left, memory.weight[row]) * change
+        pull = _pull(world, row, left, memory.weight[row]) * change
         d1 += pull * left
         d2 += pull * change
     if has_sparse:
@@ -65,6 +65,7 @@ def _slopes(
 
 @wp.func
 def _how_far(
+    world: World,
     sparse: Sparse,
     memory: Memory,
     has_sparse: bool,
@@ -86,7 +87,7 @@ def _how_far(
     high = float(-1.0)
     step = float(1.0)
     for _ in range(attempts):
-        d = _slopes(sparse, memory, has_sparse, rows, step, slope, curve, thread, threads)
+        d = _slopes(world, sparse, memory, has_sparse, rows, step, slope, curve, thread, threads)
         if wp.abs(d[0]) <= _SLOPE * gain:
             break
         if d[0] < 0.0:
@@ -101,7 +102,15 @@ def _how_far(
 
 @wp.func
 def _take(
-    sparse: Sparse, memory: Memory, has_sparse: bool, far: float, rows: int, size: int, thread: int, threads: int
+    world: World,
+    sparse: Sparse,
+    memory: Memory,
+    has_sparse: bool,
+    far: float,
+    rows: int,
+    size: int,
+    thread: int,
+    threads: int,
 ) -> float:
     """Takes a step along the search direction. Returns the number of rows that begin or cease to act."""
     changed = float(0.0)
@@ -112,7 +121,7 @@ def _take(
         before = memory.residual[row]
         after = before + far * memory.change[row]
         memory.residual[row] = after
-        if row >= _EQUALITIES and (before < 0.0) != (after < 0.0):
+        if row >= world.equalities and (before < 0.0) != (after < 0.0):
             changed += 1.0
     if has_sparse:
         changed += take_sparse(sparse, memory, far, thread, threads)
@@ -122,7 +131,9 @@ def _take(
 
 
 @wp.func
-def _begin(sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int, thread: int, threads: int) -> float:
+def _begin(
+    world: World, sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int, thread: int, threads: int
+) -> float:
     """Initializes the solver at the first guess. Returns the energy that single precision leaves uncertain.
 
     Rounding J a - aref causes it: at the minimum, a step cannot gain more than the sum of D times the squared error.
@@ -136,7 +147,7 @@ def _begin(sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int,
         residual = has - asked
         memory.residual[row] = residual
         size = wp.abs(has) + wp.abs(asked)
-        unsure += _pull(row, residual, memory.weight[row]) * size * size
+        unsure += _pull(world, row, residual, memory.weight[row]) * size * size
     if has_sparse:
         unsure += begin_sparse(sparse, memory, thread, threads)
     unsure = total(unsure, threads)
@@ -148,7 +159,7 @@ def _begin(sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int,
 def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: int, thread: int, threads: int):
     """Computes `qacc`, starting from its present value. `has_sparse` says whether the model has rows of `sparse`."""
     rows = memory.counts[1]
-    unsure = _begin(sparse, memory, has_sparse, rows, nv, thread, threads)
+    unsure = _begin(world, sparse, memory, has_sparse, rows, nv, thread, threads)
     for _ in range(world.iterations):
         energy = float(0.0)
         for i in range(thread, nv, threads):
@@ -168,6 +179,7 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
             memory.search,
             nv,
             rows,
+            world.equalities,
             1,
             wp.where(has_sparse, 1, 0),
             thread,
@@ -188,8 +200,8 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
             change_sparse(sparse, memory, thread, threads)
         slope = total(slope, threads)
         curve = total(curve, threads)
-        far = _how_far(sparse, memory, has_sparse, rows, slope, curve, gain, world.ls_iterations, thread, threads)
-        changed = _take(sparse, memory, has_sparse, far, rows, nv, thread, threads)
+        far = _how_far(world, sparse, memory, has_sparse, rows, slope, curve, gain, world.ls_iterations, thread, threads)
+        changed = _take(world, sparse, memory, has_sparse, far, rows, nv, thread, threads)
         if changed == 0.0 and wp.abs(far - 1.0) < _WHOLE:
             break
         if far * far * gain <= least:  # rounding lets the search go no further
@@ -226,6 +238,7 @@ def accelerate(
         memory.search,
         nv,
         memory.counts[1],
+        world.equalities,
         0,
         0,
         thread,

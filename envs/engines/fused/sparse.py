@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.fused.constraints import asked
 from mjx_dher.envs.engines.fused.model import Memory, Sparse
-from mjx_dher.envs.engines.fused.setup import fill, is_sparse, softness
+from mjx_dher.envs.engines.fused.setup import JOINT, TENDON, fill, is_sparse, softness
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
@@ -77,10 +77,10 @@ def _frictions(model: mujoco.MjModel) -> Any:
 def _equalities(model: mujoco.MjModel) -> Any:
     for eq in range(model.neq):
         objects = [int(each) for each in (model.eq_obj1id[eq], model.eq_obj2id[eq]) if each >= 0]
-        if int(model.eq_type[eq]) == mujoco.mjtEq.mjEQ_JOINT:
+        if model.eq_type[eq] == JOINT:
             parts = [[(joint, 1.0, number)] for number, joint in enumerate(objects)]
             inverse = model.dof_invweight0[model.jnt_dofadr[objects]].sum()
-        elif int(model.eq_type[eq]) == mujoco.mjtEq.mjEQ_TENDON:
+        elif model.eq_type[eq] == TENDON:
             parts = [_tendon(model, tendon, number) for number, tendon in enumerate(objects)]
             inverse = model.tendon_invweight0[objects].sum()
         else:

@@ -89,11 +89,9 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         yield "options disabled"
     if not 0 < model.nv <= 31:
         yield "no degrees of freedom, or more than 31"
-    welds = [index for index in range(model.neq) if _is_plain_weld(model, index)]
-    few = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
-    others = [index for index in range(model.neq) if int(model.eq_type[index]) not in few and index not in welds[:1]]
+    others = [eq for eq in range(model.neq) if not _is_known(model, eq)]
     if others:
-        yield with_names("equality constraints other than one weld of a mocap body", model, "eq", others)
+        yield with_names("equality constraints other than of joints, fixed tendons and bodies", model, "eq", others)
 
 
 def _not_fixed(model: mujoco.MjModel) -> np.ndarray:
@@ -111,12 +109,14 @@ def _off_centre(model: mujoco.MjModel) -> np.ndarray:
     return alone & implicit & (parts | np.any(model.body_ipos[body] != 0, axis=1))
 
 
-def _is_plain_weld(model: mujoco.MjModel, index: int) -> bool:
-    """Whether an equality constraint welds a mocap body to another body with the same frame."""
-    if model.eq_type[index] != mujoco.mjtEq.mjEQ_WELD or model.eq_objtype[index] != mujoco.mjtObj.mjOBJ_BODY:
-        return False
-    same_frame = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
-    return bool(same_frame and model.body_mocapid[model.eq_obj1id[index]] >= 0)
+def _is_known(model: mujoco.MjModel, eq: int) -> bool:
+    """Whether an equality constraint is of joints, tendons or connected bodies, or welds a body to a mocap body's frame."""
+    kind, of_bodies = int(model.eq_type[eq]), model.eq_objtype[eq] == mujoco.mjtObj.mjOBJ_BODY
+    same_frame = np.allclose(model.eq_data[eq, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
+    plain_weld = same_frame and model.body_mocapid[model.eq_obj1id[eq]] >= 0
+    return kind in (setup.JOINT, setup.TENDON) or bool(
+        of_bodies and (kind == setup.CONNECT or (kind == setup.WELD and plain_weld))
+    )
 
 
 def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
