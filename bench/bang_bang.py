@@ -1,6 +1,6 @@
 """Does the physics survive a policy that only slams? Whole episodes of random actions, each coordinate -1 or 1.
 
-    python bench/bang_bang.py [--tasks reach push pick_and_place slide] [--engine native] [--actions 1000000] [--num-envs 200]
+    python bench/bang_bang.py [--tasks TASK ...] [--engine native] [--actions 1000000] [--num-envs 200]
 
 A line a task: episodes whose physics blew up (and was put back to a start), the object's greatest speed after any step, the
 share of episodes that end with any two geoms deeper than 5 mm in each other, and the deepest. Exits with 1 where an episode
@@ -22,6 +22,7 @@ from timing import print_table
 
 from mjx_dher import envs
 
+TASKS = ["reach", "push", "pick_and_place", "slide", "hand_reach", "block_rotate_xyz", "egg_rotate", "pen_rotate"]
 MAX_SPEED = 10.0  # m/s
 MAX_PENETRATION = 0.05  # m
 DEEP = 0.005  # m
@@ -34,7 +35,8 @@ def play(env, num_envs):
         state = jax.vmap(env.step)(state, action)
         speed = jnp.zeros(num_envs)
         if env.has_object:
-            speed = jnp.linalg.norm(state.physics.qvel[:, env._object_qvel][:, :3], axis=-1)
+            begin = env._object.qvel
+            speed = jnp.linalg.norm(state.physics.qvel[:, begin : begin + 3], axis=-1)
         return state, speed
 
     @jax.jit
@@ -80,7 +82,7 @@ def survive(task, engine, actions, num_envs, seed=0):
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", default=["reach", "push", "pick_and_place", "slide"])
+    parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--engine", default="native")
     parser.add_argument("--actions", type=int, default=1_000_000)
     parser.add_argument("--num-envs", type=int, default=200)

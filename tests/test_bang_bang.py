@@ -8,7 +8,7 @@ import jax
 import pytest
 from conftest import ROOT
 
-TASKS = ("reach", "push", "pick_and_place", "slide")
+TASKS = ("reach", "push", "pick_and_place", "slide", "hand_reach", "block_rotate_xyz", "egg_rotate", "pen_rotate")
 SCRIPT = ROOT / "bench" / "bang_bang.py"
 
 
