@@ -46,6 +46,22 @@ def test_a_signal_ends_a_program_that_is_not_held_at_once(number, busy):
     assert seconds < 10
 
 
+@pytest.mark.parametrize("number", NUMBERS)
+def test_a_signal_while_the_interpreter_ends_does_not_replace_the_status(number):
+    """A module's objects are freed late, after the interpreter has restored the signals' defaults."""
+    code = f"""
+class Late:
+    def __del__(self):
+        os.kill(os.getpid(), {number:d})
+        time.sleep(0.05)
+sys.late = Late()
+signals.take()
+sys.exit(3)
+"""
+    status, _, err, _ = program(code)
+    assert (status, err) == (3, "")
+
+
 def test_an_exception_of_a_library_and_its_handler_change_nothing():
     """As Ray has a handler for SIGTERM that raises SystemExit."""
     code = """

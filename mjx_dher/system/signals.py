@@ -7,6 +7,7 @@ process at once, unless a block is `held`, which ends in order.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import fcntl
@@ -106,6 +107,15 @@ class _Signals:
                 clean()
         os._exit(128 + number)
 
+    def finish(self) -> None:
+        """Ignores signals while the interpreter ends. It would restore their defaults, which replace the exit status."""
+        with self.lock:
+            self.look()
+            numbers = list(self.before)
+            self.before.clear()
+            for number in numbers:
+                signal.signal(number, signal.SIG_IGN)
+
     def before_fork(self) -> None:
         """Blocks signals until a child has its own handlers."""
         self.mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
@@ -153,6 +163,7 @@ def take() -> None:
             os.close(end)
             os.set_blocking(own, False)
         os.register_at_fork(before=_signals.before_fork, after_in_parent=_signals.in_parent, after_in_child=_signals.in_child)
+        atexit.register(_signals.finish)
         threading.Thread(target=_signals.listen, args=[_signals.pipe[0]], name="signals", daemon=True).start()
     signal.set_wakeup_fd(_signals.pipe[1], warn_on_full_buffer=False)
     with _signals.lock:
