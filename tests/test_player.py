@@ -156,7 +156,7 @@ def test_physics_that_blows_up_is_told_and_begins_anew():
     player = Player(GAME, lambda obs: np.array([10.0]))
     player.step()
     assert player.episodes == Tally(1, 0)
-    assert "blew up" in panel.score(player)
+    assert "diverged" in panel.score(player)
     for _ in range(HOLD):
         player.step()
     assert (player.clock, player.note) == (0, "")

@@ -168,7 +168,7 @@ BAD = [
     (["push", "--env-kwargs", "x"], ["env_kwargs must be NAME=VALUE"]),
     (["push", "--seed", "-1"], ["seed must lie in [0, 4294967295]; got -1"]),
     (["push", "--port", "70000"], ["port must lie in [0, 65535]"]),
-    (["push", "--host", "192.0.2.1"], ["host '192.0.2.1' is no address of this machine"]),
+    (["push", "--host", "192.0.2.1"], ["host must be an address of this machine; got '192.0.2.1'"]),
 ]
 
 

@@ -156,7 +156,7 @@ def test_a_run_that_goes_on_is_followed(stopped, tmp_path):
 
 
 def test_why_there_is_no_critic_is_told():
-    assert sources.Cast(of_package("reach"), reach()).critic == "No critic: the policies of the package come without one."
+    assert sources.Cast(of_package("reach"), reach()).critic == "No critic: bundled policies come without one."
     assert sources.Cast(sources.by_random("reach"), reach()).critic == "Random actions have no critic."
 
 

@@ -1,4 +1,4 @@
-"""The physics engines, one file each, behind `make_engine`."""
+"""The physics engines, one file each, and `make_engine`."""
 
 from __future__ import annotations
 
@@ -37,19 +37,20 @@ def _has_warp() -> bool:
 
 
 def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
-    """Makes an engine that advances `model` by `substeps` timesteps a call.
+    """Makes an engine that advances `model` by `substeps` timesteps per call.
 
-    `native` takes any model without sleeping bodies, `jax` any that MJX takes, and `warp` those whose features its kernel has.
+    `native` supports any model without sleeping bodies, `jax` any that MJX supports, and `warp` any whose features its kernels
+    support.
 
     Args:
       name: "native", "jax", "warp" or "auto".
-      model: the compiled MJCF.
-      substeps: MuJoCo timesteps an environment step.
-      **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp
-        the same two, `constraints` (its memory), and `allow_cpu`.
+      model: compiled MJCF.
+      substeps: MuJoCo timesteps per environment step.
+      **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp these
+        two, `constraints` (memory for rows) and `allow_cpu`.
 
     Raises:
-      ValueError: there is no such engine or option, or the engine cannot run this model or on this machine.
+      ValueError: there is no such engine or option, or the engine does not support the model or this machine.
     """
     for option in options:
         check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
@@ -58,11 +59,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
 
 
 def engine_options(name: str) -> list[str]:
-    """Names of an engine's options.
-
-    Raises:
-      ValueError: as for `make_engine`.
-    """
+    """Names of an engine's options. Raises ValueError like `make_engine`."""
     return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps", "derived", "sensors"})
 
 

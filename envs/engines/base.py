@@ -1,4 +1,4 @@
-"""The engine interface: the part of an environment that advances physics, and nothing else."""
+"""The engine interface, the part of an environment that advances physics."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class Physics:
 
 @struct.dataclass
 class Controls:
-    """Inputs that are held for a whole environment step."""
+    """Inputs that are held during an environment step."""
 
     ctrl: Array  # [nu]
     mocap: Array  # [nmocap, 7] poses of mocap bodies: position, m, and orientation (w, x, y, z)
 
 
 class Engine(Protocol):
-    """Physics engine that advances one simulation by one environment step; `jax.vmap` makes the batch."""
+    """Physics engine that advances one simulation by one environment step. `jax.vmap` makes a batch."""
 
     name: str
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
-        """Returns the physics one environment step later."""
+        """Physics one environment step later."""
         ...
 
     def check(self) -> None:
@@ -45,7 +45,7 @@ class Engine(Protocol):
 
 
 def check_state(model: mujoco.MjModel) -> None:
-    """Raises ValueError if the model has state that `Physics` does not hold."""
+    """Raises ValueError if the model has state that `Physics` does not contain."""
     if model.nhistory or model.npluginstate:
         raise ValueError("the model has delays or plugins, whose state `Physics` does not hold; use mjx_dher.envs.Simulator")
     if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
@@ -53,7 +53,7 @@ def check_state(model: mujoco.MjModel) -> None:
 
 
 def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) -> None:
-    """Raises ValueError if an array has another shape than the model's, or the model has more state."""
+    """Raises ValueError if an array does not have the model's shape, or the model has more state than `Physics`."""
     check_state(model)
     for values, shapes in (
         (physics, {"qpos": (model.nq,), "qvel": (model.nv,), "warmstart": (model.nv,), "act": (model.na,)}),
@@ -64,6 +64,6 @@ def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) ->
 
 
 def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
-    """Raises ValueError if the array called `name` has another shape."""
+    """Raises ValueError if the array called `name` does not have this shape."""
     if jnp.shape(value) != shape:
         raise ValueError(f"{name} has shape {list(jnp.shape(value))}; the model's is {list(shape)} (use jax.vmap for a batch)")

@@ -1,4 +1,4 @@
-"""Which engines take a model: what stands against each of them, and what would help."""
+"""Support of a model by the engines: the reason against each of them, and a fix."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import mujoco
 from mjx_dher.envs.engines import make_engine
 
 _NATIVE = "use engine native"
-# Words of a reason -> what a user can change in the MJCF.
+# Fixes in the MJCF, by words of the reason.
 _CURES = {
     "integrator": 'integrator="Euler"',
     "elliptic": 'cone="pyramidal"',
@@ -22,7 +22,7 @@ _CURES = {
 
 
 class Verdict(NamedTuple):
-    """Whether an engine takes a model."""
+    """Whether an engine supports a model."""
 
     engine: str  # native, jax, warp fused or warp graph
     reason: str  # "" if it does
@@ -30,7 +30,7 @@ class Verdict(NamedTuple):
 
 
 def explain(model: mujoco.MjModel) -> list[Verdict]:
-    """Tries every engine, and both paths of warp, on a model. Where there is no GPU, warp is tried on the CPU."""
+    """Tries every engine, and both paths of warp, on a model. Without a GPU, warp is tried on the CPU."""
     return [
         _verdict(model, "native", "mjx_dher.envs.Simulator, or MuJoCo itself"),
         _verdict(model, "jax", _NATIVE),

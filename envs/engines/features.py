@@ -1,4 +1,4 @@
-"""Fields of MuJoCo's MjModel that an engine leaves out, and so must have their defaults."""
+"""Fields of MuJoCo's MjModel that an engine ignores, and that must therefore have their defaults."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def fields(model: mujoco.MjModel) -> Iterator[tuple[str, Any]]:
 
 @functools.cache
 def _defaults() -> dict[str, Any]:
-    """Defaults of fields: one element's for a field that each element of its kind has."""
+    """Defaults of fields. For fields of elements, the default of one element."""
     per_element = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "pair_", "tendon_")
     values = dict(fields(mujoco.MjModel.from_xml_string(_NEUTRAL)))
-    # The world's body comes first, and the actuator's default pushes its joint.
+    # The world body comes first, and the default actuator drives its joint.
     return {
         name: value[0] if name.startswith(per_element) else 0 if _is_count(name) else value for name, value in values.items()
     }
@@ -62,11 +62,11 @@ def _is_count(name: str) -> bool:
 
 
 def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> list[str]:
-    """Features of a model whose fields do not have their defaults, with the elements that have them.
+    """Features of a model whose fields do not have their defaults, with their elements.
 
     Args:
-      model: the compiled MJCF.
-      concerns: whether a field, by its name, is looked at.
+      model: compiled MJCF.
+      concerns: whether to check a field, by name.
     """
     features: list[str] = []
     defaults = _defaults()
@@ -83,7 +83,7 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
 
 
 def with_names(what: str, model: mujoco.MjModel, kind: str, indices: Any) -> str:
-    """Returns `what` followed by names of elements, or by their numbers if they have none."""
+    """`what`, followed by names of elements, or by their numbers if they have none."""
     if kind == "dof":
         kind, indices = "jnt", np.unique(model.dof_jntid[indices])
     if kind == "pair":

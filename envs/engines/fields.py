@@ -1,4 +1,4 @@
-"""Fields of MuJoCo's MjData: which of them a simulation can return, and what fills them."""
+"""Fields of MuJoCo's MjData: the ones that a simulation can return, and the functions that fill them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mujoco.batch import DATA_FIELDS
 
 from mjx_dher.lookup import check_name
 
-# Fields that mj_step and mj_forward leave to these functions, which are called after them.
+# Fields that mj_step and mj_forward do not fill, and the functions that do.
 LATE: dict[str, Callable[[mujoco.MjModel, mujoco.MjData], Any]] = {
     **dict.fromkeys(("cacc", "cfrc_int", "cfrc_ext"), mujoco.mj_rnePostConstraint),
     **dict.fromkeys(("subtree_linvel", "subtree_angmom"), mujoco.mj_subtreeVel),
@@ -27,10 +27,10 @@ REJECTED = {
 
 
 def derived_fields(names: Sequence[str], state: Sequence[str]) -> tuple[str, ...]:
-    """Returns `names` without repetitions.
+    """`names` without repetitions.
 
     Raises:
-      ValueError: one is no field of MjData, belongs to the `state`, or has no value that MuJoCo computes at every timestep.
+      ValueError: a name is not a field of MjData, belongs to the `state`, or has no value that every timestep computes.
     """
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ValueError(f"derived must be a list of names; got {names!r}")

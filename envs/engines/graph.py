@@ -1,7 +1,7 @@
-"""Simulations on a device that MuJoCo Warp's own kernels advance: for models that the fused kernel does not support.
+"""Simulations on a device with MuJoCo Warp's kernels, for models that the fused kernel does not support.
 
-All substeps of an environment step are one CUDA graph on memory that stays where it is, so that starting some hundred kernels a
-substep costs little. Only the state goes in and out.
+All substeps of an environment step are one CUDA graph on fixed memory, so starting some hundred kernels per substep costs
+little. Only the state is copied in and out.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
 
@@ -19,11 +19,11 @@ from mjx_dher.system.warp_setup import wp
 # Fields of MjModel that MuJoCo Warp ignores without an error (mujoco-mjx 3.17).
 IGNORED = ("actuator_armature", "opt.disableactuator")
 _PROBE = 2000  # timesteps
-_FEW_CONTACTS, _FEW_ROWS = 48, 160  # memory for fewer is not worth an overflow
+_FEW_CONTACTS, _FEW_ROWS = 48, 160  # always allocated, if they can occur
 
 
 def unsupported(model: mujoco.MjModel) -> list[str]:
-    """Features of the model that MuJoCo Warp does not support, with names of the elements that have them."""
+    """Features of the model that MuJoCo Warp does not support, with names of their elements."""
     left_out = beyond_defaults(model, IGNORED.__contains__)
     try:
         with wp.ScopedDevice("cpu"):
@@ -34,9 +34,9 @@ def unsupported(model: mujoco.MjModel) -> list[str]:
 
 
 def memory_for(model: mujoco.MjModel) -> tuple[int, int]:
-    """Contacts and rows of constraints to have memory for in each environment.
+    """Numbers of contacts and constraint rows per environment to allocate memory for.
 
-    All that can occur if that is little, else half as many again as random controls cause.
+    All that can occur if these are few, else 1.5 times as many as random controls cause.
     """
     contacts, rows = pairs.most(model)
     if contacts > _FEW_CONTACTS or rows > _FEW_ROWS:
@@ -47,11 +47,11 @@ def memory_for(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 def probe(model: mujoco.MjModel) -> tuple[int, int, int]:
-    """The most contacts, rows, and rows of contacts under random controls, from the default and from keyframes."""
+    """Most contacts, rows, and rows of contacts under random controls, from the default and from keyframes."""
     data, rng, most = mujoco.MjData(model), np.random.default_rng(0), (0, 0, 0)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     for warning in data.warning:
-        warning.number = 1  # else MuJoCo writes a log
+        warning.number = 1  # otherwise MuJoCo writes a log
     starts = range(-1, min(model.nkey, 4))
     for key in starts:
         mujoco.mj_resetDataKeyframe(model, data, key) if key >= 0 else mujoco.mj_resetData(model, data)
@@ -139,10 +139,10 @@ class Simulation:
     Args:
       model: a model for which `unsupported` is empty.
       num_envs: number of environments.
-      substeps: timesteps an environment step.
-      contacts: contacts that there is memory for, in each environment on average.
-      rows: rows of constraints that there is memory for, in each environment.
-      sensors: whether `advance` also reads the sensors, in the state that it ends with.
+      substeps: timesteps per environment step.
+      contacts: memory for contacts, per environment on average.
+      rows: memory for constraint rows, per environment.
+      sensors: whether `advance` also reads the sensors of its final state.
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, rows: int, sensors: bool = False):
@@ -152,22 +152,22 @@ class Simulation:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._step, self._model = warp.step, warp.put_model(model)
         self._last = warp.forward if sensors else None
-        # MuJoCo Warp takes the velocity term of equality constraints from the timestep before.
+        # MuJoCo Warp takes the velocity term of equality constraints from the previous timestep.
         self._before = (warp.kinematics, warp.com_pos, warp.com_vel) if model.neq else ()
-        self._model.opt.warn_overflow = 0  # a kernel that prints waits for the host
+        self._model.opt.warn_overflow = 0  # printing kernels wait for the host
         self._data = warp.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
         self._substeps, self._num_envs, self._graph = substeps, num_envs, None
 
     def load(self) -> None:
-        """Compiles the kernels, or takes them from Warp's cache."""
+        """Compiles the kernels, or loads them from Warp's cache."""
         (self._last or self._step)(self._model, self._data)
         wp.synchronize_device()
 
     def advance(self, state: tuple[Any, Any, Any], inputs: Any, result: tuple[Any, Any, Any]) -> None:
-        """Advances coordinates, velocities, and the solver's first guess with activations behind it by an environment step."""
+        """Advances coordinates, velocities, and rows of warm start and activations by an environment step."""
         data = self._data
         if self._graph is None and not wp.get_device().is_cpu:
-            self.load()  # which a capture must not do
+            self.load()  # not allowed during a capture
             with wp.ScopedCapture() as capture:
                 self._run()
             self._graph = capture.graph
@@ -183,7 +183,7 @@ class Simulation:
             wp.launch(_end_sensors, dim=self._num_envs, inputs=[data.sensordata], outputs=[result[2]])
 
     def overflow(self) -> int:
-        """Number of environments, since the last call, in which contacts or rows were left out because they did not fit."""
+        """Number of environments since the last call in which contacts or rows did not fit into memory."""
         lost = int(np.count_nonzero(self._data.overflow.numpy() & private_api.overflow_of_memory()))
         if lost:
             self._data.overflow.zero_()

@@ -1,8 +1,8 @@
-"""NumPy functions that compiled JAX programs on a CPU look up by a name.
+"""NumPy functions that compiled JAX programs on a CPU call by name.
 
-`jax.pure_callback` puts a function's address into the program, which JAX therefore cannot keep for the next process. Here the
-program holds a name, as an attribute of one call of XLA's foreign function interface. The structs below are declared in
-xla/ffi/api/c_api.h, a stable binary interface.
+`jax.pure_callback` puts a function's address into the program, which JAX therefore cannot cache. Here the program has a name,
+as an attribute of a call of XLA's foreign function interface. The structs below are declared in xla/ffi/api/c_api.h, a stable
+binary interface.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _Function = Callable[[np.ndarray], np.ndarray]  # inputs [..., m] -> outputs [..
 _methods: dict[str, list[weakref.WeakMethod[_Function]]] = {}
 _lock = threading.Lock()
 _TARGET = "mjx_dher_host"
-_MAJOR, _MINOR = 0, 1  # of the interface that this is written for: later minor versions add to the ends of structs
+_MAJOR, _MINOR = 0, 1  # supported interface; later minor versions append fields to structs
 _METADATA, _EXECUTE = 1, 3
 _INTERNAL = 13  # error code
 
@@ -31,7 +31,7 @@ _pointer, _int, _int64 = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 
 
 class _Struct(ctypes.Structure):
-    """The first fields of most of XLA's structs."""
+    """First fields of most XLA structs."""
 
     _fields_: ClassVar[Any] = (("struct_size", ctypes.c_size_t), ("extension", _pointer))
 
@@ -95,24 +95,24 @@ class _Frame(_Struct):
 
 
 def register(name: str, method: _Function) -> None:
-    """Makes a bound method available to programs as `name`, for as long as its object lives.
+    """Makes a bound method available to programs as `name`, while its object lives.
 
-    All methods of one name must compute the same. They must use NumPy alone: calls of JAX in a callback could deadlock.
+    All methods of one name must compute the same. They must use only NumPy, because calling JAX in a callback could deadlock.
     """
     _register_target()
     with _lock:
         for key in [key for key, methods in _methods.items() if not any(each() for each in methods)]:
             del _methods[key]
-        _methods[name] = [*_methods.get(name, ()), weakref.WeakMethod(method)]  # others may be reading the list before
+        _methods[name] = [*_methods.get(name, ()), weakref.WeakMethod(method)]  # a new list, because others may read the old
 
 
 def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
-    """Calls the method registered under `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
+    """Calls the method registered as `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
 
-    Under `vmap` it is called once, with [..., m]. A program for another device than a CPU is not kept for the next process.
+    Under `vmap` it is called once, with [..., m]. Programs for devices other than CPUs are not cached.
     """
     result = jax.ShapeDtypeStruct(shape, np.float32)
-    inputs = inputs.astype(np.float32)  # which the method reads them as; JAX may compute in 64 bits
+    inputs = inputs.astype(np.float32)  # JAX may compute in 64 bits
     if jax.default_backend() != "cpu":
         return jax.pure_callback(functools.partial(_answer, name), result, inputs, vmap_method="broadcast_all")
     return jax.ffi.ffi_call(_TARGET, result, vmap_method="broadcast_all")(inputs, name=name)
@@ -121,13 +121,13 @@ def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
 def _answer(name: str, inputs: np.ndarray) -> np.ndarray:
     method = next(filter(None, (each() for each in _methods.get(name, ()))), None)
     if method is None:
-        raise RuntimeError("the simulator that this program calls no longer exists; keep it for as long as the program")
+        raise RuntimeError("the simulator of this program no longer exists; keep it as long as the program")
     return method(inputs)
 
 
 @functools.cache
 def _register_target() -> Any:
-    """Tells XLA of `_handle`. Returns the C function, which must not be freed."""
+    """Registers `_handle` with XLA. Returns the C function, which must not be freed."""
     handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))(lambda frame: _handle(frame.contents))
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(ctypes.cast(handler, _pointer)), platform="cpu")
     return handler
@@ -155,7 +155,7 @@ def _handle(frame: Any) -> int | None:
 
 
 def _view(buffers: Any) -> np.ndarray:
-    """Returns the first of the buffers as an array of float32."""
+    """First of the buffers, as a float32 array."""
     buffer = buffers.items[0].contents
     shape = tuple(buffer.dims[: buffer.rank])
     return np.ctypeslib.as_array(ctypes.cast(buffer.data, ctypes.POINTER(ctypes.c_float)), shape)

@@ -1,4 +1,4 @@
-"""MuJoCo MJX, the JAX implementation, which runs wherever JAX runs."""
+"""MuJoCo MJX, the JAX implementation, which runs on any device that JAX supports."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _IGNORED = (
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Returns a copy of the model in which a geom called NAME_stand_in replaces one geom of each cylinder-box contact pair.
+    """Copy of the model in which a geom called NAME_stand_in replaces one geom of each cylinder-box contact pair.
 
     It replaces the box NAME if the box has a stand-in, else the cylinder NAME. Some engines have no cylinder-box contacts, or
     inaccurate ones.
@@ -60,11 +60,11 @@ def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 class _Weld:
-    """The part of a weld's acceleration that is due to velocity, which MJX leaves out and MuJoCo C and Warp put in.
+    """The velocity term of a weld's acceleration, which MJX omits and MuJoCo C and Warp include.
 
-    With r the weld's residual, MuJoCo asks for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: an arm that
-    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. Only welds are corrected that join a mocap body
-    (which counts as at rest) to a moving body, in such a way that their frames coincide.
+    With the weld's residual r, MuJoCo solves for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: an arm that
+    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. Only welds between a mocap body (which counts as at
+    rest) and a moving body with coinciding frames are corrected.
     """
 
     def __init__(self, model: mujoco.MjModel, index: int):
@@ -79,7 +79,7 @@ class _Weld:
         self._dofs = np.array(dofs)
 
     def bias(self, data: mjx.Data) -> Array:
-        """Returns J' qvel [6]: three rows of position, m/s^2, three of orientation, 1/s^2."""
+        """J' qvel [6]: three rows of position in m/s^2, three of orientation in 1/s^2."""
         # Spatial vectors (angular, linear) at the centre of mass of the whole arm.
         acceleration = data.qvel[self._dofs] @ data.cdof_dot[self._dofs]
         velocity, arm = data.cvel[self._body], data.xpos[self._body] - data.subtree_com[self._root]
@@ -94,7 +94,7 @@ class _Weld:
 
 
 def _welds(model: mujoco.MjModel) -> list[int | _Weld]:
-    """Returns the first rows of a model's constraints in order: welds to correct, and the numbers of other rows."""
+    """First rows of a model's constraints in order: welds to correct, and numbers of other rows."""
     disabled = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     connect, weld = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
     if model.opt.disableflags & disabled or model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
@@ -105,7 +105,7 @@ def _welds(model: mujoco.MjModel) -> list[int | _Weld]:
         plain = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
         if not bodies or not plain or model.body_mocapid[model.eq_obj1id[index]] < 0:
             return False
-        return bool(model.body_weldid[model.eq_obj2id[index]])  # else it is fixed to the world
+        return bool(model.body_weldid[model.eq_obj2id[index]])  # otherwise it is fixed to the world
 
     rows: list[int | _Weld] = [3 * int(np.count_nonzero(model.eq_type == connect))]
     rows += [_Weld(model, index) if to_correct(index) else 6 for index in np.flatnonzero(model.eq_type == weld).tolist()]
@@ -116,9 +116,9 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
     """Enlarges geoms by the margin of their contact pairs, and sets the margin to 0, if MJX would ignore it.
 
     A contact with a margin acts from that distance on. MJX 3.17 finds box-box and sphere-box contacts only if the geoms
-    overlap: their distance would jump from none to the whole margin, and a slightly tilted face would touch with fewer points.
-    A geom that is larger by the margin gives the same distances and normals (except at a box's edges, which stay sharp). The
-    geom must have the same margin in all its contacts. If neither geom of a pair has, a warning names the pair.
+    overlap. Their distance would jump by the whole margin, and a slightly tilted face would touch with fewer points. A geom
+    enlarged by the margin gives the same distances and normals, except at a box's edges, which stay sharp. The geom must have
+    the same margin in all its contacts. If neither geom of a pair has, a warning names the pair.
     """
     sphere, box = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX)
     ends = np.stack([model.pair_geom1, model.pair_geom2], axis=1)
@@ -128,7 +128,7 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
     for geom in sorted(set(ends[affected].ravel().tolist()), key=lambda geom: int(model.geom_type[geom])):
         pairs = np.flatnonzero((ends == geom).any(axis=1))
         margin = float(model.pair_margin[pairs[0]])
-        alone = not (model.geom_contype[geom] or model.geom_conaffinity[geom])  # no contacts besides the pairs
+        alone = not (model.geom_contype[geom] or model.geom_conaffinity[geom])  # no contacts except the pairs
         if alone and margin > 0 and affected[pairs].all() and (model.pair_margin[pairs] == margin).all():
             model.geom_size[geom] += margin
             model.pair_margin[pairs] = 0
@@ -138,7 +138,7 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
 
 
 def _geoms_in(model: mujoco.MjModel, message: str) -> list[int]:
-    """Geoms of the first pair whose two types MJX names in an error."""
+    """Geoms of the first pair whose two types an MJX error names."""
     for ends in [*pairs.meeting(model), *zip(model.pair_geom1, model.pair_geom2)]:
         if all(re.search(rf"\bmjGEOM_{pairs.type_of(model, geom)}\b", message) for geom in ends):
             return [int(geom) for geom in ends]
@@ -146,7 +146,7 @@ def _geoms_in(model: mujoco.MjModel, message: str) -> list[int]:
 
 
 def _loaded(data: mjx.Data, physics: Physics, controls: Controls) -> mjx.Data:
-    """Returns `data` with the state and the inputs."""
+    """`data` with the state and the inputs."""
     return data.replace(
         qpos=physics.qpos,
         qvel=physics.qvel,
@@ -161,9 +161,9 @@ def _loaded(data: mjx.Data, physics: Physics, controls: Controls) -> mjx.Data:
 class MjxEngine:
     """MJX with impl="jax".
 
-    Under `vmap`, the constraint solver's loop runs until the slowest environment has converged; so its iterations are capped.
-    With 4 iterations, pushed objects stray two to three times as far from recorded episodes as with 8; 100 iterations gain
-    little more (docs/fidelity.md).
+    Under `vmap`, the constraint solver runs until the slowest environment has converged, so its iterations are limited. With 4
+    iterations, pushed objects deviate two to three times as far from recorded episodes as with 8. 100 iterations gain little
+    more (docs/fidelity.md).
     """
 
     name = "jax"
@@ -193,31 +193,31 @@ class MjxEngine:
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         check_shapes(self._mujoco_model, physics, controls)
 
-        # MJX indexes empty arrays, such as the places of sites that do not exist, which NumPy rejects and JAX allows.
+        # MJX indexes empty arrays, such as positions of no sites, which JAX allows and NumPy does not.
         start = jax.tree.map(lambda x: x if x.size else jnp.asarray(x), self._data)
 
         def substep(_, p: Physics) -> Physics:
             data = _loaded(start, p, controls)
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
                 data = self._step(data) if self._welds else mjx.step(self._model, data)
-            # MJX takes its own precision from jax_enable_x64; between substeps, as between steps, it is float32.
+            # MJX's precision depends on jax_enable_x64; between substeps it is float32, as between steps.
             return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act)))
 
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
             return jax.lax.fori_loop(0, self._substeps, substep, dataclasses.replace(physics, sensors=None))
 
     def read_sensors(self, physics: Physics, controls: Controls) -> Array:
-        """The values [nsensordata] of the model's sensors, for an engine that was made with `sensors`."""
+        """Values [nsensordata] of the model's sensors. The engine must be made with `sensors`."""
         check_shapes(self._mujoco_model, physics, controls)
         data = _loaded(jax.tree.map(jnp.asarray, self._data), physics, controls)
         with jax.default_matmul_precision("highest"):
             return mjx.forward(self._model, data).sensordata.astype(jnp.float32)
 
     def check(self) -> None:
-        pass  # no contact is lost: there is memory for all of them
+        pass  # there is memory for all contacts
 
     def _step(self, data: mjx.Data) -> mjx.Data:
-        """Computes `mjx.step` with the welds corrected, and without sensors."""
+        """`mjx.step` with corrected welds, and without sensors."""
         data = mjx.fwd_velocity(self._model, mjx.fwd_position(self._model, data))
         shifts = [-weld.bias(data) if isinstance(weld, _Weld) else jnp.zeros(weld) for weld in self._welds]
         data = private_api.shift_reference_acceleration(data, jnp.concatenate(shifts))

@@ -1,4 +1,4 @@
-"""MuJoCo C for any model, in batches on all cores of the host, called from inside compiled JAX programs: `Simulator`."""
+"""MuJoCo C for any model, in batches on all cores of the host, called from compiled JAX programs: `Simulator`."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from mjx_dher.validation import check_number
 
 @struct.dataclass
 class Data:
-    """The complete state of one simulation, in MuJoCo's layout and under MuJoCo's names, float32.
+    """Complete state of one simulation, in MuJoCo's layout and with MuJoCo's names, float32.
 
-    It is a whole `mjSTATE_INTEGRATION`: nothing else influences a step. Fields that a model does not use are empty. Use
+    It is a whole `mjSTATE_INTEGRATION`, so nothing else influences a step. Fields that a model does not use are empty. Use
     `data.replace(ctrl=...)` to set a field.
     """
 
-    time: Array  # [] s; `residue` has what float32 leaves out
+    time: Array  # [] s; `residue` has the digits that float32 omits
     qpos: Array  # [nq]
     qvel: Array  # [nv]
     act: Array  # [na]
@@ -47,49 +47,48 @@ class Data:
     mocap_quat: Array  # [nmocap, 4]
     userdata: Array  # [nuserdata]
     plugin_state: Array  # [npluginstate]
-    residue: Array  # [2, 1 + nhistory] what the float32 of `time` and `history` leaves out, in two parts; 0 if you set those
-    derived: dict[str, Array]  # the fields of MjData that the simulator was asked for, with their shapes there
+    residue: Array  # [2, 1 + nhistory] digits of `time` and `history` that float32 omits; 0 if you set those
+    derived: dict[str, Array]  # requested fields of MjData, with their shapes
 
 
 _STATE = tuple(name for name in Data.__dataclass_fields__ if name not in ("residue", "derived"))
-_EXACT = ("time", "history")  # float64 between steps, too: a time in float32 would stop, and delays with it
-# What `advance` passes: fields of `Physics` by MuJoCo's names, and the controls.
+_EXACT = ("time", "history")  # float64 between steps too, because a float32 time would stop advancing
+# Inputs of `advance`: fields of `Physics` by MuJoCo's names, and the controls.
 _PHYSICS = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "act": "act"}
 _CONTROLS = ("ctrl", "mocap_pos", "mocap_quat")
 
 
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
-_KEPT = 8  # batches of a simulator, of the sizes that were used last
+_KEPT = 8  # batches to keep, of the last sizes
 
 
 class _Views(NamedTuple):
-    """A batch, and the fields that a call writes before it and reads after it: views of the batch's memory."""
+    """A batch, and views of its memory for the fields that a call writes and reads."""
 
     batch: Batch
     inputs: list[np.ndarray]
     outputs: list[np.ndarray]
-    exact: list[np.ndarray]  # of `_EXACT`, each [nsim, n]; empty for `advance`
+    exact: list[np.ndarray]  # views of `_EXACT`, each [nsim, n]; empty for `advance`
 
 
 class Simulator:
-    """MuJoCo C as pure functions of a state. They take no batch: use `jax.vmap`.
+    """MuJoCo C as pure functions of one state. Use `jax.vmap` for a batch.
 
-    `step` does what `mujoco.mj_step` does, in float64 on any number of threads; between calls everything is float32. However
-    many `vmap`s are around it, a call is one call of the host, which steps all simulations on its threads. Gradients do not
-    pass through it. Copies and unpickled simulators have separate threads and memory.
+    `step` computes `mujoco.mj_step` in float64 on any number of threads. Between calls, everything is float32. Any number of
+    `vmap`s make one call of the host, which steps all simulations on its threads. There are no gradients. Copies and unpickled
+    simulators have separate threads and memory.
 
-    `step` and `forward` take the whole state, `Data`. `advance` takes the few arrays that an engine needs (`Physics` and
-    `Controls`) and leaves the rest of the state at the model's defaults: this is the engine `native`.
+    `step` and `forward` take the whole state, `Data`. `advance` is the engine `native`: it takes only `Physics` and
+    `Controls`, and leaves the rest of the state at the model's defaults.
 
     Args:
-      model: any model without sleeping bodies and inter-process communication; it is copied.
-      derived: names of further fields of MjData, such as "xpos" or "sensordata", which `step` and `forward` return in
-        `Data.derived`.
-      substeps: calls of `mj_step` a step.
-      num_threads: threads that step the simulations; by default one a core.
+      model: any model without sleeping bodies and inter-process communication. It is copied.
+      derived: names of other fields of MjData, such as "xpos" or "sensordata", to return in `Data.derived`.
+      substeps: calls of `mj_step` per step.
+      num_threads: number of threads. Default: one per core.
 
     Raises:
-      ValueError: no model, a field that does not exist, a number out of range, or a model that cannot be stepped in batches.
+      ValueError: an argument is invalid, a field does not exist, or the model cannot be stepped in batches.
     """
 
     name = "native"
@@ -103,7 +102,7 @@ class Simulator:
         if num_threads is not None:
             check_number("num_threads", num_threads, "[1, 4096]")
         self._model = copy.copy(model)
-        # Without this flag, MuJoCo silently resets a simulation that blows up to qpos0.
+        # Without this flag, MuJoCo silently resets a diverged simulation to qpos0.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
         if "energy" in self._derived:
@@ -117,13 +116,13 @@ class Simulator:
 
     def _begin(self) -> None:
         self._batches: dict[tuple[bool, int], _Views] = {}
-        self._lock = threading.Lock()  # a Batch serves one caller at a time
+        self._lock = threading.Lock()  # a Batch is not thread-safe
         self._lost, self._warned = 0, False  # timesteps that left out contacts since the last `check`
         for function, method in (("step", self._on_step), ("forward", self._on_forward), ("advance", self._on_advance)):
             host_call.register(f"{self._name}_{function}", method)
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy or pickle, without locks and batches, which cannot be copied."""
+        """State of a copy or pickle, without locks and batches, which cannot be copied."""
         return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock", "_lost", "_warned")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -131,7 +130,7 @@ class Simulator:
         self._begin()
 
     def make_data(self, keyframe: int | str | None = None) -> Data:
-        """Returns the state after a reset, to the model's defaults or to a keyframe, with its derived fields.
+        """State after a reset to the model's defaults or to a keyframe, with its derived fields.
 
         Raises:
           ValueError: the model has no such keyframe.
@@ -156,23 +155,23 @@ class Simulator:
         return self._data({name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
 
     def step(self, data: Data, ctrl: Array | None = None) -> Data:
-        """Returns the state `substeps` timesteps later, under `ctrl` [nu] if it is given.
+        """State `substeps` timesteps later, under `ctrl` [nu] if given.
 
-        As with `mj_step`, derived fields describe the state before the last timestep; `forward` makes them current. A
-        simulation that blows up is not reset: its numbers are no longer finite.
+        As in `mj_step`, derived fields describe the state before the last timestep; `forward` updates them. A simulation that
+        diverges is not reset: its numbers are no longer finite.
 
         Raises:
-          ValueError: a field has another shape than the model's.
+          ValueError: a field does not have the model's shape.
         """
         if ctrl is not None and isinstance(data, Data):
             data = dataclasses.replace(data, ctrl=ctrl)
         return self._update("step", data)
 
     def forward(self, data: Data) -> Data:
-        """Returns `data` with its derived fields recomputed, as `mj_forward` does.
+        """`data` with updated derived fields, as in `mj_forward`.
 
         Raises:
-          ValueError: a field has another shape than the model's.
+          ValueError: a field does not have the model's shape.
         """
         return self._update("forward", data)
 
@@ -184,7 +183,7 @@ class Simulator:
         return Physics(**{field: after[name] for name, field in _PHYSICS.items()})
 
     def check(self) -> None:
-        """Raises ValueError if contacts were lost since the last call, because they did not fit into the model's memory."""
+        """Raises ValueError if contacts since the last call did not fit into the model's memory."""
         with self._lock:
             lost, self._lost = self._lost, 0
         if lost:
@@ -192,7 +191,7 @@ class Simulator:
 
     def _update(self, function: str, data: Data) -> Data:
         if not isinstance(data, Data):
-            raise ValueError(f"data must be a Data, as make_data gives it; got a {type(data).__name__}")
+            raise ValueError(f"data must be a Data from make_data; got a {type(data).__name__}")
         values = {name: getattr(data, name) for name in (*_STATE, "residue")}
         for name, value in values.items():
             check_shape(name, value, self._shapes[name])
@@ -206,13 +205,13 @@ class Simulator:
         return list(dict.fromkeys(LATE[name] for name in self._derived if name in LATE))
 
     def _fields(self, function: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the names of the fields that a function takes and returns, in the order of a packed row."""
+        """Names of the fields that a function takes and returns, in the order of a packed row."""
         if function == "advance":
             return (*_PHYSICS, *_CONTROLS), tuple(_PHYSICS)
         return (*_STATE, "residue"), (*_STATE, *self._derived, "residue")
 
     def _call(self, function: str, values: dict[str, Array]) -> dict[str, Array]:
-        """Calls a function of the host: one array in and one out, because each costs the call some 20 microseconds."""
+        """Calls a function of the host, with one array in and one out, because each costs some 20 microseconds."""
         inputs, outputs = self._fields(function)
         row = jnp.concatenate([jnp.ravel(jnp.asarray(values[name], jnp.float32)) for name in inputs])
         ends = np.cumsum([math.prod(self._shapes[name]) for name in outputs]).tolist()
@@ -231,7 +230,7 @@ class Simulator:
     def _on_host(self, function: str, packed: Any) -> np.ndarray:
         """Computes a function for `packed` [..., row]."""
         rows = np.asarray(packed).reshape(-1, packed.shape[-1])
-        with self._lock, np.errstate(over="ignore", invalid="ignore"):  # of a simulation that blew up
+        with self._lock, np.errstate(over="ignore", invalid="ignore"):  # from diverged simulations
             views = self._views(function, len(rows))
             begin = 0
             for view in views.inputs:
@@ -250,7 +249,7 @@ class Simulator:
         return result.reshape(*packed.shape[:-1], -1)
 
     def _results(self, function: str, views: _Views) -> list[np.ndarray]:
-        """Returns the fields of a row that a function returns, each [nsim, ...]."""
+        """Fields that a function returns, each [nsim, ...]."""
         outputs = list(views.outputs)
         if views.exact:
             outputs.append(_residue(np.concatenate(views.exact, axis=1)))
@@ -269,14 +268,14 @@ class Simulator:
         return [filled.get(name, output) for name, output in zip(names, outputs, strict=True)]
 
     def _note_lost(self, lost: int) -> None:
-        """Notes timesteps that left out contacts, and warns the first time."""
+        """Counts timesteps that left out contacts, and warns the first time."""
         self._lost += lost
         if lost and not self._warned:
             self._warned = True
             warnings.warn(_lost_contacts(self._model, lost), stacklevel=2)
 
     def _views(self, function: str, nsim: int) -> _Views:
-        key = function == "advance", nsim  # what `advance` does not write must stay as it was made: it has its own batches
+        key = function == "advance", nsim  # `advance` has separate batches, because its other fields must stay at defaults
         views = self._batches.pop(key, None) or self._made(function, nsim)
         self._batches[key] = views
         if len(self._batches) > _KEPT:
@@ -296,13 +295,13 @@ class Simulator:
 
 
 def _residue(values: np.ndarray) -> np.ndarray:
-    """Returns what the float32 of `values` [..., n] leaves out, as two parts [..., 2, n] that are float32 numbers."""
+    """Parts of `values` [..., n] that float32 omits, as two float32 numbers [..., 2, n]."""
     first = values - values.astype(np.float32)
     return np.stack([first, first - first.astype(np.float32)], axis=-2)
 
 
 def _add(exact: list[np.ndarray], residue: np.ndarray) -> None:
-    """Adds `residue` [nsim, 2 n] to fields [nsim, n in all] where it belongs to their values."""
+    """Adds `residue` [nsim, 2 n] to the fields [nsim, n in total] whose values it belongs to."""
     parts = residue.reshape(len(residue), 2, -1).astype(np.float64).sum(axis=1) if exact else residue
     for view in exact:
         part, parts = parts[:, : view.shape[1]], parts[:, view.shape[1] :]
@@ -318,7 +317,7 @@ def _lost_contacts(model: mujoco.MjModel, lost: int) -> str:
 
 
 def _digest(model: mujoco.MjModel, *settings: Any) -> str:
-    """Returns digits that stand for a model and its settings: simulators with the same digits are interchangeable."""
+    """Digest of a model and its settings. Simulators with the same digest are interchangeable."""
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     return hashlib.sha256(buffer.tobytes() + repr(settings).encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Geoms of a model that can touch, and how many contacts that can make."""
+"""Geoms of a model that can touch, and the number of possible contacts."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 
 _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")
-# Most contacts of two geoms, in the order of MuJoCo's types; of a sphere or an ellipsoid 1, and of others that are missing 8.
+# Most contacts of two geoms, in the order of MuJoCo's types. Otherwise 1 with a sphere or an ellipsoid, else 8.
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
 _MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2}
 _LEAST_FRICTION = 1e-5  # MuJoCo's
-_MANY = 50  # of height fields and signed distance fields
+_MANY = 50  # contacts of height fields and signed distance fields
 
 
 def type_of(model: mujoco.MjModel, geom: int) -> str:
@@ -43,7 +43,7 @@ def meeting(model: mujoco.MjModel) -> np.ndarray:
 
 
 class Pairs(NamedTuple):
-    """Pairs of geoms that can touch, and the numbers of their contacts [n, ...]: MuJoCo's pair_*."""
+    """Pairs of geoms that can touch, with MuJoCo's pair_* of their contacts [n, ...]."""
 
     geom1: np.ndarray
     geom2: np.ndarray
@@ -55,7 +55,7 @@ class Pairs(NamedTuple):
 
 
 def all_pairs(model: mujoco.MjModel) -> Pairs:
-    """The pairs that a model lists, and those that meet otherwise, with numbers mixed from their geoms' as in MuJoCo C."""
+    """Pairs that a model lists, and others that can touch, with parameters mixed from their geoms as in MuJoCo C."""
     listed = [getattr(model, f"pair_{name}") for name in Pairs._fields]
     listed[Pairs._fields.index("friction")] = np.maximum(model.pair_friction, _LEAST_FRICTION)
     others = meeting(model)
@@ -85,7 +85,7 @@ def all_pairs(model: mujoco.MjModel) -> Pairs:
 
 
 def most_contacts(model: mujoco.MjModel, geom1: int, geom2: int) -> int:
-    """The most contacts that two geoms can have."""
+    """Largest number of contacts of two geoms."""
     kind = tuple(sorted((type_of(model, geom1), type_of(model, geom2)), key=_TYPES.index))
     if "HFIELD" in kind or "SDF" in kind:
         return _MANY
@@ -95,7 +95,7 @@ def most_contacts(model: mujoco.MjModel, geom1: int, geom2: int) -> int:
 
 
 def most(model: mujoco.MjModel) -> tuple[float, float]:
-    """The most contacts, and the most rows of constraints, that a simulation can have."""
+    """Largest numbers of contacts and of constraint rows of a simulation."""
     if model.nflex:
         return np.inf, np.inf
     pairs = all_pairs(model)

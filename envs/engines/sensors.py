@@ -1,4 +1,4 @@
-"""Reads a model's sensors on every engine, as `mj_forward` computes them for the present state and inputs."""
+"""Reads a model's sensors on every engine, as computed by `mj_forward` for the current state and inputs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mjx_dher.types import Array
 
 
 class Sensors:
-    """Sensors of a model, read by the implementation that an engine uses.
+    """Sensors of a model, read by an engine's implementation.
 
     Args:
-      engine: an engine's name: "native", "jax", "warp" or "warp graph". For both paths of warp, MuJoCo Warp reads them.
-      model: the compiled MJCF.
-      allow_cpu: as for `WarpEngine`.
+      engine: "native", "jax", "warp" or "warp graph". MuJoCo Warp reads them for both paths of warp.
+      model: compiled MJCF.
+      allow_cpu: as in `WarpEngine`.
 
     Raises:
       ValueError: the implementation does not support the model.
@@ -42,7 +42,7 @@ class Sensors:
             self._reader = WarpEngine(model, 0, path="graph", allow_cpu=allow_cpu, sensors=True)
 
     def read(self, physics: Physics, controls: Controls) -> Array:
-        """The values [nsensordata] of all sensors, in the model's order."""
+        """Values [nsensordata] of all sensors, in the model's order."""
         if not hasattr(self, "_rest"):
             return self._reader.read_sensors(physics, controls)
         state = {"qpos": physics.qpos, "qvel": physics.qvel, "act": physics.act, "qacc_warmstart": physics.warmstart}
@@ -51,5 +51,5 @@ class Sensors:
         return self._reader.forward(data).derived["sensordata"]
 
     def check(self) -> None:
-        """Raises ValueError if contacts were left out, as `Engine.check` does."""
+        """Raises ValueError if contacts were left out, like `Engine.check`."""
         self._reader.check()

@@ -1,6 +1,6 @@
-"""Physics on an NVIDIA GPU: a whole step of thousands of environments is one kernel, or else one CUDA graph of MuJoCo Warp's.
+"""Physics on an NVIDIA GPU: a step of thousands of environments is one kernel, or one CUDA graph of MuJoCo Warp.
 
-Only the state goes in and out; `mjx.step` would pass some 170 arrays from Warp to XLA and back every substep.
+Only the state is passed in and out. `mjx.step` would pass some 170 arrays between XLA and Warp in every substep.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
@@ -23,31 +23,31 @@ from mjx_dher.system.warp_setup import load, prepare, wp
 from mjx_dher.validation import check_count
 
 PATHS = ("auto", "fused", "graph")
-_KEPT = 8  # numbers of environments, of those that were used last, whose memory is kept
+_KEPT = 8  # batches to keep in memory, of the last sizes
 
 
 class WarpEngine:
-    """Physics on the device of the JAX program around it, by one of two paths.
+    """Physics on the device of the surrounding JAX program, by one of two paths.
 
-    `fused` is the kernel of `engines.fused`: it follows MuJoCo C to the rounding of single precision, and no sum depends on the
-    order in which threads finish. `graph` is MuJoCo Warp, which supports more features and is slower; its sums have no fixed
-    order. `path` and `note` say which one runs and why.
+    `fused` is the kernel of `engines.fused`. It matches MuJoCo C to single precision, and no sum depends on the order of
+    threads. `graph` is MuJoCo Warp, which supports more features and is slower. The order of its sums varies. `path` and
+    `note` tell which one runs, and why.
 
     Args:
-      model: the compiled MJCF.
-      substeps: MuJoCo timesteps an environment step.
+      model: compiled MJCF.
+      substeps: MuJoCo timesteps per environment step.
       path: "fused", "graph", or "auto": fused if the kernel supports the model.
-      iterations: maximum Newton iterations of the constraint solver; each environment stops by itself, most after one or two.
-        By default 50 for `fused`, and the model's for `graph`.
-      ls_iterations: maximum steps of the solver's line search; by default 20, or the model's.
-      constraints: constraint rows that fit into memory in each environment; by default all that can occur, or for `graph` with
-        large models half as many again as random controls cause.
-      contacts: contacts that fit into memory, likewise; `graph` only.
-      allow_cpu: whether to run without an NVIDIA GPU, on one thread: for comparing engines, not for training.
-      sensors: whether the object is for `read_sensors` instead of `advance`; `graph` only.
+      iterations: most Newton iterations of the constraint solver. Each environment stops by itself, usually after one or two.
+        Default: 50 for `fused`, the model's for `graph`.
+      ls_iterations: most steps of the solver's line search. Default: 20 for `fused`, the model's for `graph`.
+      constraints: memory for constraint rows per environment. Default: all that can occur, or for `graph` with large models
+        1.5 times as many as random controls cause.
+      contacts: memory for contacts, with the same default. Only for `graph`.
+      allow_cpu: whether to run without an NVIDIA GPU, on one thread, to compare engines.
+      sensors: whether to make the object for `read_sensors` instead of `advance`. Only for `graph`.
 
     Raises:
-      ValueError: JAX does not run on an NVIDIA GPU, and `allow_cpu` is False; or the path does not support the model.
+      ValueError: JAX does not run on an NVIDIA GPU and `allow_cpu` is False, or the path does not support the model.
     """
 
     name = "warp"
@@ -75,7 +75,7 @@ class WarpEngine:
         self._model, self._substeps, self._sensors = copy.copy(model), substeps, sensors
         self.allow_cpu = allow_cpu
         self.path, self.note = _choose(model, path, constraints)
-        self.name = "warp" if self.path == "fused" else "warp graph"  # their numbers differ, so runs name them apart
+        self.name = "warp" if self.path == "fused" else "warp graph"  # separate names, because results differ
         if self.path == "graph":
             most = graph.memory_for(model)
             defaults = (model.opt.iterations, model.opt.ls_iterations)
@@ -89,13 +89,13 @@ class WarpEngine:
 
     def _begin(self) -> None:
         self._simulations: dict[tuple[str, int], simulation.Simulation | graph.Simulation] = {}
-        self._lost = 0  # contacts, in memory that is no longer kept
+        self._lost = 0  # contacts lost in batches that are no longer kept
         self._lock = threading.Lock()
         self._loading: list[concurrent.futures.Future[None]] | None = None
         self._call = self._jax_callable()
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy or pickle, without locks, threads and device memory, which cannot be copied."""
+        """State of a copy or pickle, without locks, threads and device memory, which cannot be copied."""
         left_out = ("_simulations", "_lost", "_lock", "_loading", "_call")
         return {name: value for name, value in vars(self).items() if name not in left_out}
 
@@ -104,8 +104,8 @@ class WarpEngine:
         self._begin()
 
     def _jax_callable(self) -> Any:
-        """Makes a JAX function that advances a batch and allocates the batch's memory on its first call."""
-        engine = weakref.ref(self)  # Warp keeps the function for ever
+        """JAX function that advances a batch, and allocates its memory on the first call."""
+        engine = weakref.ref(self)  # Warp never frees the function
 
         def advance_all(
             qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
@@ -117,7 +117,7 @@ class WarpEngine:
             rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
         ):
             if (me := engine()) is None:
-                raise RuntimeError("the engine that this program calls no longer exists; keep it for as long as the program")
+                raise RuntimeError("the engine of this program no longer exists; keep it as long as the program")
             me._wait()
             with me._lock:
                 me._simulation(qpos.device, qpos.shape[0]).advance((qpos, qvel, rest), inputs, (qpos_out, qvel_out, rest_out))
@@ -140,7 +140,7 @@ class WarpEngine:
         return Physics(qpos=qpos, qvel=qvel, warmstart=rest[: self._model.nv], act=rest[self._model.nv :])
 
     def read_sensors(self, physics: Physics, controls: Controls) -> jax.Array:
-        """The values [nsensordata] of the model's sensors, for an engine that was made with `sensors`."""
+        """Values [nsensordata] of the model's sensors. The engine must be made with `sensors`."""
         return self._advanced(physics, controls)[2][self._model.nv + self._model.na :]
 
     def _advanced(self, physics: Physics, controls: Controls) -> list[jax.Array]:
@@ -152,10 +152,10 @@ class WarpEngine:
         return [x[0] for x in self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None])]
 
     def check(self) -> None:
-        """Checks that no contacts were lost since the last call; waits for the kernel to compile.
+        """Checks that no contacts were lost since the last call. Waits for the kernel to compile.
 
         Raises:
-          ValueError: memory did not suffice; the message names the size that always suffices.
+          ValueError: memory did not suffice. The message has a sufficient size.
         """
         self._wait()
         with self._lock:
@@ -172,10 +172,10 @@ class WarpEngine:
         raise ValueError(f"the warp engine left out contacts that there was no room for: it was made with {cure}")
 
     def _begin_loading(self) -> None:
-        """Compiles the kernel in a thread while XLA compiles the rest: a quarter of a minute, once a machine."""
+        """Compiles the kernel in a thread while XLA compiles the rest. Takes a quarter of a minute, once per machine."""
         if self._loading is None:
             pool = concurrent.futures.ThreadPoolExecutor(2)
-            # Warp wants the module of the function that JAX calls, too, though there is no kernel in it.
+            # Warp also needs the module of the function that JAX calls, though it has no kernel.
             self._loading = [pool.submit(lambda: self._made(1).load()), pool.submit(load, wp.get_module(__name__))]
             pool.shutdown(wait=False)
 
@@ -202,10 +202,10 @@ class WarpEngine:
 
 
 def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[str, str]:
-    """Returns the path that runs, and why.
+    """Path that runs, and the reason.
 
     Raises:
-      ValueError: it does not support the model.
+      ValueError: the path does not support the model.
     """
     left_out, reason = support.unsupported(model), "as asked"
     if left_out and path != "graph":

@@ -1,4 +1,4 @@
-"""Chunks of a sweep: the runs of one task, the resources that a task takes, and the code that its node needs."""
+"""Chunks of a sweep: the runs of a task, the task's resources, and the code that its node needs."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.system import files
 
 NAMES_FILE = "chunk.json"  # names of a chunk's runs, in its folder of the storage
-MOST_RUNS = {"gpu": 64, "cpu": 8}  # of a chunk: the cost of a lost node
+MOST_RUNS = {"gpu": 64, "cpu": 8}  # per chunk, to limit the cost of a lost node
 
 
 class Task(NamedTuple):
-    """Resources that a task takes from a node."""
+    """Resources of a task on a node."""
 
     gpus: int
     cpus: int
 
     def slots(self, resources: Mapping[str, float]) -> int:
-        """Number of tasks that fit a node with these resources."""
+        """Number of tasks that fit on a node with these resources."""
         by_cpus = int(resources.get("CPU", 0) // self.cpus) if self.cpus else 1 << 20
         return min(by_cpus, int(resources.get("GPU", 0) // self.gpus)) if self.gpus else by_cpus
 
@@ -40,14 +40,14 @@ class Chunk(NamedTuple):
     id: str  # digest of the names of its runs
     specs: tuple[RunSpec, ...]
     options: Options
-    lanes: int | None  # runs side by side, at most
-    cores: int | None  # to compute on; None: all
-    storage: Path | None  # folder of its own that all nodes share
-    code: dict[str, str]  # `code_of` the driver
+    lanes: int | None  # most parallel runs
+    cores: int | None  # cores to use; None: all
+    storage: Path | None  # the chunk's folder, shared by all nodes
+    code: dict[str, str]  # the driver's `code_of`
 
 
 def task_of(cpus: int | None, nodes: Sequence[Mapping[str, float]]) -> Task:
-    """Returns the resources of a task: a GPU if the cluster has any, `cpus` cores if given, else the cores of a node.
+    """Resources of a task: one GPU if the cluster has any, else `cpus` cores, by default all cores of a node.
 
     Raises:
       ValueError: no node has them.
@@ -64,14 +64,14 @@ def task_of(cpus: int | None, nodes: Sequence[Mapping[str, float]]) -> Task:
 
 
 def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, size: int | None) -> list[tuple[RunSpec, ...]]:
-    """Splits runs into chunks that share a program, of equal size, so that all slots are busy until the end.
+    """Splits runs into chunks of equal size that share a program, so that all slots are busy until the end.
 
     Args:
       specs: runs to train, grouped by program.
-      task: of each chunk.
-      slots: tasks that the cluster runs at once.
-      lanes: runs side by side, at most.
-      size: runs of a chunk; None: chosen.
+      task: resources per chunk.
+      slots: number of parallel tasks in the cluster.
+      lanes: most parallel runs per task.
+      size: runs per chunk. Default: chosen to fill the slots.
     """
     chunks: list[tuple[RunSpec, ...]] = []
     most = (lanes or MOST_RUNS["gpu"]) if task.gpus else MOST_RUNS["cpu"] * (lanes or 1)
@@ -86,17 +86,17 @@ def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, s
 
 
 def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[RunSpec]) -> list[tuple[RunSpec, ...]]:
-    """Returns the chunks that an earlier driver left in the storage, as they were: a checkpoint belongs to runs side by side.
+    """Chunks that an earlier driver left in the storage. They stay together, because their runs share checkpoints.
 
     Args:
-      storage: of the sweep.
+      storage: storage of the sweep.
       specs: all runs of the sweep.
-      todo: those that have not ended.
+      todo: runs that have not ended.
     """
     by_name, waiting = {fingerprint.trial_name(spec): spec for spec in specs}, set(todo)
     earlier = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():
-        with contextlib.suppress(OSError, ValueError, TypeError):  # damaged: its runs begin from the start
+        with contextlib.suppress(OSError, ValueError, TypeError):  # if damaged, its runs start over
             chunk = tuple(by_name[name] for name in files.read_json(path) if name in by_name)
             if waiting & set(chunk):
                 waiting -= set(chunk)
@@ -118,7 +118,7 @@ def make(
 
 
 def code_of(specs: Sequence[RunSpec]) -> dict[str, str]:
-    """Returns versions and digests of the code that runs depend on: the package, and files of custom components."""
+    """Versions and digests of the code behind the runs: the package, and files of custom components."""
     own = {f"{field} {getattr(run, field)}": text for run in specs for field, text in fingerprint.sources(run).items()}
     flags = {name: str(value) for name, value in fingerprint.jax_flags().items()}
     return {"version of mjx_dher": __version__, "files of mjx_dher": _files_digest(), **flags, **own}
@@ -126,7 +126,7 @@ def code_of(specs: Sequence[RunSpec]) -> dict[str, str]:
 
 @functools.cache
 def _files_digest() -> str:
-    """Digest of the package's files that decide what a run computes."""
+    """Digest of the package's files that affect a run's result."""
     package, digest = Path(files.__file__).parents[1], hashlib.sha256()
     paths = {
         os.path.relpath(os.path.join(root, name), package): Path(root, name)
@@ -140,10 +140,10 @@ def _files_digest() -> str:
 
 
 def custom_code(specs: Sequence[RunSpec]) -> Path | None:
-    """Returns the folder from which custom components are imported, which nodes need; None if all of them are installed.
+    """Folder from which custom components are imported, and which nodes need, or None if all are installed.
 
     Raises:
-      ValueError: they are imported from more than one folder.
+      ValueError: there is more than one folder.
     """
     roots: dict[Path, str] = {}
     for spec in specs:

@@ -20,11 +20,11 @@ from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.system import files, signals, subprocesses
 from mjx_dher.validation import host_and_port
 
-RETRIES = 5  # of a chunk whose worker or node was lost
+RETRIES = 5  # for a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # for the head of a cluster
-LONG_PATH = 27  # characters of a folder in which paths of Ray's sockets are over the system's 107
-STORE_BYTES = 200 << 20  # of the object store of a cluster that is started here; the rest goes to the disk
-# Files beside custom code that no node needs, as .gitignore names them. The package is each node's own.
+LONG_PATH = 27  # characters; in longer folders, paths of Ray's sockets exceed the system's limit of 107
+STORE_BYTES = 200 << 20  # object store of a local cluster; the rest goes to disk
+# Files next to custom code that no node needs, as in .gitignore. Each node has its own package.
 NOT_SENT = ["/mjx_dher", "/envs", ".git", "__pycache__", "/runs", "/sweeps", ".venv", "venv", ".caches"]
 NOT_SENT += ["*.npz", "*.mp4", "*.gif"]
 
@@ -32,31 +32,31 @@ Work = Callable[[Chunk, Tell], list[bytes]]
 
 
 class Running(NamedTuple):
-    """Chunk that Ray runs, or is to run."""
+    """A chunk that Ray runs or will run."""
 
     chunk: Chunk
     ref: Any
 
 
 class LostError(Exception):
-    """A chunk whose worker or node was lost more often than it is retried."""
+    """The worker or node of a chunk was lost more often than it is retried."""
 
 
 class Board:
-    """Actor that passes news from chunks to the driver, and its wish to stop to them."""
+    """Actor that passes news from chunks to the driver, and requests to stop to the chunks."""
 
     def __init__(self) -> None:
         self._stop = False
         self._news: dict[str, News] = {}
 
     def tell(self, news: News) -> bool:
-        """Takes news of a chunk; returns whether to stop."""
+        """Takes news of a chunk. Returns whether to stop."""
         before = self._news.get(news.chunk)
         self._news[news.chunk] = news if before is None else news._replace(lines=(*before.lines, *news.lines)[-20:])
         return self._stop
 
     def look(self, stop: bool) -> list[News]:
-        """Returns the news since the last look, and passes on whether to stop."""
+        """News since the last call. Passes on whether to stop."""
         self._stop = stop
         news, self._news = list(self._news.values()), {}
         return news
@@ -64,27 +64,27 @@ class Board:
 
 @contextlib.contextmanager
 def joined(address: str, code: Path | None) -> Iterator[Cluster]:
-    """Joins a cluster, or starts one on this machine, for as long as the block runs.
+    """Joins a cluster, or starts one on this machine, for the duration of the block.
 
     Args:
       address: local, auto or HOST:PORT.
-      code: folder with custom code, which nodes get.
+      code: folder with custom code, which is sent to the nodes.
 
     Raises:
       ValueError: there is no such cluster, this machine is not part of it, or the code cannot be sent.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
-    started: list[int] = []  # Ray's node: its workers outlive it by seconds
+    started: list[int] = []  # Ray's processes, whose workers outlive them by seconds
     with contextlib.ExitStack() as stack:
         if address == LOCAL:
             parent = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
             parent = parent if len(parent) < LONG_PATH else "/tmp"
             private = stack.enter_context(files.temporary_folder("ray-", parent))
             stack.enter_context(signals.cleaning(lambda: subprocesses.kill_sessions(started)))
-            place = f"{private}/ray"  # Ray opens its folder to every user, so it lies in a private one
+            place = f"{private}/ray"  # inside a private folder, because Ray opens its folder to all users
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}
-            # Ray then listens on 127.0.0.1 alone, and only processes with this token can call it.
+            # Ray then listens only on 127.0.0.1, and only processes with this token can call it.
             os.environ.update({"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token"})
             os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
         else:
@@ -95,7 +95,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
         try:
             with _sessions_of_their_own():
                 ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
-        except Exception as error:  # Ray raises errors of many kinds
+        except Exception as error:  # Ray raises many kinds of errors
             raise ValueError(f"ray: the cluster at {address} cannot be joined ({_first_line(error)})") from error
         started.extend(subprocesses.leaders() if address == LOCAL else ())
         signals.take_back()
@@ -104,7 +104,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
 
 @contextlib.contextmanager
 def _sessions_of_their_own() -> Iterator[None]:
-    """Starts processes, in the block, that a signal to this one's group does not reach: Ray has no option for it."""
+    """Starts processes in their own sessions during the block, so that signals to this group do not reach them."""
     _starting.append(True)
     try:
         yield
@@ -117,7 +117,7 @@ os.register_at_fork(after_in_child=lambda: os.setsid() if _starting else None)
 
 
 def _check_answers(address: str) -> None:
-    """Raises ValueError unless the head of a cluster answers at an address, within seconds."""
+    """Raises ValueError unless the head of a cluster answers at an address within seconds."""
     where = [] if address == "auto" else ["--address", address]
     failure = None
     if where:
@@ -137,7 +137,7 @@ def _first_line(error: Exception) -> str:
 
 
 class Cluster:
-    """A cluster that this program has joined."""
+    """A joined cluster."""
 
     def __init__(self) -> None:
         import ray
@@ -148,27 +148,27 @@ class Cluster:
         self._board: Any = ray.remote(Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here).remote()
 
     def resources(self) -> list[dict[str, float]]:
-        """Returns the resources of each node that is alive."""
+        """Resources of each living node."""
         return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
 
     def submit(self, chunk: Chunk, task: Task, work: Work) -> Running:
-        """Hands a chunk to Ray, which runs it when a node has room, and again if a worker or a node is lost."""
+        """Submits a chunk to Ray, which runs it when a node has room, and again if a worker or node is lost."""
         options: dict[str, Any] = {"num_cpus": task.cpus, "num_gpus": task.gpus, "max_retries": RETRIES}
         if task.gpus:
-            options["max_calls"] = 1  # a process gives a GPU's memory back when it ends
+            options["max_calls"] = 1  # a process releases a GPU's memory when it ends
         else:
             options["runtime_env"] = {"env_vars": {"JAX_PLATFORMS": "cpu"}}
         remote = self._ray.remote(_run).options(name=f"chunk {chunk.id}", **options)
         return Running(chunk, remote.remote(chunk, work, self._board))
 
     def wait(self, running: Sequence[Running], seconds: float) -> list[Running]:
-        """Returns the chunks that have ended, within so many seconds."""
+        """Chunks that end within `seconds`."""
         by_ref = {one.ref: one for one in running}
         ended, _ = self._ray.wait(list(by_ref), num_returns=1, timeout=seconds)
         return [by_ref[ref] for ref in ended]
 
     def result(self, running: Running) -> list[bytes]:
-        """Returns the runs of a chunk that has ended, as `worker.train` does; none if it was cancelled.
+        """Runs of an ended chunk, from `worker.train`. Empty if it was cancelled.
 
         Raises:
           LostError: its worker or node was lost too often.
@@ -190,11 +190,11 @@ class Cluster:
             raise LostError(f"{running.chunk.id}: {_first_line(error)}") from error
 
     def cancel(self, running: Running) -> None:
-        """Takes back a chunk that has not begun."""
+        """Cancels a chunk that has not begun."""
         self._ray.cancel(running.ref, force=False)
 
     def look(self, stop: bool) -> list[News]:
-        """Returns the news of chunks, and passes on whether to stop."""
+        """News of chunks. Passes on whether to stop."""
         try:
             return list(self._ray.get(self._board.look.remote(stop), timeout=3))
         except self._ray.exceptions.RayError:  # the actor is restarting
@@ -202,13 +202,13 @@ class Cluster:
 
 
 def _run(chunk: Chunk, work: Work, board: Any) -> list[bytes]:
-    """Trains a chunk in a worker of Ray's."""
+    """Trains a chunk in a Ray worker."""
     import ray
 
     def tell(news: News) -> bool:
         try:
             return bool(ray.get(board.tell.remote(news), timeout=5))
-        except ray.exceptions.RayError:  # nobody listens; the training goes on
+        except ray.exceptions.RayError:  # nobody listens; training continues
             return False
 
     if chunk.cores is not None:

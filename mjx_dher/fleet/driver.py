@@ -1,4 +1,4 @@
-"""The driver of a sweep on a cluster: hands chunks out, and writes their runs into the sweep's folder as they come back."""
+"""Driver of a sweep on a cluster: submits chunks, and writes returned runs into the sweep's folder."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system.files import BusyError
 
-SECONDS_TO_WAIT = 0.5  # for a chunk to end, between looks at news
+SECONDS_TO_WAIT = 0.5  # for a chunk to end, between checks for news
 
 
 class State(NamedTuple):
     """Progress of the sweep."""
 
-    ended: int  # runs, since this start
-    running: frozenset[str]  # chunks that Ray has
-    slots: int  # chunks that the cluster takes at once, now
+    ended: int  # runs ended since this start
+    running: frozenset[str]  # submitted chunks
+    slots: int  # current number of parallel chunks
     news: Sequence[News]  # since the last state
 
 
@@ -34,7 +34,7 @@ class State(NamedTuple):
 class Job:
     """A sweep to train."""
 
-    folder: Path  # of the sweep
+    folder: Path  # folder of the sweep
     chunks: Sequence[tuple[RunSpec, ...]]
     options: Options
     lanes: int | None
@@ -48,10 +48,10 @@ class Job:
 
 
 def run(cluster: Any, job: Job) -> list[str]:
-    """Trains the chunks of a job; returns a line for each chunk that was lost for good.
+    """Trains the chunks of a job. Returns one line per chunk that was lost for good.
 
-    A few more chunks than slots are out, for a cluster that grows on demand. A lost chunk is trained again from its checkpoints
-    in the storage; without a storage, from the start.
+    Slightly more chunks than slots are submitted, for clusters that grow on demand. A lost chunk is trained again from its
+    checkpoints in the storage, or without storage from the start.
 
     Args:
       cluster: `cluster.Cluster`, or an object with its methods.
@@ -82,14 +82,14 @@ def run(cluster: Any, job: Job) -> list[str]:
         if not stopping and job.should_stop():
             stopping = True
             for one in running:
-                if one.chunk.id not in begun:  # it may be compiling: nothing is lost if nobody waits for it
+                if one.chunk.id not in begun:  # it may be compiling, which need not be awaited
                     cluster.cancel(one)
             running = [one for one in running if one.chunk.id in begun]
     return lost
 
 
 def _deliver(job: Job, chunk: Chunk, parcels: Sequence[bytes]) -> int:
-    """Writes the runs of a chunk that have ended; returns their number. With all of them, its checkpoints are removed."""
+    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns their number."""
     written = 0
     for spec, parcel in zip(chunk.specs, parcels):
         folder = grid.folder_of(job.folder, spec)
@@ -97,7 +97,7 @@ def _deliver(job: Job, chunk: Chunk, parcels: Sequence[bytes]) -> int:
             if parcel:
                 worker.unpack(folder, spec, parcel)
                 written += 1
-        except BusyError as error:  # a program without Ray trains it
+        except BusyError as error:  # a process without Ray trains it
             job.report(f"{folder} was not written: {error}")
     if written == len(chunk.specs) and chunk.storage is not None:
         shutil.rmtree(chunk.storage, ignore_errors=True)

@@ -16,17 +16,17 @@ class FleetOptions:
     """Options of a sweep on a Ray cluster."""
 
     ray: str | None = None
-    """Train on a Ray cluster: local (all GPUs or cores of this machine), auto (the cluster that it is part of) or HOST:PORT of
-    the cluster's head (docs/scaling.md). Needs the extra ray."""
+    """Train on a Ray cluster: local (all GPUs or cores of this machine), auto (this machine's cluster) or HOST:PORT of a
+    cluster's head (docs/scaling.md). Needs the extra ray."""
     ray_cpus: int | None = None
-    """Train on CPUs, each task on this many cores; by default tasks take a GPU each, or all cores of a node without GPUs."""
+    """Train on CPUs with this many cores per task. Default: one GPU per task, or all cores of a node without GPUs."""
     ray_chunk: int | None = None
-    """Runs of a task; by default as many as keep the whole cluster busy."""
+    """Runs per task. Default: as many as keep the whole cluster busy."""
     storage: Path | None = None
-    """Folder that all nodes share, for checkpoints: a lost node then costs no more than one interval."""
+    """Folder shared by all nodes, for checkpoints. A lost node then costs at most one interval."""
 
     def check(self) -> None:
-        """Raises ValueError, naming the option and what is allowed, before Ray is loaded."""
+        """Raises ValueError for an invalid option, before Ray is loaded."""
         if self.ray is None:
             for name in ("ray_cpus", "ray_chunk", "storage"):
                 if getattr(self, name) is not None:

@@ -1,6 +1,6 @@
-"""Trains a chunk on a node, inside Ray's workers, and turns its run folders into bytes and back. Knows nothing of Ray.
+"""Trains a chunk on a node, inside Ray's workers, and converts its run folders to bytes and back. Independent of Ray.
 
-A chunk is trained as a small sweep, in its folder of the storage or in a scratch folder of the node.
+A chunk is trained as a small sweep, in its folder of the storage or in a temporary folder of the node.
 """
 
 from __future__ import annotations
@@ -48,13 +48,18 @@ Tell = Callable[[News], bool]  # returns whether to stop
 
 
 def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[bytes]:
-    """Trains a chunk; resumes it if its folder in the storage has checkpoints.
+    """Trains a chunk, from its checkpoints if its folder in the storage has any.
+
+    Args:
+      chunk: the chunk.
+      make_env: makes the environment of a run.
+      tell: reports progress. Returns whether to stop.
 
     Returns:
-      Each run folder as bytes, as `pack` makes them; empty for a run that has not ended, because of a stop.
+      Each run folder as bytes from `pack`, or empty bytes if a run was stopped.
 
     Raises:
-      ValueError: as `train_runs`; or this node has other code than the driver, or another storage.
+      ValueError: as in `train_runs`, or this node has other code or storage than the driver.
     """
     here = chunks.code_of(chunk.specs)
     names = {**chunk.code, **here}
@@ -81,21 +86,21 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
 
 
 class _Reporter:
-    """Tells the driver about epochs, at most once a second, and learns whether to stop."""
+    """Reports epochs to the driver, at most once a second, and receives requests to stop."""
 
     def __init__(self, chunk: str, tell: Tell):
         self.stop = False
         self._chunk, self._tell, self._lines = chunk, tell, list[str]()
         self._present: Sequence[RunSpec] = ()
-        self._ended = self._steps = self._told_at = 0.0  # steps of runs that were trained before, and of those that are now
+        self._ended = self._steps = self._told_at = 0.0  # steps of earlier runs, and of the current ones
 
     def add_line(self, text: str) -> None:
-        """Keeps a line for the user, unless it is about compiling, which every chunk does."""
+        """Adds a line for the user, unless it is about compiling, which every chunk does."""
         if ": compil" not in text:
             self._lines.append(text)
 
     def on_epoch(self, specs: Sequence[RunSpec], progress: Progress) -> None:
-        """Tells about an epoch; always about the last one."""
+        """Reports an epoch. The last one is always reported."""
         if list(specs) != list(self._present):
             self._present, self._ended = specs, self._ended + self._steps
         self._steps = len(specs) * progress.env_steps
@@ -113,9 +118,9 @@ class _Reporter:
 
 
 def pin(cores: int) -> None:
-    """Keeps this process on `cores` of the node's cores that no other task has, as long as it runs.
+    """Restricts this process to `cores` of the node's cores that no other task uses.
 
-    Call it before JAX starts its threads, one for each core. Without free cores nothing happens.
+    Call it before JAX starts its threads, one per core. Does nothing without free cores.
     """
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else []
     for first in range(0, len(usable) - cores + 1, cores) if cores < len(usable) else ():
@@ -127,37 +132,37 @@ def pin(cores: int) -> None:
             return
 
 
-_held = contextlib.ExitStack()  # locks of this process's cores, which the system releases when it ends
+_held = contextlib.ExitStack()  # locks of this process's cores, released when it ends
 
 
 def pack(folder: Path) -> bytes:
-    """Returns a run folder as bytes: all files except its lock and its checkpoints."""
+    """A run folder as bytes: all files except its lock and checkpoints."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for path in files.inside(folder, folder.rglob("*")):
             name = path.relative_to(folder)
             if path.is_file() and name.parts[0] != run_folder.CHECKPOINTS and not files.is_lock(path):
-                entry = zipfile.ZipInfo(name.as_posix())  # without a time: the same run gives the same bytes
+                entry = zipfile.ZipInfo(name.as_posix())  # without a time, so that equal runs give equal bytes
                 archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED, compresslevel=1)
     return buffer.getvalue()
 
 
 def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
-    """Writes a trial that has ended into its folder, result.json last: the run is there whole, or has not ended.
+    """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended.
 
-    A run that has ended there already stays as it is.
+    An ended run that is already there stays unchanged.
 
     Raises:
-      FolderError: another program has the folder, it cannot be written to, or the bytes are not this trial, whole.
+      FolderError: another process uses the folder, it is not writable, or the bytes are not this complete trial.
     """
     try:
         files.make_folder(folder)
         with files.lock(folder), zipfile.ZipFile(io.BytesIO(parcel)) as archive:
             if results.is_done(folder, spec):
                 return
-            content = {name: archive.read(name) for name in archive.namelist()}  # their checksums are compared
+            content = {name: archive.read(name) for name in archive.namelist()}  # checks their checksums
             (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
-            for path in folder.iterdir():  # left by a run without Ray, or by a driver that was killed
+            for path in folder.iterdir():  # left by a run without Ray, or by a killed driver
                 if not files.is_lock(path):
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
             archive.extractall(folder, [name for name in content if name != run_folder.RESULT_FILE])
@@ -166,6 +171,6 @@ def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
     except OSError as error:
         raise FolderError(f"{folder} cannot be written to ({error.strerror or error}); run the same command again") from error
     except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError) as error:
-        raise FolderError(f"{folder}: the run that came back is damaged ({error})") from error
+        raise FolderError(f"{folder}: the returned run is damaged ({error})") from error
     if (problem := results.trial_problem(folder, spec)) is not None:
-        raise FolderError(f"the run that came back is damaged: {problem}")
+        raise FolderError(f"the returned run is damaged: {problem}")

@@ -114,9 +114,8 @@ def mujoco_warp() -> Any:
     """MJX's copy of MuJoCo Warp.
 
     Private: `mujoco.mjx.third_party.mujoco_warp`.
-    Why: MJX calls each substep separately, with some 170 arrays that XLA passes in and out. The engine calls the step in a
-    CUDA
-      graph instead. The separate package is another version, and needs another Warp.
+    Why: MJX calls each substep separately, with some 170 arrays that XLA passes in and out. The engine calls the step in
+      a CUDA graph instead. The separate package is another version, and needs another Warp.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # MJX may print a line

@@ -1,1 +1,1 @@
-"""The viewer in the browser (extra `view`): what plays, what is shown of it, and the server."""
+"""Viewer in the browser (extra `view`): player, scene, panel and server."""

@@ -1,4 +1,4 @@
-"""Where the viewer's page is served, and who opens it. Loads neither JAX, MuJoCo nor viser."""
+"""Address of the viewer's page, and the browser. Loads neither JAX, MuJoCo nor viser."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from mjx_dher.validation import check_number
 
 
 def check(host: str, port: int) -> int:
-    """Returns the port to serve the page at, once it is known that the viewer can begin; for 0 one that is free.
+    """Checks that the viewer can start. Returns its port, or a free one for 0.
 
     Raises:
-      ValueError: its package is not installed, the port is taken, or the host is no address of this machine.
+      ValueError: its package is not installed, the port is taken, or the host is not an address of this machine.
     """
     require_extra("the viewer", "viser", "view")
     check_number("port", port, "[0, 65535]")
@@ -27,7 +27,7 @@ def check(host: str, port: int) -> int:
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
-            if os.name == "posix":  # as the server itself does; elsewhere this would let two have one port
+            if os.name == "posix":  # like the server; on other systems two processes could share a port
                 trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind(address)
             trial.listen()
@@ -35,12 +35,12 @@ def check(host: str, port: int) -> int:
     except (OSError, UnicodeError) as error:
         if isinstance(error, OSError) and error.errno in (errno.EADDRINUSE, errno.EACCES):
             raise in_use(host, port, error.strerror or str(error)) from None
-        raise ValueError(f"host {host!r} is no address of this machine ({error})") from None
+        raise ValueError(f"host must be an address of this machine; got {host!r} ({error})") from None
 
 
 def in_use(host: str, port: int, reason: str) -> ValueError:
-    """Returns the error for a port that cannot be had."""
-    return ValueError(f"port {port} of {host} cannot be used ({reason}); name another with --port, or 0 for any that is free")
+    """Error for an unavailable port."""
+    return ValueError(f"port {port} of {host} cannot be used ({reason}); pass another --port, or 0 for any free port")
 
 
 def is_ip(host: str) -> bool:
@@ -51,7 +51,7 @@ def is_ip(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is reached from this machine alone."""
+    """Whether an address is reachable only from this machine."""
     return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
 
 
@@ -61,16 +61,16 @@ def is_everywhere(host: str) -> bool:
 
 
 def address(host: str, port: int) -> str:
-    """Returns the page's address for a browser on this machine."""
+    """URL of the page for a browser on this machine."""
     if is_everywhere(host):
         host = "::1" if ":" in host else "127.0.0.1"
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def open_browser(url: str) -> bool:
-    """Opens a page in the user's browser; returns False where there is none that has a screen."""
+    """Opens a page in the user's browser. Returns False if there is no graphical one."""
     on_screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     with contextlib.suppress(webbrowser.Error, OSError):
-        # Browsers in a terminal are of this class itself, and would take the terminal.
+        # Text browsers have this class, and would use the terminal.
         return on_screen and type(webbrowser.get()) is not webbrowser.GenericBrowser and webbrowser.open(url)
     return False

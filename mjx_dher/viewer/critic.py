@@ -1,4 +1,4 @@
-"""The critic of a run, from its newest checkpoint: a finished run has none, because its checkpoints go when it ends."""
+"""The critic of a run, from its newest checkpoint. A finished run has none, because its checkpoints are deleted."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from mjx_dher.types import Env
 
 
 class Critic(NamedTuple):
-    """What a run's critic expects, and how old it is."""
+    """Value function of a run's critic, and its age."""
 
     value: Callable[[Mapping[str, Any], Any], float]  # observation of one state, action [A] -> expected return
     epoch: int  # epochs that had ended
 
 
 def load(folder: Path, run: RunSpec, env: Env) -> Critic:
-    """Returns the critic in the newest checkpoint of a run that was trained alone.
+    """Critic in the newest checkpoint of a run that was trained alone.
 
     Raises:
-      FolderError: there is no checkpoint that can be used, or the run's learner has no `value`; the message says which.
+      FolderError: no checkpoint is usable, or the run's learner has no `value`.
     """
     run = dataclasses.replace(run, demonstrations=None)  # the checkpoint's ring holds them
     train = program.make_loop(env, run, program.choices_of([run]))

@@ -1,7 +1,7 @@
 """Guard of the viewer's port: checks connections, requests and messages before viser gets them. Needs viser.
 
-Any web page can make a browser call this port, and any program on the machine can. So requests must come from the viewer's own
-page, and messages must be those that its panel and its handle send, with values that these allow.
+Any web page can make a browser call this port, and so can any program on the machine. So requests must come from the viewer's
+page, and messages must come from its panel and handle, with allowed values.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from websockets.http11 import Request, Response
 
 from mjx_dher.viewer import address
 
-CLIENTS = 16  # browsers at a time
-WAITING = 64  # connections that are no browsers yet
-MESSAGE_BYTES = 1 << 14  # the page's own have less than 300
-BYTES_PER_SECOND, BURST_BYTES = 100_000, 500_000  # of a client
-MESSAGE_COST = 500  # bytes that a message counts for beside its own; the page sends up to 100 messages a second
-UNSENT_BYTES = 16 << 20  # of a client that sends and does not read
+CLIENTS = 16  # most browsers
+WAITING = 64  # most connections that are not browsers yet
+MESSAGE_BYTES = 1 << 14  # the page's messages have less than 300
+BYTES_PER_SECOND, BURST_BYTES = 100_000, 500_000  # per client
+MESSAGE_COST = 500  # bytes added to a message's own; the page sends up to 100 messages per second
+UNSENT_BYTES = 16 << 20  # for a client that sends and does not read
 SECONDS_TO_READ = 20.0  # for a client that does not read
 HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'none'",
@@ -37,7 +37,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 
-_Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # which NaN is not
+_Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # excludes NaN
 _Pixels = Annotated[int, msgspec.Meta(ge=0, le=100_000)]
 _Vector = tuple[_Number, _Number, _Number]
 _Quaternion = tuple[_Number, _Number, _Number, _Number]
@@ -89,22 +89,22 @@ class Guard:
     """Rules of a port, and its open connections.
 
     Args:
-      host: the address that the user named.
+      host: the user's address.
     """
 
     def __init__(self, host: str):
-        self.controls: dict[str, Callable[[Any], bool]] = {}  # of the panel, by number: whether a value is allowed
+        self.controls: dict[str, Callable[[Any], bool]] = {}  # tests of values, by id of a panel's control
         self.is_used = False
         self._names = {"localhost", host.lower()}
         if not address.is_loopback(host):
             self._names |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-        self.waiting: dict[Connection, None] = {}  # in the order of their calls
+        self.waiting: dict[Connection, None] = {}  # in order of connection
         self.clients: dict[Connection, None] = {}
 
     def options(self, own: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns options for `websockets.asyncio.server.serve`, in place of viser's own."""
+        """Options for `websockets.asyncio.server.serve`, based on viser's."""
         self.is_used = True
-        log = logging.Logger("viewer")  # with no handler: a stranger's errors are not for the user's screen
+        log = logging.Logger("viewer")  # errors of strangers are not shown to the user
         log.addHandler(logging.NullHandler())
         return {
             **own,
@@ -118,7 +118,7 @@ class Guard:
         }
 
     def _answer(self, connection: Connection, request: Request, page: Callable[..., Response | None]) -> Response | None:
-        """Answers a request; returns None for a browser that may connect."""
+        """Answers a request. Returns None if the browser may connect."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return connection.respond(http.HTTPStatus.MISDIRECTED_REQUEST, "no such host here\n")
@@ -136,7 +136,7 @@ class Guard:
         return response
 
     def _is_own(self, host: str) -> bool:
-        """Whether a request's Host cannot be a name that a stranger's DNS server has pointed here."""
+        """Whether a request's Host cannot come from a foreign DNS name that points here."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -144,7 +144,7 @@ class Guard:
         return name in self._names or address.is_ip(name)
 
     def _admit(self, connection: Connection) -> bool:
-        """Admits a browser; of too many, one that has not sent its camera gives way."""
+        """Admits a browser. If there are too many, it replaces one that has not sent its camera."""
         if len(self.clients) >= CLIENTS:
             silent = next((client for client in self.clients if not client.has_camera), None)
             if silent is None:
@@ -156,7 +156,7 @@ class Guard:
 
 
 class Connection(ServerConnection):
-    """Connection that passes on valid messages alone, and that ends if its peer sends too much or reads too little."""
+    """Connection that passes on only valid messages, and that ends if its peer sends too much or reads too little."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any):
         super().__init__(*args, **options)
@@ -199,10 +199,10 @@ class Connection(ServerConnection):
             with contextlib.suppress(msgspec.MsgspecError, TypeError):  # TypeError: a frame of text
                 message = _decode(raw)  # type: ignore[arg-type]
                 if self._is_allowed(message):
-                    return msgspec.msgpack.encode(message)  # not `raw`, of which viser could read something else
+                    return msgspec.msgpack.encode(message)  # not `raw`, which viser could read differently
 
     def _is_allowed(self, message: _Message) -> bool:
-        """Whether viser may have a message. The camera comes first: viser has no client without one."""
+        """Whether viser may get a message. The camera must come first, because viser has no client without one."""
         if isinstance(message, _Camera):
             view = math.dist(message.position, message.look_at)
             is_posed = min(view, math.hypot(*message.up_direction), math.hypot(*message.wxyz)) > 1e-3

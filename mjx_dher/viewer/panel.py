@@ -1,4 +1,4 @@
-"""The panel beside the scene: what to play, how fast, how it goes. Each press of a user's is a command, in order."""
+"""The panel next to the scene: policy, speed and progress. Each user action is a command; commands run in order."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from mjx_dher.system import private_api
 from mjx_dher.viewer.player import Player
 
 SPEEDS = (0.1, 4.0)  # slowest and fastest, times real time
-DRAGGED = ("goal", "object", "nothing")  # one at a time: at a goal that is reached, their handles would lie in one place
+DRAGGED = ("goal", "object", "nothing")  # one at a time, because handles coincide at a reached goal
 _ONCE = ("Step", "New episode")  # buttons
-_SOLID, _DASHED = {"width": 2}, {"width": 1, "dash": (6, 4)}  # as uPlot has lines
+_SOLID, _DASHED = {"width": 2}, {"width": 1, "dash": (6, 4)}  # uPlot's line styles
 _RED, _BLUE, _GREY = "#d62728", "#1f77b4", "#999999"
 
 
 class Commands:
-    """Commands of users, from the thread of the server to the one that plays. A later one replaces one of the same kind."""
+    """Queue of user commands, from the server's thread to the player's. A later command replaces one of the same kind."""
 
     def __init__(self) -> None:
         self._lock, self._waiting = threading.Lock(), dict[str, Callable[[], None]]()
 
     def put(self, kind: str, command: Callable[[], None]) -> None:
-        """Adds a command; returns at once."""
+        """Adds a command and returns at once."""
         with self._lock:
             self._waiting.pop(kind, None)
             self._waiting[kind] = command
 
     def run(self) -> bool:
-        """Runs the commands that wait, in order; returns whether there were any."""
+        """Runs the waiting commands in order. Returns whether there were any."""
         with self._lock:
             waiting, self._waiting = self._waiting, {}
         for command in waiting.values():
@@ -43,13 +43,13 @@ class Panel:
     """Buttons, counters and curves.
 
     Args:
-      gui: of a server of viser's.
-      controls: receives, for each control, whether it may have a value.
-      labels: names of the policies; the first is at play.
-      commands: to put the user's into.
+      gui: GUI of a viser server.
+      controls: receives a test of allowed values for each control.
+      labels: names of the policies. The first one plays.
+      commands: queue for user commands.
       choose: called with a policy's name.
-      player: returns the player as it is then.
-      take: called with what is to be dragged: one of `DRAGGED`.
+      player: returns the current player.
+      take: called with the dragged part, one of `DRAGGED`.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class Panel:
         self._player = player
         self._policy = gui.add_dropdown("Policy", tuple(labels), initial_value=labels[0])
         self._about = gui.add_markdown("")
-        self._play = gui.add_button("Pause", hint="Stop the clock, or let it go on")
-        self._once = gui.add_button_group("Once", _ONCE, hint="A step of 40 ms; another start and goal")
+        self._play = gui.add_button("Pause", hint="Stop or resume the clock")
+        self._once = gui.add_button_group("Once", _ONCE, hint="One step; a new start and goal")
         self._speed = gui.add_slider("Speed", *SPEEDS, step=0.1, initial_value=1.0, hint="Times real time")
-        self._renew = gui.add_checkbox("Next by itself", True, hint="Whether another episode begins when one has ended")
-        self._taken = gui.add_dropdown("Drag", DRAGGED, initial_value=DRAGGED[0], hint="Where the handle is that moves it")
+        self._renew = gui.add_checkbox("Next by itself", True, hint="Start a new episode when one has ended")
+        self._taken = gui.add_dropdown("Drag", DRAGGED, initial_value=DRAGGED[0], hint="Part that the handle moves")
         self._score = gui.add_markdown("")
         self._distance = _curve(gui, "Distance to the goal, cm", ("distance", _RED), ("reached below", _GREY))
         self._critic = gui.add_markdown("")
@@ -102,22 +102,22 @@ class Panel:
         self._player().speed, self._player().renew = float(self._speed.value), bool(self._renew.value)
 
     def adopt(self) -> None:
-        """Hands what is set here to a player that has taken another's place."""
+        """Applies the panel's settings to a new player."""
         self._settle()
         self._player().playing = self._play.label == "Pause"
 
     def name(self, label: str, about: str, critic: str, has_value: bool) -> None:
-        """Shows which policy is at play, and where it comes from."""
+        """Shows the current policy and its origin."""
         if self._policy.value != label:
             self._policy.value = label
         self._about.content, self._critic.content, self._value.visible = about, critic, has_value
 
     def say(self, text: str) -> None:
-        """Shows a sentence in place of where the policy comes from."""
+        """Shows a sentence in place of the policy's origin."""
         self._about.content = text
 
     def update(self, with_curves: bool) -> None:
-        """Shows how it goes."""
+        """Shows the player's progress."""
         player = self._player()
         _assign(self._play, "label", "Pause" if player.playing else "Play")
         _assign(self._renew, "value", player.renew)
@@ -129,21 +129,21 @@ class Panel:
 
 
 def distance_curve(player: Player) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns times, s, distances to the goal, cm, and the distance below which it is reached (0 where the task has none)."""
+    """Times in s, distances to the goal in cm, and the distance at which it is reached, or 0 if the task has none."""
     times, distances, _ = (np.array(x) for x in zip(*player.history))
     threshold = getattr(player.game.env, "distance_threshold", 0.0)
     return times, 100 * distances, np.full_like(times, 100 * threshold)
 
 
 def value_curve(player: Player) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times, s, and the critic's values, for those steps that have one: a chart with NaN in it has no range."""
+    """Times in s and the critic's values, for steps with a value, because a chart with NaN has no range."""
     times, _, values = (np.array(x, float) for x in zip(*player.history))
     has_value = np.isfinite(values)
     return times[has_value], values[has_value]
 
 
 def score(player: Player) -> str:
-    """Returns the counters as Markdown."""
+    """Counters as Markdown."""
     state = "**reached**" if player.success else f"{100 * player.distance:.1f} cm from the goal"
     lines = [f"Episodes reached: **{player.episodes}**"]
     if player.own.attempts or player.is_own:
@@ -155,7 +155,7 @@ def score(player: Player) -> str:
 
 
 def _curve(gui: Any, label: str, *series: tuple[str, str]) -> Any:
-    """Adds a chart with series of a label and a colour each; a grey one is dashed."""
+    """Adds a chart with a label and a colour per series. Grey series are dashed."""
     lines = [{"label": name, "stroke": colour, **(_DASHED if colour == _GREY else _SOLID)} for name, colour in series]
     return gui.add_uplot(
         tuple(np.zeros(1) for _ in range(1 + len(lines))),
@@ -168,9 +168,9 @@ def _curve(gui: Any, label: str, *series: tuple[str, str]) -> Any:
 
 
 def _put(commands: Commands, kind: str, command: Callable[[], None]) -> Callable[[Any], Any]:
-    """Returns a callback of viser's that puts a command, unless the server itself has set the control."""
+    """Viser callback that queues a command, unless the server has set the control."""
 
-    async def callback(event: Any) -> None:  # a coroutine: what a thread ran could come out of order
+    async def callback(event: Any) -> None:  # a coroutine, because threads could change the order
         if event.client_id is not None:
             commands.put(kind, command)
 
@@ -178,6 +178,6 @@ def _put(commands: Commands, kind: str, command: Callable[[], None]) -> Callable
 
 
 def _assign(handle: Any, field: str, value: Any) -> None:
-    """Sets a field of an element where it differs: each time it is set, it is sent."""
+    """Sets a field of an element if it differs, because each assignment is sent."""
     if getattr(handle, field) != value:
         setattr(handle, field, value)

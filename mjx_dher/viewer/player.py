@@ -1,4 +1,4 @@
-"""An environment and a policy in step with a clock: play, pause, move goal and object, count what is reached. Draws nothing."""
+"""Plays a policy in an environment in real time: play, pause, move goal and object, count successes. Draws nothing."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from mjx_dher import context
 from mjx_dher.contract import step_seconds
 from mjx_dher.tools.render import check_drawable, goal_marks
 
-HOLD = 0.6  # s for which the end of an episode is shown before the next one begins
-SHOWN = 10.0  # s that the curves show
-MOST_SECONDS = 0.4  # that are made up for if the machine is too slow; the rest is dropped
+HOLD = 0.6  # s, display time of the end of an episode
+SHOWN = 10.0  # s, range of the curves
+MOST_SECONDS = 0.4  # delay to catch up with if the machine is too slow; the rest is dropped
 
 Act = Callable[[Mapping[str, np.ndarray]], np.ndarray]  # observation of one state -> action [A]
-Value = Callable[[Mapping[str, np.ndarray], np.ndarray], float]  # observation, action [A] -> what a critic expects
+Value = Callable[[Mapping[str, np.ndarray], np.ndarray], float]  # observation, action [A] -> expected return
 Bounds = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]  # lowest and highest x, y and z
 
 
 class Game(NamedTuple):
-    """An environment and its functions for one state, compiled."""
+    """An environment and its compiled functions of one state."""
 
     env: Any
     reset: Callable[[Any], Any]  # seed [] -> state
     step: Callable[[Any, Any], Any]  # state, action [A] -> state
-    move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None where it cannot be moved
+    move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None if it cannot be moved
     move_object: Callable[[Any, Any], Any] | None  # the same
 
     @property
     def dt(self) -> float:
-        """Seconds that a step takes in real time."""
+        """Seconds per step in real time."""
         return step_seconds(self.env)
 
     def steps(self, seconds: float) -> int:
-        """Number of steps that take `seconds` in real time, at least 1."""
+        """Number of steps in `seconds` of real time, at least 1."""
         return max(1, round(seconds / self.dt))
 
 
 def make_game(env: Any) -> Game:
-    """Compiles an environment's functions. A goal can be moved where it has `with_goal`, an object where it has `with_object`.
+    """Compiles an environment's functions. A goal can be moved if it has `with_goal`, and an object if it has `with_object`.
 
     Raises:
       ValueError: the environment cannot be drawn.
     """
     check_drawable(env)
-    has_object = getattr(env, "has_object", True)  # the tasks here share their methods, and not all have an object
+    has_object = getattr(env, "has_object", True)  # all built-in tasks share their methods, even without an object
     is_point = jax.eval_shape(env.reset, jax.random.key(0)).obs["desired_goal"].shape == (3,)
     has_position = bounds(env, "goal") is not None if hasattr(env, "goal_marks") else is_point
 
@@ -73,17 +73,14 @@ def make_game(env: Any) -> Game:
 
 
 def bounds(env: Any, dragged: str) -> Bounds | None:
-    """Returns where a "goal" or an "object" may be put by hand: where resets put it, which is what policies have seen.
-
-    None where the environment does not tell.
-    """
+    """Range in which a "goal" or an "object" may be placed by hand, the range of resets, or None if unknown."""
     box = getattr(env, f"{dragged}_bounds", None)
     return None if box is None else tuple((float(low), float(high)) for low, high in np.transpose(box))  # type: ignore[return-value]
 
 
 @dataclasses.dataclass
 class Tally:
-    """A count of attempts, and of those that ended with the goal reached."""
+    """Numbers of attempts and of successes."""
 
     attempts: int = 0
     reached: int = 0
@@ -98,17 +95,17 @@ class Tally:
 
 
 class Player:
-    """A policy at play in an environment.
+    """A policy that plays in an environment.
 
-    An attempt lasts as many steps as an episode. It begins with a reset, or whenever goal or object are moved, and ends as an
-    evaluation's episode does: it is counted by whether the goal is reached at its last step. While `renew` is set, the next
-    episode begins then; it is unset when something is moved, so that nothing is taken out of a user's hand.
+    An attempt has as many steps as an episode. It begins with a reset, or when goal or object are moved. It counts as a
+    success if the goal is reached at its last step, as in an evaluation. If `renew` is set, the next episode begins then.
+    Moving something unsets `renew`, so that a user can continue.
 
     Args:
       game: the environment.
       act: the policy.
-      value: a critic, where there is one.
-      seed: of the first episode; the next ones have the next numbers.
+      value: the critic, or None.
+      seed: seed of the first episode. Others follow.
     """
 
     def __init__(self, game: Game, act: Act, value: Value | None = None, seed: int = 1):
@@ -129,7 +126,7 @@ class Player:
         self._look()
 
     def advance(self, seconds: float) -> int:
-        """Plays for so many seconds of the clock on the wall, times the speed; returns the number of steps made."""
+        """Plays for `seconds` of real time, times the speed. Returns the number of steps."""
         if not self.playing:
             return 0
         self._owed += seconds * self.speed / self.game.dt
@@ -140,7 +137,7 @@ class Player:
         return min(steps, most)
 
     def step(self) -> None:
-        """Makes one step of the environment, or holds the end of an episode for one."""
+        """Makes one step of the environment, or holds the end of an episode for one step."""
         if self._held:
             self._held -= 1
             if not self._held:
@@ -155,14 +152,14 @@ class Player:
             (self.own if self.is_own else self.episodes).add(self.success)
             self._held = self.game.steps(HOLD) if failed or ended or self.renew else 0
         if failed:
-            self.note = "The physics blew up; a new episode begins."
+            self.note = "The simulation diverged; a new episode begins."
 
     def move_goal(self, position: np.ndarray) -> None:
-        """Puts the goal to a position [3], m, or as near to it as it may be, and begins an attempt of the user's own."""
+        """Moves the goal to a position [3] in m, or as near as allowed, and begins a user's attempt."""
         self._move(self.game.move_goal, "goal", position)
 
     def move_object(self, position: np.ndarray) -> None:
-        """Puts the object to a position [3], m, or as near to it as it may be; see `move_goal`."""
+        """Moves the object to a position [3] in m, or as near as allowed; see `move_goal`."""
         self._move(self.game.move_object, "object", position)
 
     def _move(self, move: Callable[[Any, Any], Any] | None, dragged: str, position: np.ndarray) -> None:
@@ -172,14 +169,14 @@ class Player:
         box = bounds(self.game.env, dragged)
         if box is not None:
             position = np.clip(position, *np.transpose(box)).astype(np.float32)
-        if self._failed:  # which only a reset mends
+        if self._failed:  # only a reset helps
             self.new_episode()
         self._state = move(self._state, position)
         self.clock, self._held, self.is_own, self.renew = 0, 0, True, False
         self._look()
 
     def replace(self, act: Act, value: Value | None) -> None:
-        """Plays another policy from here on, and counts anew."""
+        """Continues with another policy, and resets the counters."""
         self.act, self.value = act, value
         self.episodes, self.own = Tally(), Tally()
         self._look()
@@ -191,18 +188,18 @@ class Player:
 
     @property
     def success(self) -> bool:
-        """Success: whether the goal is reached."""
+        """Whether the goal is reached."""
         return bool(np.asarray(self._state.success) > 0.5)
 
     @property
     def distance(self) -> float:
-        """Distance of what should be at the goal from it, m."""
+        """Distance to the goal in m."""
         distance = getattr(self.game.env, "goal_distance", context.euclidean)
         return float(distance(self.obs["achieved_goal"], self.obs["desired_goal"]))
 
     @property
     def qpos(self) -> np.ndarray:
-        """Configuration [nq], in the layout of the environment's model."""
+        """Configuration [nq] in the layout of the environment's model."""
         return np.asarray(self._state.physics.qpos, np.float64)
 
     @property
@@ -218,10 +215,10 @@ class Player:
         return bool(np.any(getattr(self._state, name, False)))
 
     def _look(self) -> None:
-        """Notes what is to be seen of the state."""
+        """Records the observation, distance and value of the state."""
         self.obs = jax.tree.map(np.asarray, dict(self._state.obs))
         value = float("nan") if self.value is None else self.value(self.obs, self.act(self.obs))
         now = self._steps * self.game.dt
-        if self.history and self.history[-1][0] == now:  # moved, or begun anew, since the last step
+        if self.history and self.history[-1][0] == now:  # moved or restarted since the last step
             self.history.pop()
         self.history.append((now, self.distance, value))

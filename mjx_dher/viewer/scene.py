@@ -1,4 +1,4 @@
-"""A MuJoCo model as a scene of viser's: its geoms, in nodes that move with their bodies."""
+"""A MuJoCo model as a viser scene, with nodes that move with its bodies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-_FLOOR = (0.80, 0.82, 0.85)  # colour of a plane without one
+_FLOOR = (0.80, 0.82, 0.85)  # colour of a plane
 _TYPES = mujoco.mjtGeom
 
 
@@ -17,18 +17,18 @@ class Shape(NamedTuple):
     name: str
     body: int
     kind: int  # mujoco.mjtGeom
-    size: np.ndarray  # [3] as MuJoCo has it
+    size: np.ndarray  # [3] as in MuJoCo
     rgba: np.ndarray  # [4] in [0, 1]
     pos: np.ndarray  # [3] m
     quat: np.ndarray  # [4] w, x, y, z
-    mesh: int  # number of its mesh; -1 for none
+    mesh: int  # index of its mesh, or -1
 
 
 def shapes(model: Any) -> list[Shape]:
-    """Returns the geoms of a compiled model that can be seen, in its order.
+    """Visible geoms of a compiled model, in its order.
 
     Raises:
-      ValueError: a geom of a kind that is not drawn here.
+      ValueError: a geom type is not supported.
     """
     known = {int(kind) for kind in (_TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_SPHERE, _TYPES.mjGEOM_CAPSULE, _TYPES.mjGEOM_ELLIPSOID)}
     known |= {int(kind) for kind in (_TYPES.mjGEOM_CYLINDER, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
@@ -36,9 +36,9 @@ def shapes(model: Any) -> list[Shape]:
     for index in range(model.ngeom):
         rgba, kind = model.geom_rgba[index], int(model.geom_type[index])
         material = int(model.geom_matid[index])
-        if material >= 0 and np.array_equal(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default stands for "the material's"
+        if material >= 0 and np.array_equal(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default means the material's
             rgba = model.mat_rgba[material]
-        if rgba[3] == 0 or model.geom_group[index] > 2:  # the groups that MuJoCo's own viewer shows
+        if rgba[3] == 0 or model.geom_group[index] > 2:  # groups that MuJoCo's viewer hides
             continue
         if kind not in known:
             raise ValueError(f"the viewer does not draw geoms of kind {_TYPES(kind).name}")
@@ -58,16 +58,16 @@ class Poses:
         self._model, self._data = model, mujoco.MjData(model)
 
     def at(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns positions [nbody, 3], m, and orientations [nbody, 4] (w, x, y, z) at a configuration [nq]."""
+        """Positions [nbody, 3] in m and orientations [nbody, 4] (w, x, y, z) at a configuration [nq]."""
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         return self._data.xpos, self._data.xquat
 
 
 def add(scene: Any, model: Any, ghosts: Any = None, rgba: Any = None) -> dict[int, Any]:
-    """Adds a model's geoms to a scene of viser's; returns the nodes of the bodies that have any, by their number.
+    """Adds a model's geoms to a viser scene. Returns the nodes of bodies with geoms, by body number.
 
-    With `ghosts`, these bodies alone are added, a second time and in the colour `rgba` [4].
+    With `ghosts`, only these bodies are added, a second time and in the colour `rgba` [4].
     """
     nodes: dict[int, Any] = {}
     folder = "/bodies" if ghosts is None else "/ghosts"
@@ -85,7 +85,7 @@ def _add_shape(scene: Any, model: Any, shape: Shape, name: str) -> None:
     rgb = tuple(round(255 * float(x)) for x in shape.rgba[:3])
     x, y, z = map(float, shape.size)
     if shape.kind == int(_TYPES.mjGEOM_PLANE):
-        wide, deep = (2 * side if side > 0 else 20.0 for side in (x, y))  # 0: without end
+        wide, deep = (2 * side if side > 0 else 20.0 for side in (x, y))  # 0 means infinite
         scene.add_grid(
             name,
             wide,
@@ -115,12 +115,12 @@ def _add_shape(scene: Any, model: Any, shape: Shape, name: str) -> None:
 
 
 def _mesh(model: Any, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the vertices [V, 3], m, and the triangles [F, 3] of a capsule, an ellipsoid or a mesh."""
+    """Vertices [V, 3] in m and triangles [F, 3] of a capsule, an ellipsoid or a mesh."""
     import trimesh
 
     if shape.kind == int(_TYPES.mjGEOM_CAPSULE):
         mesh = trimesh.creation.capsule(height=2 * float(shape.size[1]), radius=float(shape.size[0]), count=[24, 24])
-        middle = np.mean(mesh.bounds, axis=0)  # releases of trimesh differ in where a capsule begins
+        middle = np.mean(mesh.bounds, axis=0)  # the origin of a capsule depends on trimesh's version
         return np.asarray(mesh.vertices - middle, np.float32), np.asarray(mesh.faces, np.uint32)
     if shape.kind == int(_TYPES.mjGEOM_ELLIPSOID):
         mesh = trimesh.creation.icosphere(subdivisions=3)

@@ -1,4 +1,4 @@
-"""The viewer's server: a page in the browser that shows a player's scene, and takes a user's commands. Needs viser."""
+"""The viewer's server: a page in the browser that shows a player's scene and takes user commands. Needs viser."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from mjx_dher.viewer.player import Game, Player, bounds, make_game
 from mjx_dher.viewer.scene import Poses, add
 from mjx_dher.viewer.sources import Cast, Source
 
-_REACHED = (60, 180, 75)  # colour of a goal that is reached
-_SECONDS_PER_LOOK = 1.0  # between looks for a policy that has been trained further
+_REACHED = (60, 180, 75)  # colour of a reached goal
+_SECONDS_PER_LOOK = 1.0  # between checks for a newer policy
 _SECONDS_PER_CURVE = 0.25
-_BACK = 1.3  # how much farther away than the model's camera the page's is
+_BACK = 1.3  # distance of the page's camera relative to the model's
 
 
 class Viewer:
-    """A page with a scene and a panel, and what plays in it. Use it in a `with` block, and call `run`.
+    """A page with a scene and a panel, and its player. Use it in a `with` block, and call `run`.
 
     Args:
-      sources: policies to choose from; the first is at play.
+      sources: policies to choose from. The first one plays.
       make_env: makes a source's environment.
-      host, port: where the page is served, as `address.check` gave the port.
-      seed: of the first episode.
+      host, port: address of the page, with a port from `address.check`.
+      seed: seed of the first episode.
 
     Raises:
       ValueError: the first policy cannot be played, its environment cannot be drawn, or the port is taken.
@@ -43,7 +43,7 @@ class Viewer:
         self._make_env, self._seed = make_env, seed
         self._games: dict[tuple[Any, ...], Game] = {}
         self._commands = Commands()
-        self._taken, self._held = DRAGGED[0], False  # what has the handle, and whether a user holds it
+        self._taken, self._held = DRAGGED[0], False  # part with the handle, and whether a user holds it
         self._handle: Any = None
         self._cast, self.player = self._prepare(sources[0])
         self._server, controls = _start(host, port)
@@ -58,11 +58,11 @@ class Viewer:
         return self
 
     def __exit__(self, *error: object) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # viser says that it stops
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
             self._server.stop()
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> None:
-        """Plays, in real time, while a browser looks; returns when told to stop."""
+        """Plays in real time while a browser is connected, until `should_stop` returns True."""
         looked = drawn = before = time.monotonic()
         while not should_stop():
             started = time.monotonic()
@@ -83,13 +83,13 @@ class Viewer:
             time.sleep(max(0.002, self.player.game.dt / max(1.0, self.player.speed) / 2 - (time.monotonic() - started)))
 
     def choose(self, label: str) -> None:
-        """Plays the policy by this name; one that cannot be played is told in the panel, and the one before goes on."""
+        """Plays the policy of this name. If it cannot be played, the panel reports it and the previous one continues."""
         source = self._sources[label]
         if source.place not in self._games:
             self._panel.say(f"compiling `{source.env}` ...")
         try:
             cast, player = self._prepare(source)
-        except Exception as error:  # of any kind, from custom code
+        except Exception as error:  # custom code may raise any error
             self._name()
             self._panel.say(f"{label} cannot be played: {error}")
             return
@@ -115,7 +115,7 @@ class Viewer:
         """Shows the player's state."""
         positions, orientations = self._poses.at(self.player.qpos)
         for body, node in self._nodes.items():
-            if body:  # the world stays where it is
+            if body:  # the world does not move
                 node.position, node.wxyz = positions[body], orientations[body]
         places = {"goal": self.player.obs["desired_goal"][:3], "object": self.player.obs["achieved_goal"][:3]}
         if self._handle is not None and not self._held:
@@ -131,12 +131,12 @@ class Viewer:
         self._panel.update(curves)
 
     def take(self, dragged: str) -> None:
-        """Gives the handle to one of `DRAGGED`."""
+        """Attaches the handle to one of `DRAGGED`."""
         self._taken = dragged
         self._draw_scene()
 
     def _draw_scene(self) -> None:
-        """Draws the environment anew."""
+        """Redraws the environment."""
         scene, env = self._server.scene, self.player.game.env
         for name in ("/bodies", "/ghosts", "/handle", "/ball"):
             with contextlib.suppress(KeyError, ValueError):
@@ -158,11 +158,11 @@ class Viewer:
             scale=0.14,
             line_width=4.0,
             disable_rotations=True,
-            # Its own limits are for the way that it has been dragged, not for where it is: the player keeps it in bounds.
+            # Viser's limits apply to the dragged distance, so the player limits the position instead.
             active_axes=tuple(high - low > 1e-9 for low, high in limits),
         )
 
-        async def on_update(event: Any) -> None:  # a coroutine: what a thread ran could come out of order
+        async def on_update(event: Any) -> None:  # a coroutine, because threads could change the order
             position, phase = np.array(event.target.position), event.phase
             self._commands.put("move" if phase == "update" else "hold", lambda: self._drag(dragged, position, phase))
 
@@ -170,7 +170,7 @@ class Viewer:
         return handle
 
     def _drag(self, dragged: str, position: np.ndarray, phase: str) -> None:
-        """Follows a hand: `phase` is start, update or end. The handle may have been given to something else meanwhile."""
+        """Follows the handle. `phase` is start, update or end. Ignored if the handle now belongs to another part."""
         if self._handle is None or dragged != self._taken:
             return
         self._held = phase != "end"
@@ -178,7 +178,7 @@ class Viewer:
             {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](position)
 
     def _aim(self, model: Any) -> None:
-        """Puts the cameras where the model's camera "front" is, if it has one."""
+        """Moves the cameras to the model's camera "front", if it exists."""
         cameras = [model.camera(index) for index in range(model.ncam) if model.camera(index).name == "front"]
         if not cameras:
             return
@@ -194,22 +194,22 @@ class Viewer:
 
 
 def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:
-    """Starts viser's server; returns it, and the place for the panel's controls.
+    """Starts viser's server. Returns it, and a dict for the panel's controls.
 
     Raises:
-      ValueError: another program has taken the port since it was checked.
+      ValueError: another process has taken the port since it was checked.
     """
     import viser
 
     from mjx_dher.viewer.guard import Guard
 
     guard = Guard(host)
-    with contextlib.redirect_stdout(io.StringIO()):  # the address is told by whoever started this
+    with contextlib.redirect_stdout(io.StringIO()):  # the caller prints the address
         with private_api.viser_served_with(guard.options):
             server = viser.ViserServer(host=host, port=port, label="mjx-dher", verbose=False)
-        if server.get_port() != port:  # it takes the next that is free
+        if server.get_port() != port:  # viser takes the next free port
             server.stop()
-            raise address.in_use(host, port, "another program has taken it")
+            raise address.in_use(host, port, "another process has taken it")
         if not guard.is_used:
             server.stop()
             raise ValueError(f"the viewer cannot check requests with viser {viser.__version__}; install viser 1.1.1")

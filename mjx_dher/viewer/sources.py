@@ -1,4 +1,4 @@
-"""What the viewer can play: policies of run folders, which may still be trained, those of the package, and random actions."""
+"""Policies for the viewer: of run folders, which may still be training, bundled ones, and random actions."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ RANDOM = "random actions"
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """A policy by name, and the environment that it is played in."""
+    """A named policy and its environment."""
 
     label: str
     env: str
-    folder: Path | None = None  # of the run; None for random actions
+    folder: Path | None = None  # run folder; None for random actions
     run: RunSpec | None = None
-    env_kwargs: tuple[str, ...] = ()  # arguments of the environment, NAME=VALUE each
+    env_kwargs: tuple[str, ...] = ()  # arguments of the environment as NAME=VALUE
 
     @property
     def place(self) -> tuple[str, tuple[str, ...]]:
@@ -37,16 +37,16 @@ class Source:
 
 
 def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequence[str] = ()) -> Source:
-    """Returns the source of a run's policy, which must be there.
+    """Source of a run's policy, which must exist.
 
     Args:
-      label: its name for the user.
-      folder: of the run.
-      env: the environment to play it in; its own, with its own arguments, where None.
-      env_kwargs: arguments of the environment that take the place of those, NAME=VALUE each.
+      label: name for the user.
+      folder: run folder.
+      env: environment to play in. Default: the run's, with its arguments.
+      env_kwargs: arguments of the environment as NAME=VALUE, which override the run's.
 
     Raises:
-      FolderError: no run folder, or one without a policy.
+      FolderError: it is not a run folder, or has no policy.
       ValueError: the policy is of another Shadow-hand task, whose observations and goals have the same sizes.
     """
     run = run_folder.read_spec(folder)
@@ -59,20 +59,20 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
 
 
 def of_package() -> list[Source]:
-    """Returns the sources of the policies that are part of the package."""
+    """Sources of the bundled policies."""
     return [of_run(name, bundled.FOLDER / name) for name in bundled.names()]
 
 
 def by_random(env: str, env_kwargs: Sequence[str] = ()) -> Source:
-    """Returns the source of uniformly random actions in an environment."""
+    """Source of uniformly random actions in an environment."""
     return Source(f"{RANDOM}, {env}", env, env_kwargs=to_texts(to_arguments(env_kwargs)))
 
 
 class Cast:
-    """A source's policy, and its critic where it has one, in an environment; follows a run that is still being trained.
+    """Policy of a source and its critic, if any, in an environment. Follows a run that is still training.
 
     Raises:
-      ValueError: the policy cannot be read, or is of other sizes than the environment.
+      ValueError: the policy cannot be read, or does not fit the environment.
     """
 
     def __init__(self, source: Source, env: Any):
@@ -83,28 +83,26 @@ class Cast:
         self._seen: tuple[int, ...] = ()
         self._critic_seen: Path | None = None
         if source.folder is not None:
-            self.critic = (
-                "No critic: it is in a run's checkpoints, and this run has none (with --keep-end one that has ended has)."
-            )
+            self.critic = "No critic: it is in a run's checkpoints, and this run has none (--keep-end keeps the last one)."
             if bundled.is_shipped(source.folder):
-                self.critic = "No critic: the policies of the package come without one."
+                self.critic = "No critic: bundled policies come without one."
             self._load()
             self._load_critic()
 
     def refresh(self) -> bool:
-        """Loads what has been trained since, and returns whether there is anything new."""
+        """Loads a newer policy if there is one. Returns whether there was one."""
         if self.source.folder is None or self._stamp() == self._seen:
             return False
         try:
             self._load()
-        except ValueError:  # gone, or damaged, since it was read: what was read goes on
+        except ValueError:  # removed or damaged since it was read; the old one continues
             self._seen = self._stamp()
             return False
         self._load_critic()
         return True
 
     def about(self) -> str:
-        """Returns how far the run has come, as Markdown."""
+        """Progress of the run, as Markdown."""
         folder, text = self.source.folder, f"`{self.source.env}`"
         if folder is None:
             return f"{RANDOM} in {text}"
@@ -118,7 +116,7 @@ class Cast:
                 )
             row: Mapping[str, Any] = results.read_metrics(folder)[-1]
             return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
-        except (FolderError, KeyError, IndexError, OSError, ValueError):  # what it plays is whole, and that is what counts
+        except (FolderError, KeyError, IndexError, OSError, ValueError):  # the policy itself is intact
             return text
 
     def _stamp(self) -> tuple[int, ...]:
@@ -140,7 +138,7 @@ class Cast:
         self.act, self._seen = policy, stamp
 
     def _load_critic(self) -> None:
-        """Loads the critic in the newest checkpoint, if there is another one than was read."""
+        """Loads the critic in the newest checkpoint, unless it is loaded."""
         folder, run = self.source.folder, self.source.run
         assert folder is not None
         assert run is not None
@@ -150,7 +148,7 @@ class Cast:
         self._critic_seen = newest
         try:
             loaded = critic.load(folder, run, self._env)
-        except (ValueError, OSError) as error:  # ValueError: kernels that this machine cannot run, too
+        except (ValueError, OSError) as error:
             self.critic = f"No critic: {error}."
         else:
             self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
