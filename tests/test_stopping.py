@@ -51,10 +51,9 @@ def test_a_signal_while_the_interpreter_ends_does_not_replace_the_status(number)
     """A module's objects are freed late, after the interpreter has restored the signals' defaults."""
     code = f"""
 class Late:
-    def __del__(self):
-        os.kill(os.getpid(), {number:d})
-        time.sleep(0.05)
-sys.late = Late()
+    def __del__(self, kill=os.kill, pid=os.getpid()):
+        kill(pid, {number:d})
+late = Late()
 signals.take()
 sys.exit(3)
 """
