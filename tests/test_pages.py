@@ -75,6 +75,7 @@ def test_each_table_of_results_with_numbers_is_made_from_the_curves():
     heads = [rest.splitlines()[start] for start, _ in tables]
     assert heads == [
         "| departure from the paper | where |",
+        "| term or row | meaning |",
         "| the paper says | finding |",
         "| figure of the paper | ours | command | curves | on one H100 |",
     ]
