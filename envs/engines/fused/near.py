@@ -6,7 +6,7 @@ constraints take later, and keeps those that touch. All lists are in the order o
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
-from mjx_dher.envs.engines.fused.contacts import FAR, geom_of
+from mjx_dher.envs.engines.fused.contacts import geom_of
 from mjx_dher.envs.engines.fused.model import (
     PLANE_BOX,
     PLANE_CAPSULE,
@@ -130,7 +130,6 @@ def keep(
     held.rolling = contacts.rolling
     held.soft = contacts.soft
     held.weight = contacts.weight
-    held.slots = contacts.slots
     held.pair = ints(spare, layout.size, layout.pair, contacts.slots, threads)
     kept = int(0)
     for begin in range(0, near.pairs, threads):
@@ -153,9 +152,7 @@ def keep(
                         wp.atomic_add(lost, 0, 1)
                     at += 1
         kept += all_of(number, threads)
-    for s in range(kept + thread, contacts.slots, threads):
-        memory.distance[s] = FAR
-        held.pair[s] = 0
+    held.slots = wp.min(kept, contacts.slots)
     sync(threads)
     return held
 
