@@ -24,6 +24,7 @@ _NOISE = ("noise_std", "random_noise")
 _CRITICS = ("num_critics", "policy_delay")
 _SMOOTHING = ("target_noise", "target_noise_clip")
 _ENTROPY = ("entropy_weight", "entropy_target")
+_CONTRAST = ("energy", "contrastive_loss", "representation_size", "same_episode", "logsumexp_penalty")
 _QUANTILES = ("num_quantiles", "dropped_quantiles")
 
 # Built-in components by `RunSpec` field and name. Each field also takes a custom component as "module:attribute".
@@ -57,6 +58,7 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "episode": Component("mjx_dher.samplers:episode", "any goal of the episode"),
         "future": Component("mjx_dher.samplers:future", "any goal after the step (Andrychowicz et al. 2017)"),
         "final": Component("mjx_dher.samplers:final", "the last goal of the episode"),
+        "geometric": Component("mjx_dher.samplers:geometric", "goals after the step, those t steps later with weight gamma^t"),
         "closest": Component(
             "mjx_dher.samplers:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
         ),
@@ -178,11 +180,17 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             "tqc with a deterministic actor",
             (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING),
         ),
+        "crl": Component(
+            "mjx_dher.learners.crl:make",
+            "contrastive RL (Eysenbach et al. 2022, JaxGCRL): InfoNCE critic without rewards, stochastic actor",
+            ("policy_delay", *_ENTROPY, *_CONTRAST),
+        ),
     },
     "networks": {
         "mlp": Component("mjx_dher.networks:mlp", "hidden layers with ReLU"),
         "layer_norm": Component("mjx_dher.networks:layer_norm", "mlp with layer normalization in the critics"),
         "fan_in": Component("mjx_dher.networks:fan_in", "mlp with PyTorch's initialization"),
+        "residual": Component("mjx_dher.networks:residual", "residual blocks with layer normalization and swish, of any depth"),
     },
 }
 

@@ -61,6 +61,14 @@ class Config:
     """Return quantiles per critic."""
     dropped_quantiles: Annotated[int, Number("[0, 10000]")] = 2
     """Quantiles per critic dropped from the target, starting with the largest of all critics."""
+    energy: Literal["norm", "l2", "dot", "cosine"] = "norm"
+    """Similarity of phi(s, a) and psi(g): minus their distance, minus its square, their product, or its cosine."""
+    contrastive_loss: Literal["forward", "backward", "symmetric"] = "forward"
+    """InfoNCE over the goals for each action, over the actions for each goal, or the sum of both."""
+    representation_size: Annotated[int, Number("[1, 65536]")] = 64
+    """Numbers in phi(s, a) and psi(g)."""
+    same_episode: Literal["negatives", "masked"] = "negatives"
+    """Goals of the same episode in a batch: negative examples, or left out, because the action may lead to them, too."""
     policy_delay: Annotated[int, Number("[1, 1000]")] = 1
     """Critic steps per actor step: 2 in TD3. Must divide target_period, or be a multiple of it that divides
     updates_per_cycle."""
@@ -121,6 +129,8 @@ class HParams(NamedTuple):
     """Initial weight of the policy's entropy."""
     entropy_target: Annotated[float, Number("(-inf, inf)")] = -1.0
     """Target entropy per action dimension, for which the learner adapts the entropy weight."""
+    logsumexp_penalty: NotNegative = 0.1
+    """Weight of the mean squared logsumexp of the energies in the contrastive loss."""
     hindsight_reward: Share = 1.0
     """Reward factor of relabelled transitions. Below 1, hindsight counts as a better outcome (ARCHER)."""
     obs_clip: Positive = 200.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,13 +16,28 @@ from mjx_dher import components
 from mjx_dher.types import Array, EnvSpec, PRNGKey, PyTree
 
 
-def _mlp(
-    x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, layer_norm: bool = False, fan_in: bool = False
-) -> Array:
-    for size in hidden_sizes:
-        x = nn.Dense(size, dtype=dtype, **_initializers(x, fan_in))(x)
-        x = nn.relu(nn.LayerNorm(dtype=dtype)(x) if layer_norm else x)
-    return nn.Dense(output_size, dtype=jnp.float32, **_initializers(x, fan_in))(x)
+class Style(NamedTuple):
+    """How hidden layers are built."""
+
+    layer_norm: bool = False  # normalizes each layer before its activation
+    fan_in: bool = False  # draws the first weights and biases as PyTorch does (`fan_in`)
+    residual: bool = False  # swish, and blocks of two layers with a skip connection around them (`residual`)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether there are only linear layers and ReLU, which a `policy.Policy` can hold."""
+        return not (self.layer_norm or self.residual)
+
+
+def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, style: Style) -> Array:
+    activation = nn.swish if style.residual else nn.relu
+    skipped: Any = None
+    for number, size in enumerate(hidden_sizes):
+        x = nn.Dense(size, dtype=dtype, **_initializers(x, style.fan_in))(x)
+        x = activation(nn.LayerNorm(dtype=dtype)(x) if style.layer_norm else x)
+        if style.residual and number % 2 == 0:
+            x = skipped = x if skipped is None else x + skipped
+    return nn.Dense(output_size, dtype=jnp.float32, **_initializers(x, style.fan_in))(x)
 
 
 def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:
@@ -44,13 +60,13 @@ class Actor(nn.Module):
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
-    fan_in: bool = False  # see the function of that name
+    style: Style = Style()
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> Array:
         """Maps observations [..., D] and goals [..., G] to actions [..., A]."""
         inputs = jnp.concatenate([observation, goal], axis=-1)
-        return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype, fan_in=self.fan_in))
+        return jnp.tanh(_mlp(inputs, self.hidden_sizes, self.action_size, self.dtype, self.style))
 
 
 class GaussianActor(nn.Module):
@@ -59,13 +75,13 @@ class GaussianActor(nn.Module):
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
-    fan_in: bool = False  # see the function of that name
+    style: Style = Style()
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array) -> tuple[Array, Array]:
         """Maps observations [..., D] and goals [..., G] to means [..., A] and log standard deviations [..., A]."""
         inputs = jnp.concatenate([observation, goal], axis=-1)
-        outputs = _mlp(inputs, self.hidden_sizes, 2 * self.action_size, self.dtype, fan_in=self.fan_in)
+        outputs = _mlp(inputs, self.hidden_sizes, 2 * self.action_size, self.dtype, self.style)
         return outputs[..., : self.action_size], outputs[..., self.action_size :]
 
 
@@ -74,16 +90,41 @@ class Critic(nn.Module):
 
     hidden_sizes: Sequence[int] = (256, 256, 256)
     dtype: DTypeLike = jnp.float32  # of the hidden layers' products and activations
-    layer_norm: bool = False  # before each ReLU
     size: int | None = None  # outputs M; None: one output without an axis
-    fan_in: bool = False  # see the function of that name
+    style: Style = Style()
 
     @nn.compact
     def __call__(self, observation: Array, goal: Array, action: Array) -> Array:
         """Maps observations [..., D], goals [..., G] and actions [..., A] to values [...] or [..., M]."""
         inputs = jnp.concatenate([observation, goal, action], axis=-1)
-        values = _mlp(inputs, self.hidden_sizes, self.size or 1, self.dtype, self.layer_norm, self.fan_in)
+        values = _mlp(inputs, self.hidden_sizes, self.size or 1, self.dtype, self.style)
         return values[..., 0] if self.size is None else values
+
+
+class Encoders(nn.Module):
+    """A contrastive critic's encoders: of an observation and an action, and of a goal. Parameters are float32."""
+
+    hidden_sizes: Sequence[int]
+    dtype: DTypeLike  # of the hidden layers' products and activations
+    size: int  # R
+    style: Style = Style()
+
+    @nn.compact
+    def __call__(self, observation: Array, goal: Array, action: Array) -> tuple[Array, Array]:
+        """Maps observations [..., D], goals [..., G] and actions [..., A] to phi [..., R] and psi [..., R]."""
+        tower = functools.partial(_Tower, self.hidden_sizes, self.dtype, self.size, self.style)
+        return tower(name="phi")(jnp.concatenate([observation, action], axis=-1)), tower(name="psi")(goal)
+
+
+class _Tower(nn.Module):
+    hidden_sizes: Sequence[int]
+    dtype: DTypeLike
+    size: int
+    style: Style
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return _mlp(x, self.hidden_sizes, self.size, self.dtype, self.style)
 
 
 class Networks(NamedTuple):
@@ -121,6 +162,7 @@ class Heads(NamedTuple):
 
     gaussian: bool = False  # the actor returns (mean [..., A], log standard deviation [..., A]), before tanh
     critic_size: int | None = None  # M: the critic returns values [..., M]
+    representation: int | None = None  # R: the critic returns phi [..., R] and psi [..., R], as `Encoders` does
 
 
 PLAIN = Heads()
@@ -133,9 +175,7 @@ _PARAMETERS = ("action_size", "hidden_sizes", "dtype")
 
 def mlp(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
     """The default networks."""
-    actor = GaussianActor if heads.gaussian else Actor
-    critic = Critic(hidden_sizes, jnp.dtype(dtype), size=heads.critic_size)
-    return Networks(actor=actor(action_size, hidden_sizes, jnp.dtype(dtype)), critic=critic)
+    return _styled(action_size, hidden_sizes, dtype, heads, Style(), Style())
 
 
 def layer_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
@@ -143,8 +183,7 @@ def layer_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike
 
     It bounds the critic's values for actions that it never saw (Ball et al. 2023, RLPD).
     """
-    networks = mlp(action_size, hidden_sizes, dtype, heads)
-    return networks._replace(critic=networks.critic.clone(layer_norm=True))
+    return _styled(action_size, hidden_sizes, dtype, heads, Style(), Style(layer_norm=True))
 
 
 def fan_in(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
@@ -153,8 +192,32 @@ def fan_in(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "
     The code behind the paper's numbers uses PyTorch. Xavier's bound, sqrt(6 / (inputs + outputs)), is 1.7 times as large in a
     square layer, and its biases are 0.
     """
-    networks = mlp(action_size, hidden_sizes, dtype, heads)
-    return Networks(actor=networks.actor.clone(fan_in=True), critic=networks.critic.clone(fan_in=True))
+    return _styled(action_size, hidden_sizes, dtype, heads, Style(fan_in=True), Style(fan_in=True))
+
+
+def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
+    """Residual networks of any depth, with layer normalization and swish, for actor and critic.
+
+    Each pair of layers after the first has a skip connection around it (He et al. 2016). Deep contrastive critics need all
+    three parts (Wang et al. 2025, "1000 Layer Networks for Self-Supervised RL").
+
+    Raises:
+      ValueError: `hidden_sizes` are not all equal.
+    """
+    if len(set(hidden_sizes)) != 1:
+        raise ValueError(f"networks residual need hidden_sizes that are all equal; got {hidden_sizes}")
+    style = Style(layer_norm=True, residual=True)
+    return _styled(action_size, hidden_sizes, dtype, heads, style, style)
+
+
+def _styled(
+    action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike, heads: Heads, actor: Style, critic: Style
+) -> Networks:
+    own_actor, dtype = GaussianActor if heads.gaussian else Actor, jnp.dtype(dtype)
+    judge: Any = Critic(hidden_sizes, dtype, heads.critic_size, critic)
+    if heads.representation is not None:
+        judge = Encoders(hidden_sizes, dtype, heads.representation, critic)
+    return Networks(own_actor(action_size, hidden_sizes, dtype, actor), judge)
 
 
 def make(name: str | NetworksFn) -> NetworksFn:
@@ -202,10 +265,16 @@ def check_outputs(learner: str, networks: Networks, spec: EnvSpec, heads: Heads 
     numbers: Any = (2, spec.action_size)
     for part, inputs, expected in (
         ("actor", (obs, goal), (numbers, numbers) if heads.gaussian else numbers),
-        ("critic", (obs, goal, action), (2,) if heads.critic_size is None else (2, heads.critic_size)),
+        ("critic", (obs, goal, action), _critic_shapes(heads)),
     ):
         output = jax.eval_shape(getattr(networks, part).init_with_output, key, *inputs)[0]
         if jax.tree.map(lambda x: getattr(x, "shape", None), output) != expected:
             raise ValueError(
                 f"networks: for learner {learner} the {part} must give {list(expected)} for a batch of 2; it gives {output}"
             )
+
+
+def _critic_shapes(heads: Heads) -> Any:
+    if heads.representation is not None:
+        return (2, heads.representation), (2, heads.representation)
+    return (2,) if heads.critic_size is None else (2, heads.critic_size)

@@ -48,10 +48,14 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     """
     check_name("preset", name, PRESETS)
     best = _LEARNERS.get((name, env), _HAND if is_hand(env) and name in ("cpu", "gpu") else _DDPG)
-    if learner not in (None, best.learner):
+    if learner == "crl":
+        best = _CRL
+    elif learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
     setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name]
     config, hparams = setup(env)
+    if best is _CRL:
+        hparams = hparams._replace(action_l2=0.0, random_eps=0.1)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
     return RunSpec(
         env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **{**best.parts, **changes}
@@ -194,6 +198,7 @@ class _Best(NamedTuple):
 
 _DDPG = _Best("ddpg", "mlp", None)
 _HAND = _Best("tqc", "layer_norm", None)  # not tuned yet
+_CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
 _LEARNERS = {
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),

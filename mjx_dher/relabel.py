@@ -126,6 +126,7 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
         reward=check.array("compute_reward: rewards [B]", reward, (batch_size,), jnp.number),
         discount=jnp.where(_is_terminal(sample, achieved_goal, desired_goal, context), 0.0, _gamma(context)),
         row=sample.row,
+        hindsight_goal=hindsight.goals,
     )
     missed = jnp.sum(relabelled & ~hindsight.offered, dtype=jnp.float32)
     return Relabelled(batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0))

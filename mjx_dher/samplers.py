@@ -101,6 +101,12 @@ def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length
     return _uniform(jnp.arange(achieved.shape[0]) == last)
 
 
+def geometric(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
+    """Weighs the goal t steps later by gamma^t: then a contrastive critic estimates discounted occupancy (Eysenbach 2022)."""
+    later, gamma = jnp.maximum(jnp.arange(achieved.shape[0]) - step, 0), jnp.maximum(hparams.gamma, 1e-30)
+    return future(achieved, desired, step, hparams, length) + later * jnp.log(gamma)
+
+
 def closest(
     achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
 ) -> Array:

@@ -75,6 +75,8 @@ class Batch:
     # and the next observation is m steps ahead.
     discount: Array
     row: Array  # [B] ring row of the transition's episode, int32
+    # [B, G] goal that the sampler chose, whether or not it replaced the desired goal; None in batches made by hand
+    hindsight_goal: Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -95,6 +95,27 @@ def test_every_arm_of_the_ablation_leaves_out_what_its_name_says(ablation, task)
     }
 
 
+def test_the_arms_of_contrastive_rl_and_her_share_all_but_what_their_names_say(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import crl
+
+    for task in crl.SIZES:
+        specs = {arm.name: crl.spec_of("equal", task, arm) for arm in crl.ARMS}
+        for spec in specs.values():
+            validate(spec)
+        differ = {name: set(changes(spec, specs["crl"])) for name, spec in specs.items()}
+        assert differ.pop("crl") == set()
+        assert differ.pop("crl_uniform") == {"sampler"}
+        assert differ.pop("crl_hindsight") == {"her_k"}
+        assert differ.pop("crl_jaxgcrl") == {"her_k", "actor_lr", "critic_lr", "random_eps", "gamma"}
+        assert {frozenset(fields - {"her_k"}) for fields in differ.values()} == {frozenset(("learner", "sampler"))}
+        assert {specs[name].hparams.her_k for name in ("sac_k8", "tqc_k8")} == {8.0}
+        for group in crl.CONTRASTIVE.groups:  # one program each
+            assert len({specs[arm.name].program for arm in crl.ARMS if arm.group == group}) == 1
+        validate(crl.spec_of("equal", task, crl.ARMS[0], True))
+    assert 8 < crl.minutes(("equal",), tuple(crl.SIZES), crl.ARMS, 10) < 14
+
+
 def test_every_arm_of_the_ablation_is_a_toy_too(ablation):
     for arm in ablation.ARMS:
         validate(ablation.spec_of("gpu", "reach", arm, True))

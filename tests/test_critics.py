@@ -8,7 +8,7 @@ import pytest
 
 from mjx_dher.learners import critics
 from mjx_dher.learners.critics import Critics
-from mjx_dher.networks import Critic
+from mjx_dher.networks import Critic, Style
 
 KEY = jax.random.key(0)
 TWO = jnp.array([[[-1.0], [-4.0]], [[-2.0], [-3.0]]])  # two critics, two samples
@@ -126,7 +126,10 @@ def test_critics_begin_apart_and_are_each_that_critic_alone():
 
 def test_layer_norm_normalizes_before_each_relu():
     """Of the default critic with layer_norm, by hand: (x - mean) / sqrt(var + 1e-6), then scale, bias and ReLU."""
-    network, inputs = Critic((4, 4), layer_norm=True), [jnp.array([[0.3, -2.0]]), jnp.array([[1.0]]), jnp.array([[0.5]])]
+    network, inputs = (
+        Critic((4, 4), style=Style(layer_norm=True)),
+        [jnp.array([[0.3, -2.0]]), jnp.array([[1.0]]), jnp.array([[0.5]])],
+    )
     params = network.init(KEY, *inputs)
     layers = params["params"]
     assert set(layers) == {"Dense_0", "LayerNorm_0", "Dense_1", "LayerNorm_1", "Dense_2"}

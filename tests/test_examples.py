@@ -3,7 +3,6 @@
 import re
 
 import any_model
-import contrastive
 import image_reach
 import jax
 import many_copies
@@ -67,14 +66,13 @@ def test_figures_of_any_model_fall(capsys):
 @pytest.mark.parametrize(
     ("example", "arguments", "least"),
     [
-        (contrastive, ["--epochs", "2"], 0.9),
         pytest.param(image_reach, ["--epochs", "3"], 0.8, marks=pytest.mark.slow),
         (trap, ["--epochs", "4"], 0.6),
         pytest.param(trap, ["--epochs", "12", "--dense"], 0.6, marks=pytest.mark.slow),
     ],
 )
 def test_extensions_learn(example, arguments, least, capsys):
-    """Each is one file of a custom task or learner: terminal states, other rewards, images, InfoNCE."""
+    """Each is one file of a custom task or learner: terminal states, other rewards and images."""
     example.main(arguments)
     success = [float(number) for number in re.findall(r"success ([\d.]+)", capsys.readouterr().out)]
     assert success[-1] >= least

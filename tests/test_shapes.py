@@ -35,7 +35,7 @@ KEY = jax.eval_shape(lambda: jax.random.key(0))
 EPISODES = Episode(shape(N, T + 1, D), shape(N, T + 1, G), shape(N, G), shape(N, T, A)).filled()
 RING = jax.eval_shape(lambda: replay.init(jax.tree.map(lambda x: shape(*x.shape[1:], dtype=x.dtype), EPISODES), E))
 SAMPLE = jax.eval_shape(lambda ring, key: replay.sample(ring, key, B), RING, KEY)
-BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B), shape(B), shape(B, dtype=jnp.int32))
+BATCH = Batch(shape(B, D), shape(B, D), shape(B, G), shape(B, A), shape(B), shape(B), shape(B, dtype=jnp.int32), shape(B, G))
 typed = jaxtyped(typechecker=beartype)
 values = lambda tree: tuple(getattr(tree, field.name) for field in dataclasses.fields(tree))  # noqa: E731
 fields = lambda tree: tuple(value for value in values(tree) if value is not None and value is not False)  # noqa: E731
@@ -67,6 +67,7 @@ Drawn = tuple[
     Float[Array, "B A"],
     *(Float[Array, "B"],) * 2,
     Int[Array, "B"],
+    Float[Array, "B G"],
 ]
 Batches = tuple[
     *(Float[Array, "T B D"],) * 2,
@@ -74,6 +75,7 @@ Batches = tuple[
     Float[Array, "T B A"],
     *(Float[Array, "T B"],) * 2,
     Int[Array, "T B"],
+    Float[Array, "T B G"],
 ]
 Rows = tuple[Int[Array, "B"], Int[Array, "E"], Bool[Array, ""]]
 Noise = tuple[Float[Array, "T N A"], Bool[Array, "T N"], Float[Array, "T N A"]]

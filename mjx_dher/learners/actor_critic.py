@@ -13,7 +13,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from mjx_dher.config import Config, HParams
@@ -85,10 +84,9 @@ class ActorCritic(ActorCriticBase):
             values = critics.values(self.learning.critic, critic, batch.observation, batch.desired_goal, batch.action)
             return self.critics.loss(values, atoms), jnp.mean(values)
 
-        (loss, q_mean), gradient = jax.value_and_grad(critic_loss, has_aux=True)(state.params.critic)
-        adam = common.adam(hparams.critic_lr, hparams.adam_eps)
-        updates, critic_moments = adam.update(self.mean(gradient), state.critic_moments)
-        critic = optax.apply_updates(state.params.critic, updates)
+        critic, critic_moments, loss, q_mean = self.descend(
+            critic_loss, state.params.critic, state.critic_moments, hparams.critic_lr, hparams
+        )
         state = dataclasses.replace(
             state,
             params=dataclasses.replace(state.params, critic=critic),
@@ -123,10 +121,9 @@ class ActorCritic(ActorCriticBase):
         def actor_loss(actor: PyTree) -> tuple[Array, Metrics]:
             return self.actor.loss(self.learning.actor, actor, *inputs, judge, normal, hparams)
 
-        (loss, metrics), gradient = jax.value_and_grad(actor_loss, has_aux=True)(state.params.actor)
-        adam = common.adam(hparams.actor_lr, hparams.adam_eps)
-        updates, moments = adam.update(self.mean(gradient), state.actor_moments)
-        actor = optax.apply_updates(state.params.actor, updates)
+        actor, moments, loss, metrics = self.descend(
+            actor_loss, state.params.actor, state.actor_moments, hparams.actor_lr, hparams
+        )
         state = dataclasses.replace(state, params=dataclasses.replace(state.params, actor=actor), actor_moments=moments)
         return state, {"actor_loss": loss, **metrics}
 

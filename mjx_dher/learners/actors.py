@@ -127,7 +127,7 @@ class Deterministic:
 
     def dense(self, network: Any, params: PyTree) -> Any:
         """Linear layers, or None for custom networks."""
-        return params["params"] if isinstance(network, Actor) else None
+        return params["params"] if isinstance(network, Actor) and network.style.is_plain else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Gaussian:
 
     def dense(self, network: Any, params: PyTree) -> Any:
         """Linear layers, without the last layer's outputs for standard deviations, or None for custom networks."""
-        if not isinstance(network, GaussianActor):
+        if not (isinstance(network, GaussianActor) and network.style.is_plain):
             return None
         layers = dict(params["network"]["params"])
         last = f"Dense_{len(layers) - 1}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -129,6 +130,18 @@ class ActorCriticBase(Learner):
         dense = self.actor.dense(self.networks.actor, state.params.actor)
         one_vector = isinstance(self.spec.observation, jax.ShapeDtypeStruct)
         return None if dense is None or not one_vector else from_mlp(dense, state.observation_norm, state.goal_norm, hparams)
+
+    def descend(
+        self, loss: Callable[[Tree], tuple[Array, Any]], params: Tree, moments: PyTree, rate: Array | float, hparams: HParams
+    ) -> tuple[Tree, PyTree, Array, Any]:
+        """Takes one step of Adam down `loss`, a function of `params` that gives (loss [], more).
+
+        Returns:
+          The parameters and Adam's moments after the step, the loss before it, and what `loss` gave more.
+        """
+        (value, more), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+        updates, moments = adam(rate, hparams.adam_eps).update(self.mean(gradient), moments)
+        return optax.apply_updates(params, updates), moments, value, more
 
     def mean(self, gradients: Tree) -> Tree:
         """Mean of the gradients over the devices that share the run."""
