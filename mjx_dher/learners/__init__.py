@@ -134,7 +134,7 @@ def check_values(learner: Any) -> None:
     if not callable(getattr(learner, "value", None)):
         raise ValueError(
             f"learner must have a method value(state, obs, action, hparams), which a priority, metric or generator of this run"
-            f" uses; {learner!r} has none"
+            f" uses; {type(learner).__name__} has none"
         )
 
 
