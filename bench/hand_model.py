@@ -30,6 +30,14 @@ PREFIX = "robot0:"
 TINY = ("V_thbase", "V_thhub")  # boxes of 2 mm
 # A cylinder of this radius with a blunt end, from 0.04 to 0.268 m; within 5 mm of the mesh from 0.04 to 0.26 m.
 FOREARM = 'fromto="0 0.01 0.1075 0 0.01 0.19" size="0.0675"'
+COLORS = (
+    "0.9 0.25 0.2 1",
+    "0.2 0.65 0.3 1",
+    "0.95 0.8 0.2 1",
+    "0.95 0.95 0.95 1",
+    "0.6 0.3 0.75 1",
+    "0.95 0.55 0.15 1",
+)  # marks
 SKIN, SHELL = "0.85 0.87 0.9 1", "0.35 0.37 0.42 1"
 
 
@@ -156,6 +164,9 @@ def hand(model):
     <default class="object">
       <geom contype="2" conaffinity="1" condim="4"/>
       <joint limited="false" margin="0" damping="0.01" armature="0" frictionloss="0"/>
+      <default class="mark">
+        <geom contype="0" conaffinity="0" mass="0"/>
+      </default>
     </default>
   </default>
   <statistic center="1 0.92 0.15" extent="0.45"/>
@@ -169,7 +180,7 @@ def hand(model):
   </asset>
   <worldbody>
     <light directional="true" pos="1 0.6 2" dir="-0.1 0.25 -1" diffuse="0.55 0.55 0.55" specular="0.2 0.2 0.2"/>
-    <camera name="front" pos="1.31 0.62 0.47" xyaxes="0.695 0.719 0 -0.42 0.406 0.812"/>
+    <camera name="front" pos="1.140 0.670 0.432" xyaxes="0.909 0.416 -0.000 -0.308 0.674 0.671"/>
   </worldbody>
 {sections}
 </mujoco>
@@ -192,7 +203,7 @@ def task(name, model, angles):
     <body name="object" pos="{numbers(it.pos)}"{turned} childclass="object">
       <inertial pos="0 0 0" mass="{numbers(it.mass)}" diaginertia="{numbers(it.inertia)}"/>
       <joint name="object" type="free"/>
-      <geom name="object" {OBJECTS[name]} size="{numbers(size)}"/>
+      <geom name="object" {OBJECTS[name]} size="{numbers(size)}"/>{"".join(marks(name))}
     </body>"""
         qpos = numbers([*np.zeros(24), *it.pos, *it.quat])
     else:
@@ -210,6 +221,19 @@ def task(name, model, angles):
   </keyframe>
 </mujoco>
 """
+
+
+def marks(name):
+    """Lines of geoms that show how the object is turned; they touch nothing and weigh nothing."""
+    if name == "block":
+        for i, color in enumerate(COLORS):
+            size, place = np.full(3, 0.017), np.zeros(3)
+            size[i // 2], place[i // 2] = 0.0005, 0.025 * (1 - 2 * (i % 2))
+            yield f'\n      <geom class="mark" type="box" size="{numbers(size)}" pos="{numbers(place)}" rgba="{color}"/>'
+    else:
+        radius, end = (0.0084, 0.1) if name == "pen" else (0.012, 0.029)
+        for sign, color in zip((1, -1), COLORS):
+            yield f'\n      <geom class="mark" type="sphere" size="{radius}" pos="0 0 {sign * end}" rgba="{color}"/>'
 
 
 def compare(name, there):
