@@ -1,4 +1,4 @@
-"""Environments with Brax's interface: Brax itself, MuJoCo Playground and JaxGCRL. None of them is imported here."""
+"""Environments with Brax's interface: Brax itself, MuJoCo Playground and JaxGCRL. Imports none of them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey, PyTree
 from mjx_dher.validation import check_count, check_number
 
 Part = Callable[[Any], Array]  # state of the other environment -> vector
-_WRAPPERS = ("AutoResetWrapper", "VmapWrapper", "BraxAutoResetWrapper")  # also the ends of subclasses' names
+_WRAPPERS = ("AutoResetWrapper", "VmapWrapper", "BraxAutoResetWrapper")  # names of subclasses end in these too
 
 
 @struct.dataclass
 class BraxState:
-    """The other environment's state, with a goal."""
+    """State of the inner environment, with a goal."""
 
     inner: PyTree
     obs: GoalObs
@@ -36,7 +36,7 @@ class BraxState:
 
 @struct.dataclass
 class EndingState(BraxState):
-    """The state of an environment whose `done` ends the episode."""
+    """State of an environment whose `done` ends the episode."""
 
     terminal: Array  # [] bool
 
@@ -68,21 +68,21 @@ class BraxEnv:
         return EnvSpec(obs["observation"], goal_size, self.action_size, self.episode_length, ends=self._ends)
 
     def reset(self, key: PRNGKey) -> BraxState:
-        """Resets the other environment, and keeps the goal that it drew for the episode."""
+        """Resets the inner environment, and keeps its goal for the episode."""
         inner = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), self.env.reset(key))
         return self._state(inner, self._goal(inner), jnp.zeros((), bool))
 
     def step(self, state: BraxState, action: Array) -> BraxState:
-        """Steps the other environment. `action` is [A]; values outside [-1, 1] are clipped."""
+        """Steps the inner environment with an action [A], which is clipped to [-1, 1]."""
         if jnp.shape(action) != (self.action_size,):
             raise ValueError(f"action has shape {jnp.shape(action)}; {self.name} takes ({self.action_size},)")
-        copied = jax.tree.map(lambda x: x, state.inner)  # Brax's environments write into the metrics that they are given
+        copied = jax.tree.map(lambda x: x, state.inner)  # Brax's environments modify their metrics
         following = self.env.step(copied, jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0))
         inner = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), following, state.inner)
         return self._state(inner, state.obs["desired_goal"], state.failed)
 
     def with_goal(self, state: BraxState, goal: Array) -> BraxState:
-        """Returns the state with another desired goal [G]."""
+        """State with another desired goal [G]."""
         return dataclasses.replace(self._state(state.inner, goal, state.failed), reward=state.reward)
 
     def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:
@@ -114,28 +114,28 @@ def from_brax(
     distance: DistanceFn = euclidean,
     ends: bool = False,
 ) -> BraxEnv:
-    """Makes a goal-conditioned task of an environment with Brax's interface.
+    """Makes a goal-conditioned task from an environment with Brax's interface.
 
-    The adapter replaces the reward by -1 and 0, and ignores goals that the other environment draws after the reset.
+    Rewards become -1 and 0, and goals that the inner environment draws after the reset are ignored.
 
     Args:
-      env: an environment of Brax, MuJoCo Playground or JaxGCRL, without wrappers that batch it or reset it.
+      env: an environment of Brax, MuJoCo Playground or JaxGCRL, without wrappers that batch or reset it.
       achieved: maps its state to the achieved goal [G].
       goal: maps the state after a reset to the desired goal [G].
       threshold: largest distance at which the goal is reached.
       episode_length: steps of an episode.
-      observe: maps its state to the observation [D], without the goal; by default the state's `obs`.
-      distance: (achieved [..., G], desired [..., G]) -> [...]; by default Euclidean.
-      ends: what `done` means. True: the episode ends, and no future follows. False: the episode has failed and is not learned
-        from. Under rewards of -1, True makes an early end attractive.
+      observe: maps its state to the observation [D] without the goal. Default: the state's `obs`.
+      distance: (achieved [..., G], desired [..., G]) -> [...]. Default: Euclidean.
+      ends: meaning of `done`. True: the episode ends, and no future follows. False: the episode has failed and nothing is
+        learned from it. With rewards of -1, True makes an early end attractive.
 
     Raises:
-      ValueError: a wrapper batches the environment or resets it, or an argument is out of range.
+      ValueError: a wrapper batches or resets the environment, or an argument is out of range.
     """
     layer = env
     while layer is not None:
         if (kind := type(layer).__name__).endswith(_WRAPPERS):
-            raise ValueError(f"env must not be wrapped in {kind}: pass the environment within")
+            raise ValueError(f"env must not be wrapped in {kind}: pass the inner environment")
         layer = vars(layer).get("env")
     check_number("threshold", threshold, "(0, inf)", float)
     check_count("episode_length", episode_length)

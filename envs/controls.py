@@ -74,7 +74,7 @@ class Actuators(Control):
 
     Args:
       names: names of actuators or of their joints, separated by spaces; "*" and "?" match any characters.
-      together: whether one number of the action moves all of them, like the fingers of a gripper.
+      together: whether one number of the action moves all actuators, like the fingers of a gripper.
     """
 
     def __init__(self, names: str = "*", together: bool = False):

@@ -1,6 +1,6 @@
-"""The Shadow-hand tasks: reach with the fingertips; turn a block, an egg or a pen in the hand.
+"""The Shadow-hand tasks: reach with the fingertips, or turn a block, an egg or a pen in the hand.
 
-The tasks follow gymnasium-robotics 1.4.2: HandReach-v3 and the HandManipulate tasks of version v1, run on mujoco 3.11.0.
+The tasks follow gymnasium-robotics 1.4.2 on mujoco 3.11.0: HandReach-v3, and version v1 of the HandManipulate tasks.
 `bench/hand_model.py` writes the models in envs/assets/hand (docs/fidelity.md).
 """
 
@@ -29,29 +29,29 @@ from mjx_dher.types import Array, PRNGKey
 
 TIPS = ("fftip", "mftip", "rftip", "lftip", "thtip")
 JOINTS = "??J?"  # the names of the hand's 24 joints, such as FFJ3
-RESTING_PLACE = (1.01, 0.87, 0.16)  # m; where an object comes to rest, to a centimetre or so
-OFFSETS = ((-0.04, -0.06, 0.0), (0.04, 0.02, 0.06))  # m; lowest and highest of a goal from where the object came to rest
-PALM_HEIGHT = 0.04  # m; an object that is lower after settling fell out of the hand
-ATTEMPTS = 100  # starts that a reset draws before it takes one that fell; in 800 resets of the originals, none fell
-BESIDE = np.array([0.15, 0.0, 0.0])  # m; where a goal without a position is drawn, from the object's place
+RESTING_PLACE = (1.01, 0.87, 0.16)  # m; approximate resting position of an object
+OFFSETS = ((-0.04, -0.06, 0.0), (0.04, 0.02, 0.06))  # m; lowest and highest goal relative to the resting position
+PALM_HEIGHT = 0.04  # m; a lower object fell out of the hand
+ATTEMPTS = 100  # starts to draw before accepting a fallen object; in 800 resets of the originals, none fell
+BESIDE = np.array([0.15, 0.0, 0.0])  # m; offset of the drawing of a goal without position
 ROTATIONS = ("z", "parallel", "xyz")
-_TURNS = (0.0, 0.5, -0.5, 1.0)  # of pi
+_TURNS = (0.0, 0.5, -0.5, 1.0)  # multiples of pi
 # Euler angles [24, 3], rad, of a cube with its faces parallel to the axes. A quaternion's sign follows from them.
 FACES = np.pi * np.array([*itertools.product(_TURNS, (0.0,), _TURNS), *itertools.product((0.0,), (0.5, -0.5), _TURNS)])
 
 
 class ObjectPose(Goal):
-    """The object's position, m, and orientation, a quaternion (w, x, y, z): [7].
+    """Position in m and orientation of the object, a quaternion (w, x, y, z): [7].
 
-    The distance is an angle, rad, from 0 to 2 pi. As in the original the sign counts: q and -q are a full turn apart. If the
+    The distance is an angle in rad, from 0 to 2 pi. As in the original the sign counts: q and -q are a full turn apart. If the
     position counts, `reach` m are worth `threshold` rad, and the larger of the two is the distance.
 
     Args:
-      rotation: how orientations are drawn: "z", any angle about the vertical; "parallel", one of 24 with the faces parallel to
-        the axes, then any angle about the vertical; "xyz", any angle about any axis.
+      rotation: distribution of orientations. "z": any angle about the vertical. "parallel": one of 24 with the faces parallel
+        to the axes, then any angle about the vertical. "xyz": any angle about any axis.
       positions: whether the position counts.
       reach: largest distance of the positions at which the goal is reached, m.
-      ignores_z: whether the third Euler angle does not count, as for the pen.
+      ignores_z: whether the third Euler angle is ignored, as for the pen.
     """
 
     size = 7
@@ -81,7 +81,7 @@ class ObjectPose(Goal):
         return jnp.concatenate([jax.random.uniform(place_key, (3,), jnp.float32, low, high), draw_rotation(key, self.rotation)])
 
     def distances(self, achieved: Array, desired: Array) -> tuple[Array, Array]:
-        """Distance of the positions, m (0 if they do not count), and of the orientations, rad."""
+        """Distances of the positions in m (0 if they do not count), and of the orientations in rad."""
         quat, other = achieved[..., 3:], desired[..., 3:]
         if self.ignores_z:
             quat = _from_euler(jnp.concatenate([_euler(quat)[..., :2], _euler(other)[..., 2:]], axis=-1))
@@ -94,11 +94,11 @@ class ObjectPose(Goal):
         return jnp.maximum(angle, apart * (self.threshold / self.reach)) if self.positions else angle
 
     def checked(self, goal: Any) -> Array:
-        """Returns a goal [7] with a unit quaternion.
+        """Goal [7] with a unit quaternion.
 
         Raises:
-          ValueError: the shape is another one or, outside `jit`, the quaternion's length is 0 or not finite. Inside `jit`
-            such a goal is NaN, and never reached.
+          ValueError: the shape is wrong or, outside `jit`, the quaternion's length is 0 or not finite. Inside `jit` such a
+            goal is NaN, and never reached.
         """
         goal = jnp.asarray(goal, jnp.float32)
         check_shape("desired_goal", goal, (self.size,))
@@ -116,7 +116,7 @@ class ObjectPose(Goal):
 
 
 class Fingertips(Goal):
-    """Positions of the five fingertips, [15] m. As in the original they are seen one timestep late."""
+    """Positions of the five fingertips, [15] in m. As in the original they are seen one timestep late."""
 
     size = 15
     threshold = 0.01  # m
@@ -138,7 +138,7 @@ class Fingertips(Goal):
         return jnp.concatenate([tip.position(before) for tip in self.tips])
 
     def sample(self, key: PRNGKey) -> Array:
-        """Draws a point above the palm where the thumb and another finger meet; one time in ten, all fingers stay."""
+        """Draws a point above the palm where the thumb and another finger meet. With probability 0.1, all fingers stay."""
         finger_key, place_key, stay_key = jax.random.split(key, 3)
         finger = jax.random.randint(finger_key, (), 0, len(TIPS) - 1)
         meeting = (self.meeting + 0.005 * jax.random.normal(place_key, (3,), jnp.float32))[None]
@@ -157,10 +157,10 @@ class Fingertips(Goal):
 
 
 class Drop(Start):
-    """The object falls into the hand and comes to rest in ten steps of the middle action.
+    """Drops the object into the hand, where it comes to rest in ten steps of the middle action.
 
     Args:
-      rotation: how its orientation is drawn, as for `ObjectPose`; None keeps the model's.
+      rotation: distribution of its orientation, as in `ObjectPose`, or None for the model's orientation.
     """
 
     def __init__(self, rotation: str | None):
@@ -179,18 +179,18 @@ class Drop(Start):
 
 
 class HandTask(MujocoTask):
-    """The Shadow hand, whose 20 servos the action moves: -1 and 1 are the ends of their ranges."""
+    """The Shadow hand, whose action moves 20 servos: -1 and 1 are the ends of their ranges."""
 
     control = Actuators()
     observations: tuple[str, ...] = (f"qpos:{JOINTS}", f"qvel:{JOINTS}")
 
     def init_state(self, qpos: Array, desired_goal: Array, qvel: Array | None = None) -> State:
-        """Returns the state at a given start, for example from a recorded episode.
+        """State at a given start, for example from a recorded episode.
 
         Args:
-          qpos: [24] joint angles, rad, and with an object [7] its position, m, and orientation (w, x, y, z).
+          qpos: [24] joint angles in rad, followed by an object's [7] position in m and orientation (w, x, y, z).
           desired_goal: [G].
-          qvel: [24] rad/s, and with an object [6] its velocity; None for rest.
+          qvel: [24] rad/s, followed by an object's [6] velocity. Default: at rest.
 
         Raises:
           ValueError: an array has another shape, or the goal's quaternion has no length.
@@ -207,7 +207,7 @@ class HandTask(MujocoTask):
 
 
 class HandReach(HandTask):
-    """HandReach-v3: bring the thumb's tip and another finger's together, and leave the others where they are."""
+    """HandReach-v3: bring the tips of the thumb and another finger together, and leave the others where they are."""
 
     name = "hand_reach"
     model = "assets/hand/reach.xml"
@@ -220,14 +220,14 @@ class HandReach(HandTask):
 
 
 class ManipulateTask(HandTask):
-    """The hand and an object. The goal is a pose of the object; a task names a model, a goal and a start."""
+    """The hand and an object. The goal is a pose of the object. A task names a model, a goal and a start."""
 
     episode_length = 100
     observations = (*HandTask.observations, "qvel:object", "qpos:object")
     goal: ObjectPose
 
     def start_physics(self, key: PRNGKey) -> Physics:
-        """Drops the object into the hand, again if it falls out of it."""
+        """Drops the object into the hand, and again if it falls out."""
 
         def fell(drop: tuple[Array, Physics]) -> Array:
             count, physics = drop
@@ -256,7 +256,7 @@ class ManipulateTask(HandTask):
         return self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        """Rewards [...] of goals [..., 7]. Dense: minus the angle, rad, and minus ten times the positions' distance, m."""
+        """Rewards [...] of goals [..., 7]. Dense: minus the angle in rad, and minus ten times the positions' distance in m."""
         if self.reward_type == "dense":
             apart, angle = self.goal.distances(achieved_goal, desired_goal)
             return -(10.0 * apart + angle)
@@ -320,7 +320,7 @@ class Pen(ManipulateTask):
 
 
 def draw_rotation(key: PRNGKey, kind: str) -> Array:
-    """Draws a unit quaternion [4] (w, x, y, z), whose w is not negative for "z" and "xyz"; `ObjectPose` has the kinds."""
+    """Draws a unit quaternion [4] (w, x, y, z), with w >= 0 for "z" and "xyz". `ObjectPose` documents the kinds."""
     angle_key, key = jax.random.split(key)
     half = jax.random.uniform(angle_key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
     axis = jax.random.uniform(key, (3,), jnp.float32, -1.0, 1.0) if kind == "xyz" else jnp.array([0.0, 0.0, 1.0])
@@ -333,17 +333,17 @@ def draw_rotation(key: PRNGKey, kind: str) -> Array:
 
 @functools.partial(jnp.vectorize, signature="(e)->(q)")
 def _from_euler(angles: Array) -> Array:
-    """Quaternions [..., 4] of turns by angles [..., 3], rad, about x, the new y, then the new z. The angles give the sign."""
+    """Quaternions [..., 4] of turns by angles [..., 3] in rad about x, the new y, then the new z. The sign follows too."""
     (a, b, c), (x, y, z) = jnp.cos(0.5 * angles), jnp.sin(0.5 * angles)
     return jnp.stack([a * b * c - x * y * z, x * b * c + a * y * z, a * y * c - x * b * z, a * b * z + x * y * c])
 
 
 @functools.partial(jnp.vectorize, signature="(q)->(e)")
 def _euler(quat: Array) -> Array:
-    """Euler angles [..., 3], rad, of quaternions [..., 4]."""
+    """Euler angles [..., 3] in rad of quaternions [..., 4]."""
     return matrix_to_euler(quat_to_matrix(quat))
 
 
 def _norm(vector: Array) -> Array:
-    """Length over the last axis, from a sum: a dot product would have the learner's precision on a GPU."""
+    """Length over the last axis. A sum, because a dot product would use the learner's precision on a GPU."""
     return jnp.sqrt(jnp.sum(jnp.square(vector), axis=-1))

@@ -1,4 +1,4 @@
-"""Entries of an observation, by name."""
+"""Named entries of an observation."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ class Range(NamedTuple):
 
 
 class Start:
-    """Initial configuration, parts of which are drawn at each reset.
+    """Initial configuration, partly drawn at each reset.
 
     Args:
       keyframe: name of a keyframe of the model, or None for the model's default configuration.
@@ -81,7 +81,7 @@ class Start:
 
 
 def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
-    """First index in qpos and in qvel, and limits, of free bodies (3 numbers) and of hinges and slides (1), by name."""
+    """For each name of a free body, hinge or slide: first index in qpos and in qvel, and limits (3 numbers, or 1)."""
     places = {}
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))

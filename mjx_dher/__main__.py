@@ -7,7 +7,7 @@ from mjx_dher.system import signals
 
 
 def main() -> int:
-    """Runs the command line. The signals come first: what it imports takes seconds, and much of it is written in C."""
+    """Runs the command line. Signal handling comes first, because imports take seconds."""
     signals.take()
     # The thread that reads them gets Ctrl-C. Programs that libraries start, as glfw does, inherit the mask, and keep quiet.
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])

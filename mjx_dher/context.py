@@ -1,4 +1,4 @@
-"""`Context`: inputs of relabelling, priorities and goal generators besides the data.
+"""`Context`: inputs of relabelling, priorities and goal generators in addition to the data.
 
 It holds the task's goal functions, the run's numbers and progress, and the learner's values. The trainer makes one per cycle,
 with the current learner.
@@ -38,7 +38,7 @@ class Values(NamedTuple):
 
 
 class Context(NamedTuple):
-    """Inputs of a method besides the data. To relabel by hand, you need only the first two fields."""
+    """Inputs of a method in addition to the data. To relabel by hand, you need only the first two fields."""
 
     compute_reward: RewardFn
     hparams: HParams
@@ -109,8 +109,8 @@ def of_each_episode(function: Callable[[Any], Array], episodes: Any) -> Array:
 def one_of(functions: Sequence[Callable[..., Any]], index: str) -> Callable[..., Array]:
     """Joins functions of one signature into one whose result the traced number `hparams.<index>` selects.
 
-    All functions are computed, so each lane gets exactly the result of its own function. One argument must be an `HParams`
-    with the field `index`, or a `Context` with such `hparams`.
+    All functions are computed, so each lane gets exactly the result of its function. One argument must be an `HParams` with
+    the field `index`, or a `Context` with such `hparams`.
     """
 
     def chosen(*args: Any, **more: Any) -> Array:

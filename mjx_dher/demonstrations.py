@@ -53,7 +53,7 @@ def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
 
 
 def _named(episode: Episode) -> dict[str, Any]:
-    """Leaves of an episode by name: "observation", or "observation/NAME" for each leaf of a tree."""
+    """Leaves of an episode and their names: "observation", or "observation/NAME" for each leaf of a tree."""
     leaves = jax.tree_util.tree_leaves_with_path(episode)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 

@@ -1,7 +1,7 @@
-"""Deterministic evaluation of a policy: episodes, their outcomes and a summary.
+"""Deterministic evaluation of a policy: episodes, outcomes and a summary.
 
-`evaluate` is traced by the trainer and compiled programs. `play_policy` evaluates a trained policy from Python, and
-`summarize` adds confidence intervals. More than `CHUNK` episodes are played in chunks, each with its own key.
+The trainer and compiled programs trace `evaluate`. `play_policy` evaluates a trained policy from Python, and `summarize` adds
+confidence intervals. More than `CHUNK` episodes are played in chunks with different keys.
 """
 
 from __future__ import annotations

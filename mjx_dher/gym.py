@@ -268,7 +268,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, rewards, terminated, truncated, infos
 
     def _seeds(self, which: np.ndarray) -> np.ndarray:
-        """Seeds [N] int32. Draws only those of the copies in the mask `which` [N]."""
+        """Seeds [N] int32. Only the copies in the mask `which` [N] draw new ones."""
         drawn = (episode_seed(random) if one else 0 for random, one in zip(self._np_random, which))
         return np.fromiter(drawn, np.int32, self.num_envs)
 

@@ -1,7 +1,7 @@
 """Replay ring of whole episodes on the device.
 
-Each observation is stored once, without a next-observation copy. A sampled transition reads only the row of its own episode.
-Episodes that end early are padded to T steps, and padded steps are never drawn. All functions are pure.
+Each observation is stored once, without a next-observation copy. A sampled transition reads only its episode's row. Episodes
+that end early are padded to T steps, and padded steps are never drawn. All functions are pure.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def sum_factor(values: Array) -> Array:
 
 
 def mean(values: Array, number: Array | int) -> Array:
-    """Mean [] of `number` of the values [E], of which the others are 0. It does not overflow, and is 0 if `number` is 0."""
+    """Mean [] of `number` of the values [E], if the others are 0. It does not overflow, and is 0 if `number` is 0."""
     factor = sum_factor(values)
     return jnp.sum(values * factor) / jnp.maximum(number, 1).astype(jnp.float32) / factor
 

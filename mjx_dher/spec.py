@@ -1,4 +1,4 @@
-"""`RunSpec`, the description of a run: components by name, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
+"""`RunSpec`, the description of a run: names of components, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class RunSpec:
 
     @property
     def env_arguments(self) -> dict[str, Argument]:
-        """Arguments for `envs.make`, by name."""
+        """Keyword arguments for `envs.make`."""
         return to_arguments(self.env_kwargs)
 
     @property
@@ -113,7 +113,7 @@ def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
 
 
 def to_texts(arguments: Mapping[str, Argument]) -> tuple[str, ...]:
-    """Formats arguments as "NAME=VALUE" texts, sorted by name. Inverse of `to_arguments`."""
+    """Formats arguments as sorted "NAME=VALUE" texts. Inverse of `to_arguments`."""
     return tuple(f"{name}={_to_text(value)}" for name, value in sorted(arguments.items()))
 
 

@@ -1,4 +1,4 @@
-"""Support of a model by the engines: the reason against each of them, and a fix."""
+"""Support of a model by the engines: reasons against it, and fixes."""
 
 from __future__ import annotations
 

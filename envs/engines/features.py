@@ -66,7 +66,7 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
 
     Args:
       model: compiled MJCF.
-      concerns: whether to check a field, by name.
+      concerns: whether to check a field of this name.
     """
     features: list[str] = []
     defaults = _defaults()

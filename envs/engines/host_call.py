@@ -1,4 +1,4 @@
-"""NumPy functions that compiled JAX programs on a CPU call by name.
+"""NumPy functions that compiled JAX programs on a CPU call through a name.
 
 `jax.pure_callback` puts a function's address into the program, which JAX therefore cannot cache. Here the program has a name,
 as an attribute of a call of XLA's foreign function interface. The structs below are declared in xla/ffi/api/c_api.h, a stable

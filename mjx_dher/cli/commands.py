@@ -1,4 +1,4 @@
-"""The commands by name, with their modules, and the parser of their arguments."""
+"""All commands with their modules, and the parser of their arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `list`: all tasks, components, engines, presets and policies by name."""
+"""The command `list`: names of all tasks, components, engines, presets and policies."""
 
 from __future__ import annotations
 

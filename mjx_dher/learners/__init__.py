@@ -1,4 +1,4 @@
-"""Learners: `Learner` is the protocol, `make` makes one by name."""
+"""Learners: the protocol `Learner`, and `make`."""
 
 from __future__ import annotations
 

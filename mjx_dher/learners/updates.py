@@ -27,9 +27,7 @@ def update_round(learner: Learner, period: int, hparams: HParams, state: PyTree,
 
 
 def _delayed_update(learner: Learner, period: int, hparams: HParams, state: PyTree, batches: Batch) -> tuple[PyTree, Metrics]:
-    """Makes `policy_delay` updates, of which the last includes the actor, and moves targets that are due. Returns the last
-    metrics.
-    """
+    """Makes `policy_delay` updates, the last with the actor, and moves targets that are due. Returns the last metrics."""
     delay = learners.policy_delay(learner)
     for number in range(1, delay + 1):
         batch = jax.tree.map(lambda x, i=number - 1: x[i], batches)

@@ -108,7 +108,7 @@ def any_process(flag: bool) -> bool:
 
 
 def check_equal(described: Mapping[str, Any]) -> None:
-    """Raises ValueError in all processes, naming the fields, unless `described` is the same in all of them."""
+    """Raises ValueError in all processes, naming the fields, unless `described` is equal everywhere."""
     if is_alone():
         return
     own = json.loads(json.dumps(dict(described), default=str))

@@ -1,7 +1,8 @@
 """Functions of a training loop, placed on the devices of a `Layout`. They lower and compile like the ones of `jax.jit`.
 
-Parallel runs: every device runs the single-device program, so results are bit-identical. (A program for several devices would
-round differently, because XLA simplifies it in another order.) A run on several devices: one program for the mesh.
+For parallel runs, every device runs the single-device program, so results are bit-identical. (A program for several devices
+would round differently, because XLA simplifies it in another order.) For a run on several devices, there is one program for
+the mesh.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def _place(
 class _PerDevice:
     """A function of parallel runs: one JAX stage (jitted, lowered or compiled) per device of this process.
 
-    Arguments and results lead with [L], of which each device has an equal part.
+    Arguments and results lead with [L]. Each device has an equal part.
     """
 
     def __init__(self, layout: Layout, stages: Sequence[Any]):
@@ -94,7 +95,7 @@ class _PerDevice:
         return _PerDevice(self._layout, [stage.lower(*own) for stage, own in zip(self._stages, shapes)])
 
     def compile(self, compiler_options: Any = None) -> _PerDevice:
-        """Compiles the function for each device. On GPUs, JAX's cache serves all but the first."""
+        """Compiles the function for each device. On GPUs, only the first compilation takes time; the others use JAX's cache."""
         return _PerDevice(self._layout, [stage.compile(compiler_options=compiler_options) for stage in self._stages])
 
     def memory_analysis(self) -> Any:

@@ -98,7 +98,7 @@ class Policy:
         return xp.tanh(x)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The policy's arrays by name, float32: layerI_kernel [in, out], layerI_bias [out], and the other fields."""
+        """Named arrays of the policy, float32: layerI_kernel [in, out], layerI_bias [out], and the other fields."""
         arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
         arrays |= {field: getattr(self, field) for field in (*_VECTORS, *_SCALARS)}
         return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}

@@ -20,7 +20,7 @@ _SIZES = tuple(field.name for field in dataclasses.fields(Config))
 def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
     """Every setting with every seed, sorted by environment, then seed, so that runs to compare end together.
 
-    Settings that a run does not read are set to those of the environment's first setting, and duplicates are dropped.
+    Settings that a run does not read get the values of the environment's first setting, and duplicates are dropped.
     """
     settings: dict[RunSpec, None] = {}
     first: dict[str, RunSpec] = {}

@@ -95,7 +95,7 @@ def comparison(rows: Sequence[Row]) -> Any:
 
 
 def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict[str, Any]:
-    """The three figures of an environment, by name."""
+    """The three figures of an environment and their names."""
     return {
         "curves": curves(groups, threshold),
         "thresholds": thresholds(groups, rows, threshold),

@@ -57,7 +57,7 @@ def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
 
 
 def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
-    """Paths in a folder, sorted, none of which may lead out of it.
+    """Sorted paths in a folder. Links to other places are rejected.
 
     Raises:
       FolderError: a path is a link to elsewhere.

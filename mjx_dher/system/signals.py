@@ -93,7 +93,7 @@ class _Signals:
         return []
 
     def end(self, number: int) -> None:
-        """Ends the process, whatever its other threads do. Open files are closed as by a kill."""
+        """Ends the process at once. Open files are closed as by a kill."""
         limit = threading.Timer(SECONDS_TO_CLEAN, os._exit, [128 + number])
         limit.daemon = True
         limit.start()
@@ -143,7 +143,7 @@ def children() -> list[int]:
 
 
 def _kill_children() -> None:
-    """Kills child processes that libraries have started, except those with their own session, such as a browser."""
+    """Kills child processes that libraries have started, except in other sessions, such as a browser."""
     for pid in children():
         if os.getsid(pid) == os.getsid(0):
             os.kill(pid, signal.SIGKILL)

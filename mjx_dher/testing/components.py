@@ -92,7 +92,7 @@ def check_sampler(
 
 
 def _check_log_weights(values: NDArray, alone: NDArray) -> str:
-    """Checks log weights [N, T, T+1], and those of episode 0 at its last step, computed `alone`. Returns a line."""
+    """Checks log weights [N, T, T+1], and the weights of episode 0 at its last step, computed `alone`. Returns a line."""
     wrong = np.argwhere(~(values < np.inf))  # NaN, too
     if len(wrong):
         n, t, i = wrong[0]

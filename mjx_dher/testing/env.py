@@ -67,7 +67,7 @@ def _draw(key: jax.Array, shape: tuple[int, int, int]) -> tuple[jax.Array, jax.A
 
 
 def _outputs(state: Any) -> dict[str, Any]:
-    """Arrays of a state that the library reads, by name, with one entry per leaf of the observation."""
+    """Named arrays of a state that the library reads, with one entry per leaf of the observation."""
     flags = {name: getattr(state, name) for name in contract.FLAGS if hasattr(state, name)}
     obs = {name: state.obs[name] for name in ("observation", *GOALS)}
     named = {**obs, "reward": state.reward, "success": state.success, **flags}

@@ -68,7 +68,7 @@ def subplots(rows: int, columns: int, width: float, height: float, **options: An
 def label_success(
     figure: Any, axes: Sequence[Any], units: Sequence[str], names: Sequence[str], columns: int, title: str
 ) -> None:
-    """Labels axes of success rates over several units, and adds one legend for all of them."""
+    """Labels axes of success rates over several units, and adds one common legend."""
     for axis, unit in zip(axes, units):
         axis.set_xlabel(unit)
         axis.set_xlim(left=0)

@@ -31,7 +31,7 @@ class Commands:
             self._waiting[kind] = command
 
     def run(self) -> bool:
-        """Runs the waiting commands in order. Returns whether there were any."""
+        """Runs the waiting commands in order. Returns True if there were any."""
         with self._lock:
             waiting, self._waiting = self._waiting, {}
         for command in waiting.values():

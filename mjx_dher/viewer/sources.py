@@ -90,7 +90,7 @@ class Cast:
             self._load_critic()
 
     def refresh(self) -> bool:
-        """Loads a newer policy if there is one. Returns whether there was one."""
+        """Loads a newer policy. Returns False if there is none."""
         if self.source.folder is None or self._stamp() == self._seen:
             return False
         try:
