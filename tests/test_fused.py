@@ -11,7 +11,7 @@ from mjx_dher import envs
 from mjx_dher.envs.engines.base import Controls, Physics
 from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
-from mjx_dher.envs.engines.fused.memory import carve
+from mjx_dher.envs.engines.fused.memory import carve, layout_of
 from mjx_dher.envs.engines.fused.model import Memory
 from mjx_dher.envs.engines.fused.simulation import Simulation, most_rows, most_warps
 from mjx_dher.envs.engines.fused.sparse import sparse_of
@@ -160,7 +160,7 @@ def test_fields_of_memory_follow_one_another():
     model = envs.make("push", engine="native").model
     contacts, dofs, sparse = setup.contacts_of(model), setup.dofs_of(model), sparse_of(model)
     for rows in (10, 96):
-        layout = setup.layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs, sparse)
+        layout = layout_of(model, setup.world_of(model, contacts, rows), contacts, dofs, sparse)
         begin = dict(zip(names, layout.begin.numpy()))
         own = [begin[name] for name in names if name not in ("factor", "jacobian")]
         assert own == sorted(own)

@@ -11,6 +11,7 @@ from mjx_dher import envs
 from mjx_dher.envs import engines
 from mjx_dher.envs.engines.features import fields
 from mjx_dher.envs.engines.fused import setup
+from mjx_dher.envs.engines.fused.memory import layout_of
 from mjx_dher.envs.engines.fused.sparse import sparse_of
 from mjx_dher.envs.engines.fused.support import has_default, is_read, unsupported
 from mjx_dher.envs.engines.pairs import all_pairs
@@ -102,7 +103,7 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
         recorded = Recorded(each, seen)
         contacts, dofs, sparse = setup.contacts_of(recorded), setup.dofs_of(recorded), sparse_of(recorded)
         setup.bodies_of(recorded)
-        setup.layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs, sparse)
+        layout_of(recorded, setup.world_of(recorded, contacts, 100), contacts, dofs, sparse)
     read = {name for name, _ in fields(model) if is_read(name)}
     # What decides whether a model is taken, and what only contacts of geoms that no pair lists have.
     decides = {"actuator_biastype", "eq_objtype", "wrap_type"}

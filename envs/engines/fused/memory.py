@@ -1,8 +1,57 @@
 """One environment's memory, made of one array of floats."""
 
+from typing import Any
+
+import mujoco
+import numpy as np
+
 from mjx_dher.envs.engines.fused.model import Layout, Memory
+from mjx_dher.envs.engines.fused.near import PAIR_WORDS, SLOT_WORDS
+from mjx_dher.envs.engines.fused.setup import fill, links_of
 from mjx_dher.envs.engines.fused.threads import floats, ints, matrices, quats, spatials, vec3s
 from mjx_dher.system.warp_setup import wp
+
+
+def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, sparse: Any) -> Any:
+    """Returns `Layout` for a model.
+
+    `jacobian` begins with the first fields, whose place it takes; so do contacts of near pairs. `factor` begins with `pos`.
+    """
+    nb, nv, rows = len(links_of(model).body), model.nv, world.rows
+    lengths = {
+        **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
+        **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "qvel"), nv),
+        "mass": nv * nv,
+        "factor": nv * nv,
+        "qpos": model.nq,
+        **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
+        **dict.fromkeys(("touching", "slot"), contacts.slots),
+        "limited": dofs.limits,
+        "counts": 2,
+        "jacobian": rows * nv,
+        **dict.fromkeys(("weight", "residual", "change"), rows),
+        **{f"sparse_{name}": sparse.rows for name in ("weight", "residual", "change", "slope")},
+    }
+    fields: dict[str, Any] = Memory.vars
+    size_of = {name: int(np.prod(getattr(field.type.dtype, "_shape_", ()), dtype=int)) for name, field in fields.items()}
+    taken = {name: lengths[name] * size_of[name] for name in fields}  # floats
+    names = list(fields)
+    pos, mass, factor = (names.index(name) for name in ("pos", "mass", "factor"))
+    early = [] if world.equalities else ["velocity", "bias"]  # of use to equalities alone, once forces are known
+    groups = [names[:pos] + early, [name for name in names[pos:mass] if name not in early], names[mass:factor]]
+    begin, end = {}, 0
+    least = [max(taken["jacobian"], PAIR_WORDS * contacts.near + SLOT_WORDS * contacts.near_slots), taken["factor"], 0]
+    for group, at_least in zip(groups, least):
+        first = end
+        for name in group:
+            begin[name], end = end, end + taken[name]
+        if group is groups[1]:
+            pair, end = end, end + (contacts.slots if contacts.near else 0)
+        end = max(end, first + at_least)
+    begin["jacobian"], begin["factor"] = 0, begin["pos"]
+    size = 2 * ((end + 1) // 2)  # so that `jacobian` can be read in pairs
+    length = [lengths[name] for name in names]
+    return fill(Layout, size=size, pair=pair, begin=[begin[name] for name in names], length=length)
 
 
 @wp.func

@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
-from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Layout, Memory, Softness, World
-from mjx_dher.envs.engines.fused.near import PAIR_WORDS, SLOT_WORDS
+from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, World
 from mjx_dher.envs.engines.pairs import all_pairs
 from mjx_dher.system.warp_setup import wp
 
@@ -308,37 +307,3 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
         ls_iterations=model.opt.ls_iterations,
         scale=1 / (model.stat.meaninertia * model.nv),
     )
-
-
-def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, sparse: Any) -> Any:
-    """Returns `Layout` for a model.
-
-    `jacobian` begins with the first fields, whose place it takes; so do contacts of near pairs. `factor` begins with `pos`.
-    """
-    nb, nv, rows = len(links_of(model).body), model.nv, world.rows
-    lengths = {
-        **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
-        **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "qvel"), nv),
-        "mass": nv * nv,
-        "factor": nv * nv,
-        "qpos": model.nq,
-        **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
-        **dict.fromkeys(("touching", "slot"), contacts.slots),
-        "limited": dofs.limits,
-        "counts": 2,
-        "jacobian": rows * nv,
-        **dict.fromkeys(("weight", "residual", "change"), rows),
-        **{f"sparse_{name}": sparse.rows for name in ("weight", "residual", "change", "slope")},
-    }
-    fields: dict[str, Any] = Memory.vars  # type: ignore[attr-defined]
-    length = np.array([lengths[name] for name in fields])
-    floats = length * [np.prod(getattr(field.type.dtype, "_shape_", ()), dtype=int) for field in fields.values()]
-    begin, names = np.cumsum(floats) - floats, list(fields)
-    pos, mass, factor = (names.index(name) for name in ("pos", "mass", "factor"))
-    passing, known = begin[pos], begin[mass] - begin[pos]  # floats of the fields whose place is taken
-    begin[pos:] += max(0, floats[-1] - passing, PAIR_WORDS * contacts.near + SLOT_WORDS * contacts.near_slots - passing)
-    pair = int(begin[mass])
-    begin[mass:] += max(contacts.slots if contacts.near else 0, floats[factor] - known)
-    size = 2 * ((int(begin[factor]) + 1) // 2)  # so that `jacobian` can be read in pairs
-    begin[factor], begin[-1] = begin[pos], 0
-    return fill(Layout, size=size, pair=pair, begin=begin, length=length)

@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 
 from mjx_dher.envs.engines import graph
-from mjx_dher.envs.engines.fused import kernel, setup
+from mjx_dher.envs.engines.fused import kernel, memory, setup
 from mjx_dher.envs.engines.fused.sparse import sparse_of
 from mjx_dher.system.warp_setup import load, wp
 
@@ -72,7 +72,7 @@ def _structs(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
     bodies, dofs, sparse = setup.bodies_of(model), setup.dofs_of(model), sparse_of(model)
     contacts = setup.contacts_of(model, rows)
     world = setup.world_of(model, contacts, rows)
-    return world, bodies, dofs, contacts, sparse, setup.layout_of(model, world, contacts, dofs, sparse)
+    return world, bodies, dofs, contacts, sparse, memory.layout_of(model, world, contacts, dofs, sparse)
 
 
 def shared_memory() -> int | None:
