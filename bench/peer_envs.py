@@ -69,12 +69,13 @@ def jaxgcrl_arm(name: str = "arm_push_easy", episode_length: int | None = None) 
 
 
 def _jaxgcrl(env, episode_length: int) -> BraxEnv:
+    indices = env.goal_indices
     return from_brax(
         env,
-        achieved=lambda state: state.obs[env.goal_indices],
+        achieved=lambda state: state.obs[indices],
         goal=lambda state: state.obs[env.state_dim :],
         observe=lambda state: state.obs[: env.state_dim],
-        threshold=env.goal_reach_thresh,
+        threshold=getattr(env, "goal_reach_thresh", 0.1),
         episode_length=episode_length,
     )
 

@@ -30,6 +30,15 @@ _QUANTILES = ("num_quantiles", "dropped_quantiles")
 # Built-in components by `RunSpec` field and name. Each field also takes a custom component as "module:attribute".
 COMPONENTS: dict[str, dict[str, Component]] = {
     "env": {
+        "arm_reach": Component("mjx_dher.envs.arms:ArmReach", "move the end of a Panda to a goal (JaxGCRL's arm_reach)"),
+        "arm_push_easy": Component(
+            "mjx_dher.envs.arms:ArmPushEasy", "push a cube to the square beside it (JaxGCRL's arm_push_easy)"
+        ),
+        "arm_push_hard": Component("mjx_dher.envs.arms:ArmPushHard", "the same on larger squares (JaxGCRL's arm_push_hard)"),
+        "arm_grasp": Component("mjx_dher.envs.arms:ArmGrasp", "close the gripper around a cube (JaxGCRL's arm_grasp)"),
+        "arm_binpick_easy": Component(
+            "mjx_dher.envs.arms:ArmBinpickEasy", "move a cube into another bin (JaxGCRL's arm_binpick_easy)"
+        ),
         "block": Component("mjx_dher.envs.hand:Block", "bring a block in the Shadow hand to a pose (HandManipulateBlock-v1)"),
         "block_rotate_parallel": Component(
             "mjx_dher.envs.hand:BlockRotateParallel", "turn a block to another face (HandManipulateBlockRotateParallel-v1)"
