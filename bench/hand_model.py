@@ -156,7 +156,10 @@ def hand(model):
 -->
 <mujoco>
   <compiler angle="radian"/>
-  <option timestep="{numbers(option.timestep)}" iterations="{option.iterations}"/>
+  <option timestep="{numbers(option.timestep)}" iterations="{option.iterations}">
+    <!-- Splitting the constraints into islands costs more than it saves. -->
+    <flag island="disable"/>
+  </option>
   <default>
     <geom contype="1" conaffinity="0"/>
     <joint limited="true" margin="0.01" damping="0.1" armature="0.001" frictionloss="0.001"/>
