@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import fnmatch
-from collections.abc import Sequence
 from typing import Any, Self
 
 import jax.numpy as jnp
@@ -14,32 +12,13 @@ import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.kinematics import Numbered, Place, names_of, to_quat
+from mjx_dher.envs.kinematics import Numbered, Place, names_of, pick, to_quat
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_NONE)
-
-
-def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
-    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order.
-
-    Raises:
-      ValueError: no name matches a pattern. The message lists the names.
-    """
-    chosen: set[int] = set()
-    for pattern in str(patterns).split() or [""]:
-        fitting = {i for names in columns for i, name in enumerate(names) if name and _fits(name, pattern)}
-        if not fitting:
-            check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
-        chosen |= fitting
-    return sorted(chosen)
-
-
-def _fits(name: str, pattern: str) -> bool:
-    return pattern in ("*", name) if isinstance(name, Numbered) else fnmatch.fnmatchcase(name, pattern)
 
 
 class Control:

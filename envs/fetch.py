@@ -128,7 +128,9 @@ class FetchEnv(MujocoTask):
     def reset(self, key: PRNGKey) -> State:
         """Draws a start as in the original: settled arm, object on the table near the gripper, random goal."""
         object_key, goal_key = jax.random.split(key)
-        return self.init_state(self._sample_object(object_key) if self.has_object else None, self.sample_goal(goal_key))
+        object_qpos = self._sample_object(object_key) if self.has_object else None
+        state = self.init_state(object_qpos, self.sample_goal(goal_key))
+        return dataclasses.replace(state, physics=self.vary(state.physics, key))
 
     def controls(self, physics: Physics, action: Array) -> Controls:
         """Moves the gripper's target by 5 cm times `action[:3]` (x, y, z).

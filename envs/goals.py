@@ -13,9 +13,8 @@ import numpy as np
 
 from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import quat_to_matrix
-from mjx_dher.envs.controls import pick
 from mjx_dher.envs.engines import Physics
-from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
+from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of, pick
 from mjx_dher.types import Array, PRNGKey
 from mjx_dher.validation import check_number
 

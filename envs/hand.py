@@ -242,7 +242,7 @@ class ManipulateTask(HandTask):
 
     def reset(self, key: PRNGKey) -> State:
         start_key, goal_key = jax.random.split(key)
-        physics = self.start_physics(start_key)
+        physics = self.vary(self.start_physics(start_key), key)
         moved = self.achieved(physics)[:3] - jnp.float32(RESTING_PLACE)
         return self.first_state(physics, self.sample_goal(goal_key).at[:3].add(moved))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fnmatch
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,6 +30,25 @@ def names_of(model: Any, kind: str) -> list[str]:
     """Names of a model's objects of a kind ("site", "body", "joint", "key", ...). Unnamed ones get names such as "joint_2"."""
     count = getattr(model, _COUNTS.get(kind, f"n{kind}"))
     return [getattr(model, kind)(i).name or Numbered(f"{kind}_{i}") for i in range(count)]
+
+
+def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
+    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order.
+
+    Raises:
+      ValueError: no name matches a pattern. The message lists the names.
+    """
+    chosen: set[int] = set()
+    for pattern in str(patterns).split() or [""]:
+        fitting = {i for names in columns for i, name in enumerate(names) if name and _fits(name, pattern)}
+        if not fitting:
+            check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
+        chosen |= fitting
+    return sorted(chosen)
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return pattern in ("*", name) if isinstance(name, Numbered) else fnmatch.fnmatchcase(name, pattern)
 
 
 class Place:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.controls import pick
 from mjx_dher.envs.engines import Physics
-from mjx_dher.envs.kinematics import Place, names_of
+from mjx_dher.envs.kinematics import Place, names_of, pick
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import dataclasses
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque
 from mjx_dher.envs.engines import Controls, Physics, make_engine
 from mjx_dher.envs.engines.sensors import Sensors
+from mjx_dher.envs.engines.variation import draw, to_ranges
 from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.observations import Entry
@@ -52,6 +54,8 @@ class MujocoTask(GoalEnv):
       reward_type: "sparse" (0 if the goal is reached, else -1) or "dense" (minus the distance, unbounded below).
       distance_threshold: largest distance at which the goal is reached. Default: the goal's threshold.
       episode_length: steps of an episode. Default: the class's.
+      varied: lowest and highest factor of masses, friction, damping and gains, such as {"mass:box": (0.5, 2)}. Each reset draws
+        the factors. A text "mass:box=0.5-2,gain:*=0.9-1.1" does, too. Default: the class's.
       **engine_options: options of the engine; see `make_engine`.
 
     Raises:
@@ -65,6 +69,7 @@ class MujocoTask(GoalEnv):
     start: Start = Start()
     hz: float = 25.0  # actions per second
     episode_length: int = 50
+    varied: Mapping[str, tuple[float, float]] | str = MappingProxyType({})
     max_speed: float = 1000.0  # rad/s or m/s; the simulation has diverged if it is faster
     _sensors: Sensors | None = None
 
@@ -74,6 +79,7 @@ class MujocoTask(GoalEnv):
         reward_type: str = "sparse",
         distance_threshold: float | None = None,
         episode_length: int | None = None,
+        varied: Mapping[str, tuple[float, float]] | str | None = None,
         **engine_options: Any,
     ):
         if reward_type not in ("sparse", "dense"):
@@ -85,7 +91,8 @@ class MujocoTask(GoalEnv):
         self.model = self.load()
         substeps = substeps_of(self.hz, self.model.opt.timestep)
         self.dt = substeps * float(self.model.opt.timestep)  # s
-        self.engine = make_engine(engine, self.model, substeps, **engine_options)
+        self._ranges = to_ranges(self.varied if varied is None else varied)
+        self.engine = make_engine(engine, self.model, substeps, varied=tuple(self._ranges), **engine_options)
         self.bind()
         self.distance_threshold = _plain(self.goal.threshold if distance_threshold is None else distance_threshold)
         check_number("distance_threshold", self.distance_threshold, "(0, inf)", float)
@@ -117,7 +124,7 @@ class MujocoTask(GoalEnv):
         self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
         self.observation_size = ends[-1]
         if any(entry.reads_sensors for entry in self._entries):
-            self._sensors = Sensors(self.engine.name, self.model, getattr(self.engine, "allow_cpu", False))
+            self._sensors = Sensors(self.engine.name, self.model, getattr(self.engine, "allow_cpu", False), tuple(self._ranges))
             none: Any = np.zeros(self.model.nsensordata, np.float32)
             self._rest = dataclasses.replace(self._rest, sensors=none)  # `_sensed` reads them
         check_number("max_speed", self.max_speed, "(0, inf)", float)
@@ -161,7 +168,11 @@ class MujocoTask(GoalEnv):
     def reset(self, key: PRNGKey) -> State:
         """Draws a start and a goal."""
         start_key, goal_key = jax.random.split(key)
-        return self.first_state(self.start_physics(start_key), self.sample_goal(goal_key))
+        return self.first_state(self.vary(self.start_physics(start_key), key), self.sample_goal(goal_key))
+
+    def vary(self, physics: Physics, key: PRNGKey) -> Physics:
+        """The physics with factors of `varied`, drawn with the key of the reset."""
+        return dataclasses.replace(physics, factors=draw(self._ranges, key)) if self._ranges else physics
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
         """First state of an episode that starts from `physics`, with a goal [G]."""
@@ -190,7 +201,8 @@ class MujocoTask(GoalEnv):
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         physics = self.advance(state.physics, action)
         sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C treats NaN inputs as 0
-        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, self._rest)
+        rest = dataclasses.replace(self._rest, factors=physics.factors)
+        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, rest)
         failed = state.failed | ~sound
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
         return State(

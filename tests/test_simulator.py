@@ -16,7 +16,7 @@ from conftest import refuses
 from mujoco.batch import DATA_FIELDS
 
 from mjx_dher.envs import Simulator, make
-from mjx_dher.envs.engines import Controls, native
+from mjx_dher.envs.engines import Controls, batches, native
 from mjx_dher.envs.engines.fields import REJECTED
 from mjx_dher.tools import gym_cache
 
@@ -124,6 +124,23 @@ def test_forward_makes_current_what_step_leaves_a_timestep_behind():
     np.testing.assert_array_equal(current.qpos, fallen.qpos)
 
 
+def test_few_states_are_stepped_by_one_thread_if_that_is_faster():
+    sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), num_threads=2)
+    step = jax.jit(jax.vmap(sim.step))
+    data = jax.tree.map(lambda x: jnp.stack([x, x + 0.1]), sim.make_data())
+    seen = []
+    for fast in (1, 2):
+        for rows in sim._batches[True].kept.get(2, []):
+            rows.seconds = 1.0 if rows.batch.nthread == fast else 2.0
+        seen.append(jax.block_until_ready(step(data)))
+        if len(seen) == 1:
+            continue  # the first call made the batches
+        slower = max(sim._batches[True].kept[2], key=lambda rows: rows.seconds)
+        assert slower.batch.nthread == 3 - fast
+        assert slower.seconds == 2.0 * 0.998  # until it is tried again
+    np.testing.assert_array_equal(seen[0].qpos, seen[1].qpos)
+
+
 def test_what_blows_up_is_not_reset_behind_one_s_back():
     sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE))
     data = sim.make_data()
@@ -228,7 +245,7 @@ def test_time_advances_and_delays_last_as_in_a_loop_without_pause(start):
         mujoco.mj_step(model, data)
     exact = np.concatenate([[data.time], data.history])
     first = sim.make_data().replace(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in STATE})
-    first = first.replace(residue=jnp.asarray(native._residue(exact), jnp.float32))
+    first = first.replace(residue=jnp.asarray(batches.residue(exact), jnp.float32))
     last = jax.jit(lambda data: jax.lax.fori_loop(0, 100, lambda _, x: sim.step(x), data))(first)
     for _ in range(100):
         mujoco.mj_step(model, data)
@@ -282,10 +299,10 @@ def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
     expected = program(data)
     compiled = program.lower(data).compile()
     row = np.concatenate([np.ravel(getattr(data, name)) for name in (*STATE, "residue")])
-    for size in range(1, 3 + native._KEPT):
-        sim._on_step(np.tile(row, (size, 1)))
-    assert len(sim._batches) == native._KEPT
-    kept = [weakref.ref(sim), weakref.ref(next(iter(sim._batches.values())).batch)]
+    for size in range(1, 3 + batches._KEPT):
+        sim._on_step(np.tile(row, (size, 1)), np.empty((size, len(row)), np.float32))
+    assert len(sim._batches[True].kept) == batches._KEPT
+    kept = [weakref.ref(sim), weakref.ref(next(iter(sim._batches[True].kept.values()))[0].batch)]
     twin = copy.copy(sim)  # of the same name
     del sim, program
     jax.clear_caches()

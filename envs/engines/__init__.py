@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -36,7 +36,7 @@ def _has_warp() -> bool:
     return importlib.util.find_spec("warp") is not None
 
 
-def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any) -> Engine:
+def make_engine(name: str, model: mujoco.MjModel, substeps: int, varied: Sequence[str] = (), **options: Any) -> Engine:
     """Makes an engine that advances `model` by `substeps` timesteps per call.
 
     `native` supports any model without sleeping bodies, `jax` any that MJX supports, and `warp` any whose features its kernels
@@ -46,6 +46,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
       name: "native", "jax", "warp" or "auto".
       model: compiled MJCF.
       substeps: MuJoCo timesteps per environment step.
+      varied: numbers of the model that differ between environments, such as "mass:box" (`variation.Variation`).
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp these
         two, `constraints` (memory for rows) and `allow_cpu`.
 
@@ -55,12 +56,13 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, **options: Any)
     for option in options:
         check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
     check_state(model)
-    return _constructor(name)(model, substeps=substeps, **options)
+    return _constructor(name)(model, substeps=substeps, varied=tuple(varied), **options)
 
 
 def engine_options(name: str) -> list[str]:
     """Names of an engine's options. Raises ValueError like `make_engine`."""
-    return sorted(set(inspect.signature(_constructor(name)).parameters) - {"model", "substeps", "derived", "sensors"})
+    inner = {"model", "substeps", "derived", "sensors", "varied"}
+    return sorted(set(inspect.signature(_constructor(name)).parameters) - inner)
 
 
 def _constructor(name: str) -> Callable[..., Engine]:

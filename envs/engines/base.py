@@ -21,6 +21,7 @@ class Physics:
     act: Array  # [na] activations of actuators
     # [nsensordata] in the state of a task that observes sensors, else None. Engines ignore it and return None.
     sensors: Array | None = None
+    factors: Array | None = None  # [number of `varied`] by which the model's numbers are multiplied; None for 1
 
 
 @struct.dataclass
@@ -52,7 +53,7 @@ def check_state(model: mujoco.MjModel) -> None:
         raise ValueError('the model has sleeping bodies, whose state `Physics` does not hold; remove <flag sleep="enable"/>')
 
 
-def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) -> None:
+def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls, varied: int = 0) -> None:
     """Raises ValueError if an array does not have the model's shape, or the model has more state than `Physics`."""
     check_state(model)
     for values, shapes in (
@@ -61,6 +62,8 @@ def check_shapes(model: mujoco.MjModel, physics: Physics, controls: Controls) ->
     ):
         for name, shape in shapes.items():
             check_shape(name, getattr(values, name), shape)
+    if physics.factors is not None:
+        check_shape("factors", physics.factors, (varied,))
 
 
 def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:

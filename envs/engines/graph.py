@@ -6,6 +6,7 @@ little. Only the state is copied in and out.
 # Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -94,9 +95,20 @@ def _begin(
         at = 7 * i
         mocap_pos[env, i] = wp.vec3(inputs[env, at], inputs[env, at + 1], inputs[env, at + 2])
         mocap_quat[env, i] = wp.quat(inputs[env, at + 3], inputs[env, at + 4], inputs[env, at + 5], inputs[env, at + 6])
-    for i in range(inputs.shape[1] - 7 * bodies):
+    for i in range(ctrl.shape[1]):
         ctrl[env, i] = inputs[env, 7 * bodies + i]
     time[env] = 0.0
+
+
+@wp.kernel(enable_backward=False, module="mjx_dher_graph")
+def _vary(
+    inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    begin: int,
+    field: wp.array2d(dtype=float),  # type: ignore[valid-type]
+):
+    """Copies the numbers of a field of the model that differ between environments."""
+    env, i = wp.tid()  # type: ignore[misc]
+    field[env, i] = inputs[env, begin + i]
 
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")
@@ -143,9 +155,19 @@ class Simulation:
       contacts: memory for contacts, per environment on average.
       rows: memory for constraint rows, per environment.
       sensors: whether `advance` also reads the sensors of its final state.
+      varied: fields of the model that differ between environments. `inputs` ends with their numbers.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, contacts: int, rows: int, sensors: bool = False):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        substeps: int,
+        contacts: int,
+        rows: int,
+        sensors: bool = False,
+        varied: Sequence[str] = (),
+    ):
         warp = private_api.mujoco_warp()
         model = copy.copy(model)
         if not sensors:
@@ -155,8 +177,16 @@ class Simulation:
         # MuJoCo Warp takes the velocity term of equality constraints from the previous timestep.
         self._before = (warp.kinematics, warp.com_pos, warp.com_vel) if model.neq else ()
         self._model.opt.warn_overflow = 0  # printing kernels wait for the host
+        self._varied = [self._own(name, np.asarray(getattr(model, name)), num_envs) for name in varied]
         self._data = warp.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
         self._substeps, self._num_envs, self._graph = substeps, num_envs, None
+
+    def _own(self, name: str, nominal: np.ndarray, num_envs: int) -> Any:
+        """Gives each environment its own numbers of a field. Returns them as [num_envs, n]."""
+        dtype = getattr(self._model, name).dtype
+        field: Any = wp.array(np.tile(nominal, (num_envs, *[1] * nominal.ndim)).astype(np.float32), dtype=dtype)
+        setattr(self._model, name, field)
+        return wp.array(ptr=field.ptr, shape=(num_envs, nominal.size), dtype=float, device=field.device)
 
     def load(self) -> None:
         """Compiles the kernels, or loads them from Warp's cache."""
@@ -174,6 +204,10 @@ class Simulation:
         held = [data.qpos, data.qvel, data.qacc_warmstart, data.act]
         outputs = [*held, data.mocap_pos, data.mocap_quat, data.ctrl, data.time]
         wp.launch(_begin, dim=self._num_envs, inputs=[*state, inputs], outputs=outputs)
+        begin = 7 * data.mocap_pos.shape[1] + data.ctrl.shape[1]
+        for field in self._varied:
+            wp.launch(_vary, dim=field.shape, inputs=[inputs, begin], outputs=[field])
+            begin += field.shape[1]
         if self._graph is None:
             self._run()
         else:

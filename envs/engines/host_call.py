@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import threading
 import weakref
 from collections.abc import Callable
@@ -19,7 +20,7 @@ import numpy as np
 
 from mjx_dher.types import Array
 
-_Function = Callable[[np.ndarray], np.ndarray]  # inputs [..., m] -> outputs [..., n], float32
+_Function = Callable[[np.ndarray, np.ndarray], None]  # writes outputs [..., n] for inputs [..., m], float32
 _methods: dict[str, list[weakref.WeakMethod[_Function]]] = {}
 _lock = threading.Lock()
 _TARGET = "mjx_dher_host"
@@ -56,19 +57,15 @@ class _Extension(ctypes.Structure):
 
 
 class _Buffer(_Struct):
-    _fields_ = (("dtype", _int), ("data", _pointer), ("rank", _int64), ("dims", ctypes.POINTER(_int64)))
+    _fields_ = (("dtype", _int), ("data", _pointer), ("rank", _int64), ("dims", _pointer))
 
 
 class _Buffers(_Struct):
-    _fields_ = (("size", _int64), ("types", _pointer), ("items", ctypes.POINTER(ctypes.POINTER(_Buffer))))
-
-
-class _Text(ctypes.Structure):
-    _fields_ = (("begin", _pointer), ("length", ctypes.c_size_t))
+    _fields_ = (("size", _int64), ("types", _pointer), ("items", _pointer))
 
 
 class _Attributes(_Struct):
-    _fields_ = (("size", _int64), ("types", _pointer), ("names", _pointer), ("items", ctypes.POINTER(ctypes.POINTER(_Text))))
+    _fields_ = (("size", _int64), ("types", _pointer), ("names", _pointer), ("items", _pointer))
 
 
 class _Error(_Struct):
@@ -114,48 +111,75 @@ def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
     result = jax.ShapeDtypeStruct(shape, np.float32)
     inputs = inputs.astype(np.float32)  # JAX may compute in 64 bits
     if jax.default_backend() != "cpu":
-        return jax.pure_callback(functools.partial(_answer, name), result, inputs, vmap_method="broadcast_all")
+        return jax.pure_callback(functools.partial(_answer, name, shape), result, inputs, vmap_method="broadcast_all")
     return jax.ffi.ffi_call(_TARGET, result, vmap_method="broadcast_all")(inputs, name=name)
 
 
-def _answer(name: str, inputs: np.ndarray) -> np.ndarray:
-    method = next(filter(None, (each() for each in _methods.get(name, ()))), None)
-    if method is None:
-        raise RuntimeError("the simulator of this program no longer exists; keep it as long as the program")
-    return method(inputs)
+def _answer(name: str, shape: tuple[int, ...], inputs: Any) -> np.ndarray:
+    outputs = np.empty((*inputs.shape[:-1], *shape), np.float32)
+    _method(name)(np.asarray(inputs), outputs)
+    return outputs
+
+
+def _method(name: str) -> _Function:
+    for each in _methods.get(name, ()):
+        if method := each():
+            return method
+    raise RuntimeError("the simulator of this program no longer exists; keep it as long as the program")
 
 
 @functools.cache
 def _register_target() -> Any:
     """Registers `_handle` with XLA. Returns the C function, which must not be freed."""
-    handler = ctypes.CFUNCTYPE(_pointer, ctypes.POINTER(_Frame))(lambda frame: _handle(frame.contents))
+    handler = ctypes.CFUNCTYPE(_pointer, _pointer)(_handle)
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(ctypes.cast(handler, _pointer)), platform="cpu")
     return handler
 
 
-def _handle(frame: Any) -> int | None:
+# Where a frame has what every call reads, in words of 8 bytes: fields of ctypes structs take longer than a small simulation.
+_STAGE = _Frame.stage.offset // 8
+_ARGUMENTS, _RESULTS, _ATTRIBUTES = (
+    (getattr(_Frame, name).offset + kind.items.offset) // 8
+    for name, kind in (("arguments", _Buffers), ("results", _Buffers), ("attributes", _Attributes))
+)
+_DATA, _RANK, _DIMS = (getattr(_Buffer, name).offset // 8 for name in ("data", "rank", "dims"))
+
+
+def _handle(address: int) -> int | None:
     """Answers a call of XLA with this version or the outputs. Returns None, or an error."""
     try:
-        extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension))
-        if extension and extension.contents.type == _METADATA:
-            version = extension.contents.metadata.contents.version
+        frame = _words(address)
+        if frame[1] and (extension := ctypes.cast(frame[1], ctypes.POINTER(_Extension)).contents).type == _METADATA:
+            version = extension.metadata.contents.version
             version.major, version.minor = _MAJOR, _MINOR
-        elif frame.stage == _EXECUTE:
-            name = frame.attributes.items[0].contents
-            text = ctypes.string_at(name.begin, name.length).decode()
-            outputs, expected = _answer(text, _view(frame.arguments)), _view(frame.results)
-            if np.shape(outputs) != expected.shape:
-                raise ValueError(f"a function that JAX calls must give {list(expected.shape)}; it gives {np.shape(outputs)}")
-            expected[...] = outputs
+        elif frame[_STAGE] & 0xFFFFFFFF == _EXECUTE:
+            begin, length = _first(frame[_ATTRIBUTES])[:2]
+            _method(ctypes.string_at(begin, length).decode())(_buffer(frame[_ARGUMENTS]), _buffer(frame[_RESULTS]))
     except Exception as error:
         message = f"{type(error).__name__}: {error}".encode()
         described = _Error(ctypes.sizeof(_Error), None, message, _INTERNAL)
-        return frame.api.contents.make_error(ctypes.byref(described))
+        return ctypes.cast(address, ctypes.POINTER(_Frame)).contents.api.contents.make_error(ctypes.byref(described))
     return None
 
 
-def _view(buffers: Any) -> np.ndarray:
-    """First of the buffers, as a float32 array."""
-    buffer = buffers.items[0].contents
-    shape = tuple(buffer.dims[: buffer.rank])
-    return np.ctypeslib.as_array(ctypes.cast(buffer.data, ctypes.POINTER(ctypes.c_float)), shape)
+@functools.lru_cache(maxsize=4096)  # XLA uses the same memory again
+def _words(address: int) -> Any:
+    """A window on memory, as words of 8 bytes. It may be longer than what is there: only what is there is to be read."""
+    return (ctypes.c_uint64 * 32).from_address(address)
+
+
+def _first(items: int) -> Any:
+    """Returns the first of several structs, to each of which there is a pointer."""
+    return _words(_words(items)[0])
+
+
+def _buffer(items: int) -> np.ndarray:
+    """Returns the first of several buffers as an array of float32."""
+    buffer = _first(items)
+    return _view(buffer[_DATA], tuple(_words(buffer[_DIMS])[: buffer[_RANK]]) if buffer[_RANK] else ())
+
+
+@functools.lru_cache(maxsize=4096)
+def _view(data: int, shape: tuple[int, ...]) -> np.ndarray:
+    memory: Any = (ctypes.c_float * math.prod(shape)).from_address(data)
+    return np.ndarray(shape, np.float32, memory)

@@ -8,6 +8,7 @@ import dataclasses
 import io
 import re
 import warnings
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines import pairs
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.features import beyond_defaults, with_names
+from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
 from mjx_dher.validation import check_count
@@ -169,12 +171,19 @@ class MjxEngine:
     name = "jax"
 
     def __init__(
-        self, model: mujoco.MjModel, substeps: int, iterations: int = 8, ls_iterations: int = 5, sensors: bool = False
+        self,
+        model: mujoco.MjModel,
+        substeps: int,
+        iterations: int = 8,
+        ls_iterations: int = 5,
+        sensors: bool = False,
+        varied: Sequence[str] = (),
     ):
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
         if ignored := beyond_defaults(model, _IGNORED.__contains__):
             raise ValueError(f"engine jax: MJX ignores features of the model: {', '.join(ignored)}; use engine native")
+        self._variation = Variation(model, varied)
         model = with_stand_ins(model)
         _grow_for_margins(model)
         model.opt.iterations = iterations
@@ -191,7 +200,7 @@ class MjxEngine:
             raise ValueError(f"engine jax: MJX does not support this model: {what}; use engine native") from error
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
-        check_shapes(self._mujoco_model, physics, controls)
+        check_shapes(self._mujoco_model, physics, controls, self._variation.size)
 
         # MJX indexes empty arrays, such as positions of no sites, which JAX allows and NumPy does not.
         start = jax.tree.map(lambda x: x if x.size else jnp.asarray(x), self._data)
@@ -199,29 +208,37 @@ class MjxEngine:
         def substep(_, p: Physics) -> Physics:
             data = _loaded(start, p, controls)
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
-                data = self._step(data) if self._welds else mjx.step(self._model, data)
+                data = self._step(model, data) if self._welds else mjx.step(model, data)
             # MJX's precision depends on jax_enable_x64; between substeps it is float32, as between steps.
-            return Physics(*(x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act)))
+            qpos, qvel, warmstart, act = (x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act))
+            return Physics(qpos, qvel, warmstart, act, factors=p.factors)
 
         with jax.default_matmul_precision("highest"):  # TF32 breaks contacts
+            model = self._varied(physics)
             return jax.lax.fori_loop(0, self._substeps, substep, dataclasses.replace(physics, sensors=None))
+
+    def _varied(self, physics: Physics) -> mjx.Model:
+        """The model with the numbers of a state."""
+        if not self._variation.size:
+            return self._model
+        return self._model.replace(**self._variation.values(self._variation.factors(physics.factors, jnp), jnp))
 
     def read_sensors(self, physics: Physics, controls: Controls) -> Array:
         """Values [nsensordata] of the model's sensors. The engine must be made with `sensors`."""
-        check_shapes(self._mujoco_model, physics, controls)
+        check_shapes(self._mujoco_model, physics, controls, self._variation.size)
         data = _loaded(jax.tree.map(jnp.asarray, self._data), physics, controls)
         with jax.default_matmul_precision("highest"):
-            return mjx.forward(self._model, data).sensordata.astype(jnp.float32)
+            return mjx.forward(self._varied(physics), data).sensordata.astype(jnp.float32)
 
     def check(self) -> None:
         pass  # there is memory for all contacts
 
-    def _step(self, data: mjx.Data) -> mjx.Data:
-        """`mjx.step` with corrected welds, and without sensors."""
-        data = mjx.fwd_velocity(self._model, mjx.fwd_position(self._model, data))
+    def _step(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        """Computes `mjx.step` with the welds corrected, and without sensors."""
+        data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
         shifts = [-weld.bias(data) if isinstance(weld, _Weld) else jnp.zeros(weld) for weld in self._welds]
         data = private_api.shift_reference_acceleration(data, jnp.concatenate(shifts))
-        data = mjx.fwd_acceleration(self._model, mjx.fwd_actuation(self._model, data))
+        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
         euler = int(mujoco.mjtIntegrator.mjINT_EULER)
         integrate = mjx.euler if self._mujoco_model.opt.integrator == euler else mjx.implicit
-        return integrate(self._model, mjx.solve(self._model, data))
+        return integrate(model, mjx.solve(model, data))

@@ -7,9 +7,10 @@ import dataclasses
 import hashlib
 import math
 import threading
+import time
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import mujoco
@@ -19,7 +20,9 @@ from mujoco.batch import Batch
 
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes
+from mjx_dher.envs.engines.batches import EXACT, FULL, Choice, Rows, residue
 from mjx_dher.envs.engines.fields import LATE, derived_fields
+from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -49,26 +52,13 @@ class Data:
     plugin_state: Array  # [npluginstate]
     residue: Array  # [2, 1 + nhistory] digits of `time` and `history` that float32 omits; 0 if you set those
     derived: dict[str, Array]  # requested fields of MjData, with their shapes
+    factors: Array | None = None  # [number of `varied`] by which the model's numbers are multiplied; None for 1
 
 
-_STATE = tuple(name for name in Data.__dataclass_fields__ if name not in ("residue", "derived"))
-_EXACT = ("time", "history")  # float64 between steps too, because a float32 time would stop advancing
+_STATE = tuple(name for name in Data.__dataclass_fields__ if name not in ("residue", "derived", "factors"))
 # Inputs of `advance`: fields of `Physics` by MuJoCo's names, and the controls.
-_PHYSICS = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart", "act": "act"}
+_PHYSICS = {"qpos": "qpos", "qvel": "qvel", "act": "act", "qacc_warmstart": "warmstart"}
 _CONTROLS = ("ctrl", "mocap_pos", "mocap_quat")
-
-
-_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
-_KEPT = 8  # batches to keep, of the last sizes
-
-
-class _Views(NamedTuple):
-    """A batch, and views of its memory for the fields that a call writes and reads."""
-
-    batch: Batch
-    inputs: list[np.ndarray]
-    outputs: list[np.ndarray]
-    exact: list[np.ndarray]  # views of `_EXACT`, each [nsim, n]; empty for `advance`
 
 
 class Simulator:
@@ -86,6 +76,8 @@ class Simulator:
       derived: names of other fields of MjData, such as "xpos" or "sensordata", to return in `Data.derived`.
       substeps: calls of `mj_step` per step.
       num_threads: number of threads. Default: one per core.
+      varied: masses, friction, damping and gains that differ between simulations, such as "mass:box" (`Variation`). The state
+        has their factors.
 
     Raises:
       ValueError: an argument is invalid, a field does not exist, or the model cannot be stepped in batches.
@@ -94,7 +86,12 @@ class Simulator:
     name = "native"
 
     def __init__(
-        self, model: mujoco.MjModel, derived: Sequence[str] = (), substeps: int = 1, num_threads: int | None = None
+        self,
+        model: mujoco.MjModel,
+        derived: Sequence[str] = (),
+        substeps: int = 1,
+        num_threads: int | None = None,
+        varied: Sequence[str] = (),
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
             raise ValueError(f"model must be a mujoco.MjModel; got a {type(model).__name__}")
@@ -107,15 +104,16 @@ class Simulator:
         self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
         if "energy" in self._derived:
             self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-        self._num_threads = num_threads or usable_cores()
-        self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived)}"
+        self._num_threads, self._variation = num_threads or usable_cores(), Variation(model, varied)
+        self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived, *varied)}"
         batch = Batch(self._model, 1, 1)
         self._shapes = {name: batch.bind(name).shape[1:] for name in (*_STATE, *self._derived)}
-        self._shapes["residue"] = (2, 1 + model.nhistory)
+        self._shapes["residue"], self._shapes["factors"] = (2, 1 + model.nhistory), (self._variation.size,)
         self._begin()
 
     def _begin(self) -> None:
-        self._batches: dict[tuple[bool, int], _Views] = {}
+        # `advance` has separate batches, because its other fields must stay at defaults.
+        self._batches = {whole: Choice(self._num_threads) for whole in (True, False)}
         self._lock = threading.Lock()  # a Batch is not thread-safe
         self._lost, self._warned = 0, False  # timesteps that left out contacts since the last `check`
         for function, method in (("step", self._on_step), ("forward", self._on_forward), ("advance", self._on_advance)):
@@ -147,11 +145,12 @@ class Simulator:
         for warning in data.warning:
             warning.number = 1
         mujoco.mj_forward(self._model, data)
-        self._note_lost(sum(data.warning[kind].number - 1 for kind in _FULL))
-        for compute in self._late():
+        self._note_lost(sum(data.warning[kind].number - 1 for kind in FULL))
+        for compute in dict.fromkeys(LATE[name] for name in self._derived if name in LATE):
             compute(self._model, data)
         values = {name: np.asarray(getattr(data, name)).reshape(self._shapes[name]) for name in (*_STATE, *self._derived)}
-        values["residue"] = _residue(np.concatenate([values[name].ravel() for name in _EXACT]))
+        values["residue"] = residue(np.concatenate([values[name].ravel() for name in EXACT]))
+        values["factors"] = np.ones(self._variation.size)
         return self._data({name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
 
     def step(self, data: Data, ctrl: Array | None = None) -> Data:
@@ -176,11 +175,11 @@ class Simulator:
         return self._update("forward", data)
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
-        check_shapes(self._model, physics, controls)
+        check_shapes(self._model, physics, controls, self._variation.size)
         values = {name: getattr(physics, field) for name, field in _PHYSICS.items()}
-        pos, quat = controls.mocap[:, :3], controls.mocap[:, 3:]
-        after = self._call("advance", {**values, "ctrl": controls.ctrl, "mocap_pos": pos, "mocap_quat": quat})
-        return Physics(**{field: after[name] for name, field in _PHYSICS.items()})
+        values |= {"ctrl": controls.ctrl, "mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
+        after = self._call("advance", {**values, "factors": self._variation.factors(physics.factors, jnp)})
+        return Physics(**{field: after[name] for name, field in _PHYSICS.items()}, factors=physics.factors)
 
     def check(self) -> None:
         """Raises ValueError if contacts since the last call did not fit into the model's memory."""
@@ -193,79 +192,65 @@ class Simulator:
         if not isinstance(data, Data):
             raise ValueError(f"data must be a Data from make_data; got a {type(data).__name__}")
         values = {name: getattr(data, name) for name in (*_STATE, "residue")}
+        values["factors"] = self._variation.factors(data.factors, jnp)
         for name, value in values.items():
             check_shape(name, value, self._shapes[name])
-        return self._data(self._call(function, values))
+        return self._data({**values, **self._call(function, values)})
 
     def _data(self, values: dict[str, Array]) -> Data:
         state = {name: values[name] for name in (*_STATE, "residue")}
-        return Data(**state, derived={name: values[name] for name in self._derived})
-
-    def _late(self) -> list[Any]:
-        return list(dict.fromkeys(LATE[name] for name in self._derived if name in LATE))
+        factors = values["factors"] if self._variation.size else None
+        return Data(**state, derived={name: values[name] for name in self._derived}, factors=factors)
 
     def _fields(self, function: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names of the fields that a function takes and returns, in the order of a packed row."""
         if function == "advance":
-            return (*_PHYSICS, *_CONTROLS), tuple(_PHYSICS)
-        return (*_STATE, "residue"), (*_STATE, *self._derived, "residue")
+            return (*_PHYSICS, *_CONTROLS, "factors"), tuple(_PHYSICS)
+        return (*_STATE, "residue", "factors"), (*_STATE, *self._derived, "residue")
 
     def _call(self, function: str, values: dict[str, Array]) -> dict[str, Array]:
-        """Calls a function of the host, with one array in and one out, because each costs some 20 microseconds."""
+        """Calls a function of the host, with one array in and one out, because each costs some microseconds."""
         inputs, outputs = self._fields(function)
         row = jnp.concatenate([jnp.ravel(jnp.asarray(values[name], jnp.float32)) for name in inputs])
         ends = np.cumsum([math.prod(self._shapes[name]) for name in outputs]).tolist()
         parts = jnp.split(host_call.call(f"{self._name}_{function}", (ends[-1],), row), ends[:-1])
         return {name: part.reshape(self._shapes[name]) for name, part in zip(outputs, parts, strict=True)}
 
-    def _on_step(self, packed: Any) -> np.ndarray:
-        return self._on_host("step", packed)
+    def _on_step(self, rows: np.ndarray, results: np.ndarray) -> None:
+        self._on_host("step", rows, results)
 
-    def _on_forward(self, packed: Any) -> np.ndarray:
-        return self._on_host("forward", packed)
+    def _on_forward(self, rows: np.ndarray, results: np.ndarray) -> None:
+        self._on_host("forward", rows, results)
 
-    def _on_advance(self, packed: Any) -> np.ndarray:
-        return self._on_host("advance", packed)
+    def _on_advance(self, rows: np.ndarray, results: np.ndarray) -> None:
+        self._on_host("advance", rows, results)
 
-    def _on_host(self, function: str, packed: Any) -> np.ndarray:
-        """Computes a function for `packed` [..., row]."""
-        rows = np.asarray(packed).reshape(-1, packed.shape[-1])
+    def _on_host(self, function: str, rows: np.ndarray, results: np.ndarray) -> None:
+        """Computes a function for `rows` [..., n] into `results` [..., m]."""
+        rows, results = rows.reshape(-1, rows.shape[-1]), results.reshape(-1, results.shape[-1])
         with self._lock, np.errstate(over="ignore", invalid="ignore"):  # from diverged simulations
-            views = self._views(function, len(rows))
-            begin = 0
-            for view in views.inputs:
-                end = begin + math.prod(view.shape[1:])
-                view[...] = rows[:, begin:end].reshape(view.shape)
-                begin = end
-            _add(views.exact, rows[:, begin:])
+            begun = time.perf_counter()
+            whole = function != "advance"
+            chosen = self._batches[whole].choose(len(rows), self._made, whole)
+            chosen.write(rows)
             if function == "forward":
-                views.batch.forward()
+                chosen.batch.forward()
             else:
-                views.batch.step(nstep=self._substeps)
-            self._note_lost(int((views.batch.warning[:, _FULL, 1] - 1).sum()))
-            views.batch.warning[..., 1] = 1
-            columns = [view.reshape(len(rows), -1) for view in self._results(function, views)]
-            result = np.concatenate(columns, axis=1, dtype=np.float32)
-        return result.reshape(*packed.shape[:-1], -1)
+                chosen.batch.step(nstep=self._substeps)
+            if lost := chosen.lost():
+                self._note_lost(lost)
+            chosen.read(results)
+            seconds = time.perf_counter() - begun
+            chosen.seconds = min(
+                seconds, 1.1 * chosen.seconds or seconds
+            )  # a call that waited for other processes does not count
 
-    def _results(self, function: str, views: _Views) -> list[np.ndarray]:
-        """Fields that a function returns, each [nsim, ...]."""
-        outputs = list(views.outputs)
-        if views.exact:
-            outputs.append(_residue(np.concatenate(views.exact, axis=1)))
-        late = [name for name in self._derived if name in LATE and math.prod(self._shapes[name])]
-        if function == "advance" or not late:
-            return outputs
-        functions, data = self._late(), mujoco.MjData(self._model)
-        names = [name for name in self._fields(function)[1] if math.prod(self._shapes[name])]
-        filled = {name: np.empty((views.batch.nsim, *self._shapes[name])) for name in late}
-        for index in range(views.batch.nsim):
-            views.batch.get_data(index, data)
-            for compute in functions:
-                compute(self._model, data)
-            for name in late:
-                filled[name][index] = getattr(data, name)
-        return [filled.get(name, output) for name, output in zip(names, outputs, strict=True)]
+    def _made(self, nsim: int, num_threads: int, whole: bool) -> Rows:
+        """Makes a batch for `advance`, or for functions of the whole state."""
+        derived = self._derived if whole else ()
+        batch = Batch(self._model, nsim, num_threads, persistent=any(name in LATE for name in derived))
+        inputs = _STATE if whole else (*_PHYSICS, *_CONTROLS)
+        return Rows(batch, inputs, _STATE if whole else tuple(_PHYSICS), derived, whole, self._variation)
 
     def _note_lost(self, lost: int) -> None:
         """Counts timesteps that left out contacts, and warns the first time."""
@@ -273,40 +258,6 @@ class Simulator:
         if lost and not self._warned:
             self._warned = True
             warnings.warn(_lost_contacts(self._model, lost), stacklevel=2)
-
-    def _views(self, function: str, nsim: int) -> _Views:
-        key = function == "advance", nsim  # `advance` has separate batches, because its other fields must stay at defaults
-        views = self._batches.pop(key, None) or self._made(function, nsim)
-        self._batches[key] = views
-        if len(self._batches) > _KEPT:
-            del self._batches[next(iter(self._batches))]
-        return views
-
-    def _made(self, function: str, nsim: int) -> _Views:
-        persistent = function != "advance" and bool(self._late())
-        batch = Batch(self._model, nsim, self._num_threads, persistent)
-        batch.warning[..., 1] = 1  # MuJoCo writes MUJOCO_LOG.TXT when a number of warnings leaves 0
-        inputs, outputs = (
-            [batch.bind(name) for name in names if name != "residue" and math.prod(self._shapes[name])]
-            for names in self._fields(function)
-        )
-        exact = [] if function == "advance" else [batch.bind(name).reshape(nsim, -1) for name in _EXACT]
-        return _Views(batch, inputs, outputs, exact)
-
-
-def _residue(values: np.ndarray) -> np.ndarray:
-    """Parts of `values` [..., n] that float32 omits, as two float32 numbers [..., 2, n]."""
-    first = values - values.astype(np.float32)
-    return np.stack([first, first - first.astype(np.float32)], axis=-2)
-
-
-def _add(exact: list[np.ndarray], residue: np.ndarray) -> None:
-    """Adds `residue` [nsim, 2 n] to the fields [nsim, n in total] whose values it belongs to."""
-    parts = residue.reshape(len(residue), 2, -1).astype(np.float64).sum(axis=1) if exact else residue
-    for view in exact:
-        part, parts = parts[:, : view.shape[1]], parts[:, view.shape[1] :]
-        whole = view + part
-        view[...] = np.where(whole.astype(np.float32) == view, whole, view)
 
 
 def _lost_contacts(model: mujoco.MjModel, lost: int) -> str:

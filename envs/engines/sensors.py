@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -20,26 +21,27 @@ class Sensors:
       engine: "native", "jax", "warp" or "warp graph". MuJoCo Warp reads them for both paths of warp.
       model: compiled MJCF.
       allow_cpu: as in `WarpEngine`.
+      varied: as in `make_engine`.
 
     Raises:
       ValueError: the implementation does not support the model.
     """
 
-    def __init__(self, engine: str, model: mujoco.MjModel, allow_cpu: bool = False):
+    def __init__(self, engine: str, model: mujoco.MjModel, allow_cpu: bool = False, varied: Sequence[str] = ()):
         self._reader: Any
         if engine == "native":
             from mjx_dher.envs.engines.native import Simulator
 
-            self._reader = Simulator(model, derived=("sensordata",))
+            self._reader = Simulator(model, derived=("sensordata",), varied=varied)
             self._rest = jax.device_get(self._reader.make_data())
         elif engine == "jax":
             from mjx_dher.envs.engines.mjx import MjxEngine
 
-            self._reader = MjxEngine(model, 1, sensors=True)
+            self._reader = MjxEngine(model, 1, sensors=True, varied=varied)
         else:
             from mjx_dher.envs.engines.warp import WarpEngine
 
-            self._reader = WarpEngine(model, 0, path="graph", allow_cpu=allow_cpu, sensors=True)
+            self._reader = WarpEngine(model, 0, path="graph", allow_cpu=allow_cpu, sensors=True, varied=varied)
 
     def read(self, physics: Physics, controls: Controls) -> Array:
         """Values [nsensordata] of all sensors, in the model's order."""
@@ -47,7 +49,9 @@ class Sensors:
             return self._reader.read_sensors(physics, controls)
         state = {"qpos": physics.qpos, "qvel": physics.qvel, "act": physics.act, "qacc_warmstart": physics.warmstart}
         mocap = {"mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
-        data = dataclasses.replace(jax.tree.map(jnp.asarray, self._rest), ctrl=controls.ctrl, **state, **mocap)
+        data = dataclasses.replace(
+            jax.tree.map(jnp.asarray, self._rest), ctrl=controls.ctrl, factors=physics.factors, **state, **mocap
+        )
         return self._reader.forward(data).derived["sensordata"]
 
     def check(self) -> None:

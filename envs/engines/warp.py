@@ -8,6 +8,7 @@ import concurrent.futures
 import copy
 import threading
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import mujoco
 from mjx_dher.envs.engines import graph
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.fused import simulation, support
+from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.lookup import check_name
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import load, prepare, wp
@@ -45,6 +47,7 @@ class WarpEngine:
       contacts: memory for contacts, with the same default. Only for `graph`.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread, to compare engines.
       sensors: whether to make the object for `read_sensors` instead of `advance`. Only for `graph`.
+      varied: as in `make_engine`. Only for `graph`.
 
     Raises:
       ValueError: JAX does not run on an NVIDIA GPU and `allow_cpu` is False, or the path does not support the model.
@@ -63,6 +66,7 @@ class WarpEngine:
         contacts: int | None = None,
         allow_cpu: bool = False,
         sensors: bool = False,
+        varied: Sequence[str] = (),
     ):
         check_name("path of engine warp", path, PATHS)
         prepare()
@@ -74,7 +78,9 @@ class WarpEngine:
                 check_count(name, count)
         self._model, self._substeps, self._sensors = copy.copy(model), substeps, sensors
         self.allow_cpu = allow_cpu
-        self.path, self.note = _choose(model, path, constraints)
+        self._variation = Variation(model, varied)
+        self._varied = [name for name in self._variation.fields if name != "dof_M0"]  # which MuJoCo Warp does not have
+        self.path, self.note = _choose(model, path, constraints, bool(varied))
         self.name = "warp" if self.path == "fused" else "warp graph"  # separate names, because results differ
         if self.path == "graph":
             most = graph.memory_for(model)
@@ -135,21 +141,27 @@ class WarpEngine:
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         qpos, qvel, rest = self._advanced(physics, controls)
-        if not self._model.na:
-            return Physics(qpos=qpos, qvel=qvel, warmstart=rest, act=physics.act)
-        return Physics(qpos=qpos, qvel=qvel, warmstart=rest[: self._model.nv], act=rest[self._model.nv :])
+        act = physics.act
+        if self._model.na:
+            rest, act = rest[: self._model.nv], rest[self._model.nv :]
+        return Physics(qpos=qpos, qvel=qvel, warmstart=rest, act=act, factors=physics.factors)
 
     def read_sensors(self, physics: Physics, controls: Controls) -> jax.Array:
         """Values [nsensordata] of the model's sensors. The engine must be made with `sensors`."""
         return self._advanced(physics, controls)[2][self._model.nv + self._model.na :]
 
     def _advanced(self, physics: Physics, controls: Controls) -> list[jax.Array]:
-        check_shapes(self._model, physics, controls)
+        check_shapes(self._model, physics, controls, self._variation.size)
         self._begin_loading()
         rest = jnp.concatenate([physics.warmstart, physics.act]) if self._model.na else physics.warmstart
         rows = [x[None].astype(jnp.float32) for x in (physics.qpos, physics.qvel, rest)]
         private_api.reset_call_id(self._call)
-        return [x[0] for x in self._call(*rows, jnp.concatenate([controls.mocap.ravel(), controls.ctrl])[None])]
+        inputs = [controls.mocap.ravel(), controls.ctrl]
+        if self._variation.size:
+            with jax.default_matmul_precision("highest"):
+                values = self._variation.values(self._variation.factors(physics.factors, jnp), jnp)
+            inputs += [values[name].ravel() for name in self._varied]
+        return [x[0] for x in self._call(*rows, jnp.concatenate(inputs)[None])]
 
     def check(self) -> None:
         """Checks that no contacts were lost since the last call. Waits for the kernel to compile.
@@ -185,8 +197,8 @@ class WarpEngine:
 
     def _made(self, num_envs: int) -> simulation.Simulation | graph.Simulation:
         if self.path == "graph":
-            sizes = (self._contacts, self._constraints)
-            return graph.Simulation(self._model, num_envs, self._substeps, *sizes, sensors=self._sensors)
+            sizes = self._substeps, self._contacts, self._constraints
+            return graph.Simulation(self._model, num_envs, *sizes, self._sensors, self._varied)
         return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints)
 
     def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation | graph.Simulation:
@@ -201,13 +213,15 @@ class WarpEngine:
         return made
 
 
-def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[str, str]:
+def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: bool) -> tuple[str, str]:
     """Path that runs, and the reason.
 
     Raises:
       ValueError: the path does not support the model.
     """
     left_out, reason = support.unsupported(model), "as asked"
+    if varied:
+        left_out.append("physics that varies between environments (path=graph has it)")
     if left_out and path != "graph":
         reason = f"the fused kernel does not support features of the model: {', '.join(left_out)}"
         if path == "fused":
