@@ -1,9 +1,9 @@
-"""What each part of the preset `gpu` gives on PickAndPlace and Slide: the preset without it, against the preset, seed by seed.
+"""Ablation of the preset `gpu` on PickAndPlace and Slide. Each arm omits one part of the preset; seeds are paired.
 
     python bench/ablation.py --out ablation --plan      what would be trained, and how long it would take
-    python bench/ablation.py --out ablation             trains and reports; the same command goes on where it was stopped
-    python bench/ablation.py --out ablation --report    reports what has ended
-    python bench/ablation.py --out ablation --runs docs/ablation_runs.csv   trains only what that file does not have
+    python bench/ablation.py --out ablation             trains and reports; run it again to resume
+    python bench/ablation.py --out ablation --report    reports the runs that have ended
+    python bench/ablation.py --out ablation --runs docs/ablation_runs.csv   trains only the runs missing in that file
     python bench/ablation.py --out toy --toy --seeds 3  the same on the point mass, on a CPU in minutes
 
 It is bench/bakeoff.py with other arms, and has its options. Each arm is a separate program. docs/experiments/ablation.md has
@@ -26,20 +26,20 @@ PLAIN = {"tqc": "sac", "dtqc": "td3"}  # a mean in place of quantiles
 
 
 def sized(run: RunSpec, **sizes: Any) -> RunSpec:
-    """Returns a run with other fields of its Config."""
+    """The run with other fields of its Config."""
     return dataclasses.replace(run, config=dataclasses.replace(run.config, **sizes))
 
 
 def numbered(run: RunSpec, **numbers: float) -> RunSpec:
-    """Returns a run with other fields of its HParams."""
+    """The run with other fields of its HParams."""
     return dataclasses.replace(run, hparams=run.hparams._replace(**numbers))
 
 
 def other_entropy(run: RunSpec) -> RunSpec:
-    """Returns a run of `tqc` with entropy as one of `dtqc` without, or the other way round.
+    """The run with `dtqc`, which has no entropy, in place of `tqc`, or the reverse.
 
-    The numbers are those of the preset that has that learner: actions are not punished where entropy is paid for, and
-    targets are not smoothed.
+    The numbers are taken from the preset with that learner: with entropy, actions are not punished and targets are not
+    smoothed.
     """
     if run.learner == "tqc":
         return numbered(dataclasses.replace(run, learner="dtqc"), action_l2=1.0, target_noise=0.0)
@@ -64,10 +64,10 @@ ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Returns a run of an arm, seed 0. `learner` is `gpu`: the preset's, as the bake-off has it.
+    """Run of an arm, seed 0. `learner` is `gpu`: the preset's, as in the bake-off.
 
     The priority is `eventful` in all arms, and returns have three steps in all but `one_step` and `ddpg`. The presets differ:
-    that of Slide has the priority `td_error`, and that of PickAndPlace smaller networks, returns of one step and `energy`.
+    Slide's has the priority `td_error`; PickAndPlace's has smaller networks, returns of one step and `energy`.
     """
     del learner
     run = dataclasses.replace(tuned("slide" if toy else task, priority="eventful"), env=task)

@@ -1,4 +1,4 @@
-"""A measurement in a program of its own, so that no earlier one has left anything behind."""
+"""Measurements in separate processes, so that earlier ones leave nothing behind."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def measured(script: str, args: Sequence[str], environ: Mapping[str, str] | None
     Args:
       script: path of the program to start.
       args: arguments of the function.
-      environ: variables to add to this program's environment.
-      python: interpreter that runs the script; it need not have this library.
+      environ: variables to add to this process's environment.
+      python: interpreter that runs the script. It does not need this library.
     """
     from mjx_dher.system import subprocesses
 
@@ -28,7 +28,7 @@ def measured(script: str, args: Sequence[str], environ: Mapping[str, str] | None
 
 
 def main(measure: Callable[..., Any], otherwise: Callable[[], int | None]) -> None:
-    """Runs a script: `measure` if `measured` has started it, `otherwise` if a user has."""
+    """Runs `measure` if `measured` started the script, and `otherwise` if a user did."""
     if sys.argv[1:2] == [MEASURE]:
         print(json.dumps(measure(*sys.argv[2:])))
     else:

@@ -1,13 +1,13 @@
-"""The bake-off of hindsight's methods: every arm of bench/bakeoff_arms.py against `future`, with the same seeds.
+"""Bake-off of hindsight methods: every arm of bench/bakeoff_arms.py against `future`, with the same seeds.
 
     python bench/bakeoff.py --out bakeoff --plan        what would be trained, and how long it would take
-    python bench/bakeoff.py --out bakeoff               trains and reports; the same command goes on where it was stopped
-    python bench/bakeoff.py --out bakeoff --report      reports what has ended
+    python bench/bakeoff.py --out bakeoff               trains and reports; run it again to resume
+    python bench/bakeoff.py --out bakeoff --report      reports the runs that have ended
     python bench/bakeoff.py --out toy --toy --seeds 3   the same on the point mass, on a CPU in minutes
 
-Each learner and task is a sweep in a folder of its own (`python train.py plot bakeoff/paper-slide` draws it, too). The report
-is bakeoff.csv, a row an arm, learner and task, and a forest plot a task. p is corrected over the arms that --arms names.
-A row a run is in bakeoff_runs.csv: `--runs FILE` goes on from it elsewhere, where the folders are not.
+Each learner and task is a sweep with a separate folder (`python train.py plot bakeoff/paper-slide` draws it, too). The report
+is bakeoff.csv, with one row per arm, learner and task, and one forest plot per task. p is corrected over the arms in --arms.
+bakeoff_runs.csv has one row per run: `--runs FILE` resumes from it on a machine without the folders.
 docs/experiments/bakeoff.md has the plan.
 """
 
@@ -45,7 +45,7 @@ TOY_TASK = "point_mass:PointMass"
 def parse(
     argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__
 ) -> argparse.Namespace:
-    """Returns the arguments, checked; ends the program with status 2 and a sentence for those that cannot be used."""
+    """Checked arguments. Unusable ones end the program with status 2 and an error message."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     learners, tasks, names = experiment.learners, experiment.tasks, [arm.name for arm in experiment.arms]
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps and of the report")
@@ -54,13 +54,11 @@ def parse(
     parser.add_argument("--arms", nargs="+", choices=names, default=names)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--lanes", type=int, help="runs side by side, at most; as many as memory holds on a GPU, 1 on a CPU")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop, to go on later, after the epoch that ends then")
-    parser.add_argument("--plan", action="store_true", help="say what would be trained, and train nothing")
-    parser.add_argument("--report", action="store_true", help="report what has ended, and train nothing")
-    parser.add_argument(
-        "--runs", type=Path, nargs="+", default=(), help="runs that have ended elsewhere: *_runs.csv of a report"
-    )
+    parser.add_argument("--lanes", type=int, help="parallel runs (default: as many as fit on a GPU, 1 on a CPU)")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after the epoch that ends then; resumable")
+    parser.add_argument("--plan", action="store_true", help="print what would be trained, and train nothing")
+    parser.add_argument("--report", action="store_true", help="report the runs that have ended, and train nothing")
+    parser.add_argument("--runs", type=Path, nargs="+", default=(), help="runs from other machines: *_runs.csv of a report")
     parser.add_argument("--toy", action="store_true", help="the point mass, tiny networks: tries the mechanics on a CPU")
     args = parser.parse_args(argv)
     for name in ("seeds", "lanes"):
@@ -86,12 +84,12 @@ def parse(
 
 
 def folder_of(args: argparse.Namespace, learner: str, task: str) -> Path:
-    """Returns the folder of a sweep."""
+    """Folder of a sweep."""
     return args.out / f"{learner}-{fingerprint.in_a_path(task)}"
 
 
 def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> list[RunSpec]:
-    """Returns the runs of the arms of a group, seed by seed, so that what is compared ends together."""
+    """Runs of the arms of a group, seed by seed, so that runs to be compared end together."""
     settings = [args.experiment.spec_of(learner, task, arm, args.toy) for arm in args.arms if arm.group == group]
     for setting in settings:
         validate(setting)
@@ -100,14 +98,14 @@ def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> 
 
 
 def plan(args: argparse.Namespace, console: Console) -> None:
-    """Prints the runs of each sweep, how many of them are done, and the minutes that all of them take."""
+    """Prints the runs of each sweep, the number already done, and the total minutes."""
     for learner in args.learners:
         for task in args.tasks:
             folder = folder_of(args, learner, task)
             runs = [run for group in args.experiment.groups for run in trials_of(args, learner, task, group)]
             done = sum(is_done(args, folder, run) for run in runs)
             steps = runs[0].config.total_steps
-            console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} of them done; learner {runs[0].learner}")
+            console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} done; learner {runs[0].learner}")
     if not args.toy:
         minutes = args.experiment.minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
         console.print(
@@ -117,7 +115,7 @@ def plan(args: argparse.Namespace, console: Console) -> None:
 
 
 def train(args: argparse.Namespace, console: Console) -> bool:
-    """Trains what is not done; returns whether all is."""
+    """Trains the runs that are not done. True if all are done afterwards."""
     prepare()
     until = time.monotonic() + 60 * args.minutes
     with signals.taken(), signals.held(console.print, args.out):
@@ -132,7 +130,7 @@ def train(args: argparse.Namespace, console: Console) -> bool:
 
 
 def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console: Console, until: float) -> bool:
-    """Trains the runs of a group that are not done, in one program; returns whether all of them are."""
+    """Trains the runs of a group that are not done, in one program. True if all are done afterwards."""
     learner, task, group = which
     folder = folder_of(args, learner, task)
     todo = [run for run in trials_of(args, learner, task, group) if not is_done(args, folder, run)]
@@ -158,12 +156,12 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
 
 
 def is_done(args: argparse.Namespace, folder: Path, run: RunSpec) -> bool:
-    """Returns whether a run has ended, in its folder or as one of --runs."""
+    """Whether a run has ended, in its folder or in --runs."""
     return fingerprint.trial_name(run) in args.known or grid.is_done(folder, run)
 
 
 def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
-    """Returns what the runs that have ended came to, those of --runs after those of the sweep's own folder."""
+    """Results of the runs that have ended: first from the sweep's folder, then from --runs."""
     folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
     wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
     trials: dict[str, list[dict[str, Any]]] = {}
@@ -190,7 +188,7 @@ def _runs(which: tuple[str, str, str], trials: list[dict[str, Any]], threshold: 
 
 
 def report(args: argparse.Namespace, console: Console) -> int:
-    """Writes the table and a forest plot a task of what has ended; returns the number of rows."""
+    """Writes the table and the forest plots of the ended runs. Returns the number of rows."""
     rows: list[Row] = []
     runs: list[Run] = []
     for task in args.tasks:
@@ -218,7 +216,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
 
 
 def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
-    """Plans, trains and reports; 0: all is done, 2: not possible, as a sentence says, 3: the same command has runs left."""
+    """Plans, trains and reports. Returns 0 (all done), 2 (an error, which is printed) or 3 (run again for the rest)."""
     args, console = parse(argv, experiment, about), Console(highlight=False, markup=False, soft_wrap=True)
     if args.plan:
         plan(args, console)
@@ -228,11 +226,11 @@ def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, ab
         report(args, console)
     except Exception as error:
         if (reason := sentence(error)) is None:
-            raise  # a fault of this program
+            raise  # a bug in this program
         console.print(f"error: {reason}", style="red")
         return 2
     if not done:
-        console.print("stopped; the same command goes on")
+        console.print("stopped; run the same command again to resume")
     return 0 if done else 3
 
 

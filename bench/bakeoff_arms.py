@@ -1,4 +1,4 @@
-"""The arms of bench/bakeoff.py: what each changes, what is claimed of it, and the settings that all share."""
+"""Arms of bench/bakeoff.py: changes, claims, and the shared settings."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ OURS = "nothing: a distance of this library's own, for the paper's open question
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """A setting that is compared with the baseline."""
+    """A setting to compare with the baseline."""
 
     name: str
-    # Arms of a group share a program. Those that ask the learner about the whole ring at each cycle, and those that draw four
-    # times as many transitions, would make the others' runs dearer.
+    # Arms of a group share a program. Arms that evaluate the learner on the whole ring each cycle, and arms that draw four
+    # times as many transitions, would slow down the others.
     group: str
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
@@ -37,7 +37,7 @@ class Arm:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """What bench/bakeoff.py trains and compares."""
+    """Runs and comparisons of bench/bakeoff.py."""
 
     arms: tuple[Arm, ...]  # the first one is the baseline
     learners: tuple[str, ...]
@@ -48,17 +48,17 @@ class Experiment:
 
     @property
     def runs(self) -> str:
-        """The name of the report's file of runs."""
+        """File name of the report's runs."""
         return self.table.replace(".csv", "_runs.csv")
 
     @property
     def baseline(self) -> str:
-        """The name of the arm that the others are compared with."""
+        """Name of the arm that the others are compared with."""
         return self.arms[0].name
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The groups of the arms, in order."""
+        """Groups of the arms, in order."""
         return tuple(dict.fromkeys(arm.group for arm in self.arms))
 
 
@@ -145,15 +145,15 @@ ARMS = (
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """Sizes of a task's runs, and what one of them costs."""
+    """Sizes of a task's runs, and the cost of one run."""
 
     changes: Mapping[str, Any]  # to the preset's Config
-    seconds: float  # of an H200 a run, from measured sweeps of `future`, scaled by the environment steps
+    seconds: float  # per run on an H200, from measured sweeps of `future`, scaled by the environment steps
 
 
-# As docs/results.md's fast sweeps, cut where `future` has learned: 7.0, 16.1 and 39.9 s a run of 50, 50 and 200 epochs.
+# The fast sweeps of docs/results.md, cut when `future` has learned: 7.0, 16.1 and 39.9 s per run of 50, 50 and 200 epochs.
 _FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
-# As bench/README.md's five side by side: 4.4, 11.8 and 40.2 s a run of 1.54, 1.02 and 8.19 million steps.
+# From five parallel runs in bench/README.md: 4.4, 11.8 and 40.2 s per run of 1.54, 1.02 and 8.19 million steps.
 SIZES = {
     ("paper", "push"): Size({**_FAST, "total_steps": 1_000_000}, 7.0 * 25 / 50),
     ("paper", "pick_and_place"): Size({**_FAST, "num_envs": 1600, "total_steps": 2_000_000}, 16.1 * 25 / 50),
@@ -162,7 +162,7 @@ SIZES = {
     ("best", "pick_and_place"): Size({"total_steps": 640_000}, 11.8 * 0.64 / 1.024),
     ("best", "slide"): Size({"cycles_per_epoch": 1, "total_steps": 1_740_800}, 40.2 * 1.741 / 8.192),
 }
-COMPILE_SECONDS = 30.0  # a program
+COMPILE_SECONDS = 30.0  # per program
 TOY = {
     "num_envs": 16,
     "cycles_per_epoch": 5,
@@ -177,7 +177,7 @@ TOY = {
 
 
 def parts_of(task: str, arm: Arm) -> dict[str, str]:
-    """Returns the parts of an arm by field of RunSpec; where an object comes to rest depends on the task."""
+    """Parts of an arm by field of RunSpec. The metric `resting_point` depends on the task."""
     parts = dict(arm.parts)
     if parts.get("metric") == "resting_point" and task != "slide":
         parts["metric"] = "resting_point_rough"
@@ -185,9 +185,9 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
 
 
 def tuned(task: str, **parts: str) -> RunSpec:
-    """Returns the run of the preset `gpu` that these experiments start from, with `parts` in place of its own.
+    """The run of the preset `gpu` that these experiments start from, with `parts` replaced.
 
-    For PickAndPlace it is that preset as it was until 2026-11-25: `frugal` with 512 environments and a larger ring.
+    For PickAndPlace it is that preset as of 2026-11-25: `frugal` with 512 environments and a larger ring.
     """
     if task != "pick_and_place":
         return presets.preset("gpu", task, **parts)
@@ -196,14 +196,14 @@ def tuned(task: str, **parts: str) -> RunSpec:
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Returns a run of an arm, seed 0.
+    """Run of an arm, seed 0.
 
-    `paper` is DDPG under the paper's settings, `best` what `tuned` gives, with `eventful`. Priorities choose the whole batch in
-    `paper`, as their authors do, and in `best` the preset's half of it, where they take the place of `eventful`.
+    `paper` is DDPG under the paper's settings; `best` is `tuned`, with `eventful`. In `paper`, priorities choose the whole
+    batch, as in their authors' work. In `best` they replace `eventful` for the preset's half of the batch.
     """
     parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
     run = presets.preset("paper", task, **parts) if learner == "paper" else tuned(task, **parts)
-    # A ring of all that is played: a larger one costs memory alone.
+    # A ring for all transitions: a larger one costs only memory.
     changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}
     numbers = dict(arm.numbers)
     if arm.prioritized and learner == "paper":
@@ -212,7 +212,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
 
 
 def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Returns the minutes of one H200 that the runs take by what sweeps of `future` took, compilation included."""
+    """Minutes of one H200 for the runs, estimated from sweeps of `future`, compilation included."""
     sizes = [SIZES[learner, task] for learner in learners for task in tasks]
     programs = len(sizes) * len({arm.group for arm in arms})
     return (sum(size.seconds for size in sizes) * len(arms) * seeds + COMPILE_SECONDS * programs) / 60

@@ -1,4 +1,4 @@
-"""The comparison of bench/bakeoff.py's arms with the first of them: rows of a table, and forest plots."""
+"""Comparison of bench/bakeoff.py's arms with the first of them: rows of a table, and forest plots."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ALPHA, POWER = 0.05, 0.8
 
 
 class Scores(NamedTuple):
-    """What the runs of an arm came to, by seed; all [S]."""
+    """Results of an arm's runs, by seed; all [S]."""
 
     seeds: tuple[int, ...]
     area: NDArray  # mean success over the epochs
@@ -29,7 +29,7 @@ class Scores(NamedTuple):
 
 
 class Row(NamedTuple):
-    """An arm of a learner and task beside the baseline. Differences are paired by seed; intervals are at 95 %."""
+    """Comparison of an arm with the baseline, for a learner and task. Differences are paired by seed; intervals are at 95 %."""
 
     learner: str
     task: str
@@ -54,10 +54,10 @@ class Row(NamedTuple):
 
 
 def smallest_effect(spread: float, seeds: int, tests: int) -> float:
-    """Returns the mean difference for which the permutation test has p <= 0.05 / tests four times in five; NaN where none has.
+    """Mean difference for which the permutation test has p <= 0.05 / tests with probability 0.8. NaN: there is none.
 
-    `spread` is the standard deviation of the differences, which are taken as normal: 2,000 draws of them. Holm's method holds
-    the smallest of `tests` p-values to that level. Beyond 12 seeds signs are drawn, too, 4,096 of them.
+    `spread` is the standard deviation of the differences, which are assumed normal: 2,000 draws. Holm's method holds the
+    smallest of `tests` p-values to that level. Beyond 12 seeds, 4,096 sign patterns are drawn, too.
     """
     if seeds < 2 or 2.0 ** (1 - seeds) > ALPHA / tests:
         return math.nan
@@ -83,16 +83,16 @@ def _smallest_effect(seeds: int, tests: int) -> float:
 
 
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm], tests: int | None = None) -> list[Row]:
-    """Returns a row an arm that has scores, each against the first of `arms` on the seeds that both have.
+    """One row per arm with scores, each against the first of `arms` on their common seeds.
 
-    p is corrected over `tests` comparisons (`corrected`): unless given, all of `arms`, those that have not been run yet, too.
+    p is corrected over `tests` comparisons (`corrected`). Default: all of `arms`, including those without scores.
     """
     base, tests = scores[arms[0].name], len(arms) - 1 if tests is None else tests
     return corrected([_row(learner, task, arm, scores[arm.name], base, tests) for arm in arms if arm.name in scores], tests)
 
 
 def corrected(rows: Sequence[Row], tests: int) -> list[Row]:
-    """Returns the rows with p corrected over `tests` comparisons together (`stats.holm`)."""
+    """The rows with p corrected over `tests` comparisons together (`stats.holm`)."""
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
     by_row = dict(zip(tested, stats.holm([rows[number].p_value for number in tested], tests)))
     return [row._replace(p_corrected=by_row[n]) if n in by_row else row for n, row in enumerate(rows)]
@@ -138,7 +138,9 @@ def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: in
 
 
 def forest(rows: Sequence[Row], path: Path, baseline: str) -> None:
-    """Draws the paired differences of a task's arms to the baseline, a panel a learner, with intervals and corrected p."""
+    """Draws the paired differences of a task's arms from the baseline, with intervals and corrected p, one panel per
+    learner.
+    """
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""The runs of bench/bakeoff.py as rows of a file: all that is compared, without the folders that they were trained in."""
+"""Runs of bench/bakeoff.py as rows of a file, which suffices for the report without the runs' folders."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mjx_dher.system.files import FolderError
 
 
 class Run(NamedTuple):
-    """What a run came to."""
+    """Result of a run."""
 
     learner: str
     task: str
@@ -33,7 +33,7 @@ class Run(NamedTuple):
 
 
 def save(path: Path, runs: Iterable[Run]) -> None:
-    """Writes runs, a row each."""
+    """Writes one row per run."""
     with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Run._fields)
@@ -41,10 +41,10 @@ def save(path: Path, runs: Iterable[Run]) -> None:
 
 
 def load(path: Path, experiment: Experiment | None = None) -> list[Run]:
-    """Returns the runs of a file that `save` has written.
+    """Runs of a file written by `save`.
 
     Raises:
-      FolderError: no such file, a row that is none, or a run whose settings are not those of the `experiment`'s arm today.
+      FolderError: the file does not exist, a row is invalid, or a run's settings differ from the `experiment`'s arm today.
     """
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -61,7 +61,7 @@ def load(path: Path, experiment: Experiment | None = None) -> list[Run]:
 
 
 def _run(where: str, row: dict[str, str]) -> Run:
-    """Returns the run of a row; raises FolderError where it holds none."""
+    """The run of a row. Raises FolderError if the row is invalid."""
     try:
         run = Run(
             *(row[name] for name in ("learner", "task", "arm")),
@@ -78,7 +78,7 @@ def _run(where: str, row: dict[str, str]) -> Run:
 
 
 def _check(where: str, run: Run, experiment: Experiment) -> None:
-    """Raises FolderError for a run that the experiment does not have, or has with other settings."""
+    """Raises FolderError for a run that the experiment lacks, or has with other settings."""
     arms = {arm.name: arm for arm in experiment.arms}
     for column, values in {"learner": experiment.learners, "task": experiment.tasks, "arm": tuple(arms)}.items():
         if getattr(run, column) not in values:
@@ -89,12 +89,12 @@ def _check(where: str, run: Run, experiment: Experiment) -> None:
 
 
 def name_of(spec: RunSpec, seed: int) -> str:
-    """Returns the name of the folder of a run with this seed."""
+    """Folder name of a run with this seed."""
     return fingerprint.trial_name(dataclasses.replace(spec, seed=seed))
 
 
 def merged(runs: Iterable[Run]) -> list[Run]:
-    """Returns the runs, each once: the first of each name."""
+    """The runs without duplicates: the first of each name."""
     found: dict[str, Run] = {}
     for run in runs:
         found.setdefault(run.name, run)
@@ -102,7 +102,7 @@ def merged(runs: Iterable[Run]) -> list[Run]:
 
 
 def by_arm(runs: Iterable[Run]) -> dict[str, Scores]:
-    """Returns the scores of the runs of one learner and task by arm, ordered by seed."""
+    """Scores by arm of the runs of one learner and task, ordered by seed."""
     found: dict[str, list[Run]] = {}
     for run in sorted(runs, key=lambda run: run.seed):
         found.setdefault(run.arm, []).append(run)

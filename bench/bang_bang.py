@@ -1,12 +1,14 @@
-"""Does the physics survive a policy that only slams? Whole episodes of random actions, each coordinate -1 or 1.
+"""Does the physics survive extreme actions? Whole episodes of random actions, each coordinate -1 or 1.
 
     python bench/bang_bang.py [--tasks TASK ...] [--engine native] [--actions 1000000] [--num-envs 200]
 
-A line a task: episodes whose physics blew up (and was put back to a start), the object's greatest speed after any step, the
-share of episodes that end with any two geoms deeper than 5 mm in each other, and the deepest. Exits with 1 where an episode
-ended with a value that is not finite, an object faster than 10 m/s, or geoms deeper than 5 cm in each other. The contacts are
-the original's, and soft: slammed from above, the cube sinks up to 50 mm into the table there, up to 47 here, and the puck up to
-45 there, in six tries. Slide on native exits with 1: its puck once sinks 63 mm in 20,000 episodes (bench/README.md).
+The table has one row per task: episodes whose physics blew up (and was reset), the object's greatest speed after any step, the
+share of episodes that end with two geoms more than 5 mm inside each other, and the deepest penetration. The exit status is 1
+if an episode ended with a value that is not finite, an object faster than 10 m/s, or a penetration beyond 5 cm.
+
+The contacts are as soft as the original's. In six tries of slamming from above, the original's cube sinks up to 50 mm into the
+table (47 mm here), and its puck up to 45 mm. Slide on native exits with 1: in 20,000 episodes its puck once sinks 63 mm
+(bench/README.md).
 """
 
 from __future__ import annotations
@@ -51,7 +53,7 @@ def play(env, num_envs):
 
 
 def penetration(model, qpos):
-    """Depth, m, of the deepest contact in each state, [N]; MuJoCo C finds it, whatever the engine."""
+    """Depth [N] in m of the deepest contact in each state, computed by MuJoCo C for every engine."""
     data, depths = mujoco.MjData(model), []
     for row in qpos:
         data.qpos[:] = row

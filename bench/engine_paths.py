@@ -1,10 +1,10 @@
-"""Both paths of the engine warp beside native: how far apart their coordinates are, and how fast they run.
+"""Both paths of the engine warp against native: the difference of their coordinates, and their speed.
 
     PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu] [--models arm block_rotate_z] [--num-envs 1024 8192]
 
-A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest ones of all coordinates within 8
-environment steps of 64 environments under random controls; a task has its own number of timesteps a step. Speed is of 24 more
-steps: physics alone, from where those ended. Each line is printed as soon as it is measured.
+A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest of all coordinates within 8
+environment steps of 64 environments under random controls. A task has its own number of timesteps per step. The speed is
+measured over the next 24 steps, of physics alone. Each line is printed as soon as it is measured.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ HEAD = "| model | path | environments | env steps/s | first call, s | median dis
 
 
 def load(name: str) -> tuple[mujoco.MjModel, int]:
-    """A model and its timesteps an environment step."""
+    """A model and its timesteps per environment step."""
     if name in MODELS:
         return mujoco.MjModel.from_xml_string(MODELS[name]), SUBSTEPS
     if name.endswith(".xml"):
@@ -37,7 +37,7 @@ def load(name: str) -> tuple[mujoco.MjModel, int]:
 
 
 def measure(engine, model, num_envs: int) -> tuple[float, float, np.ndarray]:
-    """Environment steps a second, seconds of the first call, and coordinates [64, 8, nq]."""
+    """Environment steps per second, seconds of the first call, and coordinates [64, 8, nq]."""
     first, controls = start(model, (FEW,))
     many = lambda x: jnp.tile(x, (num_envs // FEW, *([1] * (x.ndim - 1))))  # noqa: E731
     first, controls = jax.tree.map(many, first), jax.tree.map(many, controls)

@@ -1,13 +1,13 @@
-"""Open-loop replay of recorded episodes of the original tasks: how far do the rebuilt ones stray?
+"""Open-loop replay of recorded episodes of the original tasks: how far do the rebuilt ones deviate?
 
     python bench/fidelity.py [--engines native jax warp] [--tasks push pick_and_place slide]
 
-Starts, goals and actions are those of tests/data/fetch_TASK.npz; nothing is fed back in 50 steps. `warp` runs on the CPU
-where there is no GPU. With all tasks and engines, which takes some minutes, it puts its tables into docs/fidelity.md and
-draws docs/fidelity_trajectories.png (extra `plot`); with fewer it only prints.
+Starts, goals and actions are taken from tests/data/fetch_TASK.npz. There is no feedback in 50 steps. `warp` runs on the CPU if
+there is no GPU. With all tasks and engines (some minutes) it writes its tables into docs/fidelity.md and draws
+docs/fidelity_trajectories.png (extra `plot`). With fewer it only prints.
 
-The yardstick beside them is the original, replayed in the same way with its object's start moved by 0.1 mm. That runs in an
-environment of its own, which needs a MuJoCo older than ours, and writes tests/data/fetch_yardstick.csv:
+The yardstick is the original, replayed in the same way with its object's start moved by 0.1 mm. It needs a separate virtual
+environment with an older MuJoCo, and writes tests/data/fetch_yardstick.csv:
 
     python -m venv .fetch && .fetch/bin/pip install gymnasium-robotics==1.4.2 mujoco==3.11.0
     PYTHONPATH=. .fetch/bin/python bench/fidelity.py yardstick
@@ -38,13 +38,13 @@ KINDS = ("random actions", "script with noise", "script")
 HEAD = ("task", "episodes", "run by", "grip, mean", "p95", "object, median", "p95", "moved agrees", "success agrees")
 MOVED = 0.02  # m
 SHIFTS = (0.0, 1e-4)  # m, of the yardstick
-DIRECTIONS = 4  # that the yardstick moves each start in
-FALLS = 1000  # episodes that are looked at for pucks that fall
+DIRECTIONS = 4  # of the yardstick's moves of each start
+FALLS = 1000  # episodes in which fallen pucks are counted
 PUCK_SPEED, FRICTION, GRAVITY = 0.5, 0.1, 9.81  # m/s, -, m/s^2
 
 
 def load(task):
-    """The recorded episodes; bench/record_fetch.py says what the arrays are."""
+    """Recorded episodes. bench/record_fetch.py documents the arrays."""
     with np.load(DATA / f"fetch_{task}.npz") as file:
         return {name: file[name] for name in file.files}
 
@@ -54,9 +54,9 @@ def figures(recorded, grip, obj, of):
 
     Args:
       recorded: the task's episodes.
-      grip: [K, T+1, 3] m, of K replayed ones.
-      obj: [K, 2, 3] the object's first and last place in them, m.
-      of: [K] which of the recorded they replay.
+      grip: [K, T+1, 3] m, of K replayed episodes.
+      obj: [K, 2, 3] first and last position of the object in m.
+      of: [K] indices of the replayed episodes.
     """
     there, goal = recorded["achieved"][of][:, [0, -1]], recorded["goal"][of]
     grip_error = 1e3 * np.linalg.norm(grip - recorded["grip"][of], axis=-1)
@@ -100,7 +100,7 @@ def replay(env, recorded):
 
 
 def free_slide(engine):
-    """How far, in m, a puck goes that starts at PUCK_SPEED along x and that nothing touches but the table."""
+    """Distance in m that a puck slides from PUCK_SPEED along x, touching only the table."""
     import jax
     import jax.numpy as jnp
 
@@ -116,7 +116,7 @@ def free_slide(engine):
 
 
 def falls(engine):
-    """How many of FALLS episodes of Slide end with the puck below the table: each pushes it on, whichever way it chose."""
+    """Number of FALLS episodes of Slide that end with the puck below the table. Each pushes it on in its own direction."""
     import jax
     import jax.numpy as jnp
 
@@ -134,7 +134,7 @@ def falls(engine):
 
 
 def between_engines(recorded, paths):
-    """Lines on how the engines compare with one another on Slide."""
+    """Lines that compare the engines with one another on Slide."""
     script = recorded["policy"] == KINDS.index("script")
     ends = {engine: paths["slide", engine][1][script][:, -1] for engine in ENGINES}
     apart = {engine: 1e3 * np.linalg.norm(ends[engine] - ends["native"], axis=-1) for engine in ENGINES[1:]}
@@ -184,7 +184,7 @@ def report(tasks, engines):
 
 
 def draw(recorded, paths):
-    """The picture: three scripted episodes of each task, recorded and replayed on `native`, from above and over time."""
+    """Draws three scripted episodes per task, recorded and replayed on `native`, from above and over time."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, len(TASKS), figsize=(12, 7.6), height_ratios=(1.5, 1), layout="constrained")
@@ -196,7 +196,7 @@ def draw(recorded, paths):
         time = 0.04 * np.arange(there["object"].shape[1])
         script = np.flatnonzero(recorded[task]["policy"] == KINDS.index("script"))
         error = np.linalg.norm((here["object"] - there["object"])[script, -1], axis=-1)
-        # Not the best ones: those at 25, 50 and 90 % of the order by the object's error.
+        # The episodes at 25, 50 and 90 % of the order by the object's error.
         chosen = np.argsort(error)[[len(script) * share // 100 for share in (25, 50, 90)]]
         for name, (pale, dark, line) in looks.items():
             for episode in script[chosen]:
@@ -227,7 +227,7 @@ def draw(recorded, paths):
 
 
 def put_into_document(block):
-    """Replaces what stands between the markers in docs/fidelity.md; all else there is written by hand."""
+    """Replaces the text between the markers in docs/fidelity.md."""
     text = DOCUMENT.read_text()
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
     DOCUMENT.write_text(f"{text[:start]}\n{block}\n{text[end:]}")
@@ -241,10 +241,10 @@ def run_by(shift):
 
 
 def replay_original(env, recorded, shift, rng):
-    """Grip [E, T+1, 3] and the object's first and last place [E, 2, 3], m, in the original itself.
+    """Grip [E, T+1, 3] and the object's first and last position [E, 2, 3] in m, in the original itself.
 
-    The object starts `shift` m from where it was recorded, in a random direction of the plane; the recording is rounded to
-    float32, so a shift of 0 is no exact replay either.
+    The object starts `shift` m from its recorded start, in a random direction of the plane. Recordings are rounded to float32,
+    so a shift of 0 is no exact replay either.
     """
     import mujoco
 
@@ -266,7 +266,7 @@ def replay_original(env, recorded, shift, rng):
 
 
 def yardstick():
-    """Writes what the report says of the originals, replayed from starts moved by SHIFTS."""
+    """Writes the report's numbers for the originals, replayed from starts moved by SHIFTS."""
     import gymnasium as gym
     import gymnasium_robotics
 

@@ -1,18 +1,18 @@
-"""Open-loop replay of recorded episodes of the original hand tasks: how far do ours stray?
+"""Open-loop replay of recorded episodes of the original hand tasks: how far do ours deviate?
 
     python bench/fidelity_hand.py [--engines native] [--tasks block_rotate_xyz egg_rotate pen_rotate hand_reach]
 
 It replays the recorded actions from the recorded starts, without feedback, and prints a table. With all tasks on `native` it
-puts the table into docs/fidelity.md. `--episodes` and `--steps` shorten it, for `warp` on a CPU.
+writes the table into docs/fidelity.md. `--episodes` and `--steps` shorten it, for `warp` on a CPU.
 
-`record` plays the episodes and `yardstick` replays them in the original itself, with the start moved by 0.1 mm (0.1 mrad
-without an object). Both need a MuJoCo older than ours, and so another environment:
+`record` plays the episodes. `yardstick` replays them in the original itself, with the start moved by 0.1 mm (0.1 mrad without
+an object). Both need a separate virtual environment with an older MuJoCo:
 
     python -m venv .fetch && .fetch/bin/pip install gymnasium-robotics==1.4.2 mujoco==3.11.0
     PYTHONPATH=. .fetch/bin/python bench/fidelity_hand.py record
     PYTHONPATH=. .fetch/bin/python bench/fidelity_hand.py yardstick
 
-tests/data/hand_TASK.npz has, for E episodes of T steps, of which every tenth is kept:
+tests/data/hand_TASK.npz has E episodes of T steps, and every tenth state:
 
     action  (E, T, 20)         int8, in units of 1/127
     qpos    (E, T/10 + 1, nq)  joint angles, rad, then the object's position, m, and orientation (w, x, y, z)
@@ -92,7 +92,7 @@ def short(error):
 
 
 def turn(a, b):
-    """Angle between orientations [..., 4], rad, of which q and -q are the same."""
+    """Angle in rad between orientations [..., 4]; q and -q are the same orientation."""
     return 2 * np.arccos(np.clip(np.abs(np.sum(a * b, axis=-1)), 0, 1))
 
 
@@ -101,8 +101,8 @@ def figures(recorded, qpos, of):
 
     Args:
       recorded: the task's episodes.
-      qpos: [K, T/10 + 1, nq] of K replayed ones.
-      of: [K] which of the recorded they replay.
+      qpos: [K, T/10 + 1, nq] of K replayed episodes.
+      of: [K] indices of the replayed episodes.
     """
     there = recorded["qpos"][of][:, : qpos.shape[1]].astype(float)
     joints = 1e3 * np.abs(qpos - there)[..., :JOINTS].mean(axis=-1)
@@ -178,7 +178,7 @@ def run_by(shift):
 
 
 def original(task):
-    """The original task, and the numbers of its coordinates that are ours (the rest is the drawn target's)."""
+    """The original task, and the indices of the coordinates it shares with ours (the others belong to the drawn target)."""
     import gymnasium
     import gymnasium_robotics
 

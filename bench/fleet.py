@@ -1,13 +1,15 @@
-"""What a sweep over many nodes survives, and what it costs.
+"""Faults and overhead of a sweep over many nodes.
 
     python bench/fleet.py kills [--rounds 20] [--seeds 12] [--seed 0]
     python bench/fleet.py overhead [--seconds 60]
 
-`kills` starts a cluster of four nodes on this machine (`ray.cluster_utils.Cluster`), sweeps the point mass of docs/examples
-with the real command, and kills (SIGKILL) a worker, a node and the driver in turn, at random times; a node comes back, and a
-driver is started again with the same command. When a sweep has ended before all kills are made, another one begins. Each must
-have every trial, none twice, and the tables of the same sweep without Ray. `overhead` times the same sweep by the plain
-command and by `--ray local` with one task at a time, after its programs have been compiled. The extra ray is needed.
+`kills` starts a cluster of four nodes on this machine (`ray.cluster_utils.Cluster`) and sweeps the point mass of docs/examples
+with the real command. It kills (SIGKILL) a worker, a node and the driver in turn, at random times, then replaces the node, or
+starts the driver again with the same command. When a sweep ends before all kills are made, another one begins. Each sweep must
+have every trial exactly once, and the tables of the same sweep without Ray.
+
+`overhead` times the same sweep by the plain command and by `--ray local` with one task at a time, after compilation. The extra
+`ray` is needed.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from mjx_dher.system.limits import usable_cores
 
 ROOT = Path(__file__).resolve().parent.parent
 STORE = 80 << 20  # bytes of a node's object store
-TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")  # columns that no two runs have alike
+TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")  # columns that differ between runs
 SIZES = """
     --preset cpu --env docs.examples.point_mass:PointMass --sampler future weighted --final-episodes 20 --num-envs 16
     --batch-size 64 --replay-size 4000 --hidden-sizes 32 --eval-episodes 20 --threshold 0.5 --checkpoint-every 2
@@ -43,7 +45,7 @@ STEPS_PER_EPOCH = 3200
 
 
 class Nodes:
-    """A cluster on this machine: a head without CPUs, and nodes with one each."""
+    """A cluster on this machine: a head without CPUs, and nodes with one CPU each."""
 
     def __init__(self, count, **options):
         self.options = {"num_cpus": 1, "object_store_memory": STORE, **options}
@@ -67,7 +69,7 @@ class Nodes:
         self.nodes.append(self.cluster.add_node(**self.options))
 
     def workers(self):
-        """Process ids of those that train, by the title that Ray gives them, among children of this cluster's nodes."""
+        """Process ids of training processes among the children of this cluster's nodes, by the title that Ray gives them."""
         raylets = {int(line.split()[0]): int(line.split()[1]) for line in _ps("pid=,ppid=")}
         own = {pid for pid, parent in raylets.items() if parent == os.getpid()}
         lines = [line.split(None, 2) for line in _ps("pid=,ppid=,args=")]
@@ -92,7 +94,7 @@ def finished(process, seconds=1800):
 
 
 def table(folder, name):
-    """Rows of a table, without what no two runs have alike."""
+    """Rows of a table, without the columns that differ between runs."""
     with (folder / name).open() as file:
         return [{key: value for key, value in row.items() if key not in TIMES} for row in csv.DictReader(file)]
 
@@ -103,7 +105,7 @@ def same_tables(one, other):
 
 
 def kill(kind, nodes, driver, dice):
-    """Kills a worker or a node, or the driver; returns whether there was one to kill."""
+    """Kills a worker, a node or the driver. False if there was none to kill."""
     if kind == "worker":
         if workers := nodes.workers():
             os.kill(dice.choice(workers), signal.SIGKILL)
@@ -117,7 +119,7 @@ def kill(kind, nodes, driver, dice):
 
 
 def kills(rounds, seeds, seed, epochs=12):
-    """Kills in turn until there were so many; returns a row for each sweep."""
+    """Kills in turn until `rounds` kills were made. Returns one row per sweep."""
     dice, rows, done = random.Random(seed), [], 0
     flags = [*LONG, epochs * STEPS_PER_EPOCH, "--seeds", seeds]
     with tempfile.TemporaryDirectory() as folder, Nodes(4) as nodes:
@@ -159,7 +161,7 @@ def kills(rounds, seeds, seed, epochs=12):
 
 
 def overhead(seconds):
-    """Times of the same sweep, plain and by Ray, with one task at a time of at least so many seconds."""
+    """Times the same sweep, plain and by Ray, with one task at a time of at least `seconds`."""
     cores = usable_cores()
     with tempfile.TemporaryDirectory() as folder:
 

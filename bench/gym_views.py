@@ -1,8 +1,8 @@
-"""Environment steps a second through gymnasium, with random actions, resets included: one environment, and many at once.
+"""Environment steps per second through gymnasium, with random actions, resets included: one environment, and many in parallel.
 
     python bench/gym_views.py [--tasks FetchPush FetchReach] [--num-envs 32]
 
-The same without gymnasium, with a policy network: throughput.py.
+For the same without gymnasium, with a policy network, see throughput.py.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def measure(env, num_envs: int) -> tuple[str, str]:
-    """Steps a second over whole episodes, resets included in the time but not counted, and seconds until it has compiled."""
+    """Steps per second over whole episodes (resets are timed but not counted), and seconds until it is compiled."""
     actions = np.random.default_rng(0).uniform(-1, 1, (50, *env.action_space.shape)).astype(np.float32)
     start = time.perf_counter()
     env.reset(seed=0)

@@ -1,15 +1,15 @@
 """Writes envs/assets/hand/*.xml from the numbers of the original hand tasks' compiled models.
 
-Runs in an environment of its own, because gymnasium-robotics 1.4.2 needs a MuJoCo older than ours:
+Needs a separate virtual environment, because gymnasium-robotics 1.4.2 requires an older MuJoCo:
 
     python -m venv .fetch && .fetch/bin/pip install gymnasium-robotics==1.4.2 mujoco==3.11.0
     .fetch/bin/python bench/hand_model.py
 
 It then compares the compiled models, original and ours, and prints the largest difference in each quantity.
 
-Differences: meshes that nothing touches, the drawn target's body, and two boxes of 2 mm in the thumb's joints, which
-random actions never touch, are left out. The forearm's convex mesh is a capsule. The hand does not touch the floor, as random
-actions never made it do in 480,000 timesteps.
+Differences: meshes that nothing touches, the drawn target's body, and two boxes of 2 mm in the thumb's joints, which random
+actions never touch, are left out. The forearm's convex mesh is a capsule. The hand does not touch the floor: random actions
+never made it do so in 480,000 timesteps.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SKIN, SHELL = "0.85 0.87 0.9 1", "0.35 0.37 0.42 1"
 
 
 def originals():
-    """Compiled models of the originals by object, `reach` without one, and the angles that HandReach starts with, by joint."""
+    """Compiled models of the originals by object (`reach` has none), and HandReach's initial angles by joint."""
     import gymnasium_robotics
     from gymnasium_robotics.envs.shadow_dexterous_hand.reach import DEFAULT_INITIAL_QPOS
 
@@ -57,13 +57,13 @@ def numbers(values):
 
 
 def own(name):
-    """Our name of an element: without the robot's prefix and the mark of its kind."""
+    """Our name of an element: without the robot's prefix and the marker of its kind."""
     name = name.removeprefix(PREFIX)
     return name[2:] if name[:2] in ("C_", "S_", "A_", "T_") else name
 
 
 def body(model, index):
-    """Lines of a body of the hand, with all that it carries."""
+    """Lines of a body of the hand, with everything attached to it."""
     it = model.body(index)
     frame = f' pos="{numbers(it.pos)}"' if it.pos.any() else ""
     if abs(it.quat[0] - 1) > 1e-9:
@@ -91,7 +91,7 @@ def body(model, index):
 
 
 def geom(model, i):
-    """The line of a geom of the hand that can touch something; none for the others."""
+    """The line of a geom of the hand, or none if it cannot touch anything."""
     it = model.geom(i)
     if not model.geom_contype[i] or it.name.removeprefix(PREFIX) in TINY:
         return []

@@ -1,14 +1,14 @@
-"""Where the numbers in envs/assets and envs/TASK.py come from, and whether fitting them to recordings would improve on them.
+"""Where the numbers in envs/assets and envs/TASK.py come from, and whether fitting them to recordings would improve them.
 
-`read` prints the numbers of the original's compiled model beside ours and, at the end, the largest difference in each
-quantity. It runs in an environment of its own, because the original needs a MuJoCo older than ours:
+`read` prints the numbers of the original's compiled model and ours, then the largest difference in each quantity. It needs a
+separate virtual environment with an older MuJoCo:
 
     python -m venv .fetch && .fetch/bin/pip install gymnasium-robotics==1.4.2 mujoco==3.11.0
     PYTHONPATH=. .fetch/bin/python bench/identify.py read [--tasks push pick_and_place slide reach]
 
-`fit` scales six groups of those numbers so that recorded episodes, replayed open loop in MuJoCo C, stray least (Nelder and
-Mead's simplex, from scipy, which JAX brings along), and prints the errors before and after, also on episodes that it did not
-see. It changes nothing in envs/assets: `python bench/identify.py fit [--evaluations 150]`, some minutes.
+`fit` scales six groups of those numbers so that recorded episodes, replayed open loop in MuJoCo C, deviate least (Nelder-Mead
+simplex from scipy, which JAX requires). It prints the errors before and after, also on held-out episodes, and changes nothing
+in envs/assets: `python bench/identify.py fit [--evaluations 150]`, some minutes.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FINGERS = ("r", "l")
 
 
 def task_numbers(task):
-    """The keywords of `FetchTask(...)` in envs/TASK.py, read without importing it (and with it JAX)."""
+    """The keywords of `FetchTask(...)` in envs/TASK.py, read without importing it (and JAX)."""
     tree = ast.parse((ROOT / "envs" / f"{task}.py").read_text())
     (call,) = (n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "FetchTask")
     return {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
@@ -43,7 +43,7 @@ def our_model(task):
 
 
 def settle(model, numbers):
-    """Our model's data with the arm where the task starts."""
+    """Our model's data with the arm at the task's start."""
     data = mujoco.MjData(model)
     for name, angle in zip(JOINTS, numbers["arm_qpos"]):
         data.joint(name).qpos = angle
@@ -93,7 +93,7 @@ def arm_inertia(model, data, name="{}"):
 
 
 def rows_of_weld(there, here):
-    """The weld. What counts of its impedance d is (1 - d) / d times the body's inverse inertia: see envs/assets/common.xml."""
+    """The weld. Its impedance d acts through (1 - d) / d times the body's inverse inertia: see envs/assets/common.xml."""
 
     def softness(model, body, part):
         impedance = model.eq_solimp[0, :2]
@@ -107,7 +107,7 @@ def rows_of_weld(there, here):
 
 
 def rows_of_contacts(there, here):
-    """Sizes, and each pair of ours against what MuJoCo mixes from the original's two geoms."""
+    """Sizes, and each of our pairs against MuJoCo's mix of the original's two geoms."""
     geoms = {
         "finger_both": "robot0:r_gripper_finger_link",
         "finger_r": "robot0:r_gripper_finger_link",
@@ -171,7 +171,7 @@ def rows_of_actuators(there, here):
 
 
 def rows_of_start(env, numbers):
-    """What envs/TASK.py calls settled, and the ranges of object and goal."""
+    """Values marked as settled in envs/TASK.py, and the ranges of object and goal."""
     joints = [env.data.joint(f"robot0:{name}_joint") for name in JOINTS]
     yield "settled angles, rad", "arm", [j.qpos[0] for j in joints], numbers["arm_qpos"]
     yield "settled rates, rad/s", "arm", [j.qvel[0] for j in joints], numbers["arm_qvel"]
@@ -209,7 +209,7 @@ def read(tasks):
             a, b = (np.squeeze(np.asarray(value, float)) for value in values)
             apart = float(np.abs(a - b).max())
             largest.setdefault(quantity, {})[task] = max(apart, largest.get(quantity, {}).get(task, 0.0))
-            a, b = (np.diag(value) if value.ndim == 2 else value for value in (a, b))  # of a matrix, what one can read
+            a, b = (np.diag(value) if value.ndim == 2 else value for value in (a, b))  # only the diagonal of a matrix
             print(f"{quantity:34s} {part:26s} {a}" + (f"  here {b}" if apart > 1e-6 else ""))
     print(f"\nLargest difference\n\n{'':36s}" + "".join(f"{task:>16s}" for task in tasks))
     for quantity, by_task in largest.items():
@@ -218,7 +218,7 @@ def read(tasks):
 
 # fit
 
-SUBSTEPS, ACTION_SCALE, CAP = 20, 0.05, 0.05  # -, m, m: an episode that has gone astray must not rule the fit
+SUBSTEPS, ACTION_SCALE, CAP = 20, 0.05, 0.05  # -, m, m: a cap keeps single episodes from dominating the fit
 SCALED = ("joint damping", "joint armature", "weld time", "weld softness", "finger friction", "object friction")
 
 
@@ -298,7 +298,7 @@ def errors(scale, recorded):
 
 
 def load(task, part):
-    """Every other scripted episode, with noise and without, from the first (`part` 0) or the second (1) on."""
+    """Every second scripted episode, with noise and without, starting from the first (`part` 0) or the second (1)."""
     with np.load(ROOT / "tests" / "data" / f"fetch_{task}.npz") as file:
         data = {name: file[name] for name in file.files}
     rows = np.concatenate([np.flatnonzero(data["policy"] == kind)[part::2] for kind in (1, 2)])
@@ -338,7 +338,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("mode", choices=("read", "fit"))
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS, help="for read")
-    parser.add_argument("--evaluations", type=int, default=150, help="for fit: replays of all tasks, at most")
+    parser.add_argument("--evaluations", type=int, default=150, help="for fit: maximum number of replays of all tasks")
     args = parser.parse_args()
     if args.mode == "read":
         read(args.tasks)

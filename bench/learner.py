@@ -1,12 +1,12 @@
-"""Gradient updates: what one costs, and how much of it is drawing and relabelling its batch.
+"""Time of a gradient update, and the share of drawing and relabelling its batch.
 
     python bench/learner.py [--learners ddpg td3 sac redq tqc dtqc] [--networks mlp] [--batch-sizes 256 512 1024] [--seeds 1]
         [--sampler weighted] [--dtype bfloat16] [--num-critics 2] [--policy-delay 1]
         [--hidden-sizes 256 256 256] [--updates 500]
 
-As in training: as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
-until `--updates` or more are made, all in one program. Several seeds are one program, vmapped; times are per update of one of
-them. The last column is the time of a learner's gradients over that of ddpg, each by its own products.
+As in training, as many batches as trainer.MAX_TRANSITIONS_PER_DRAW allows are drawn at once, then learned from one by one,
+until at least `--updates` are made, all in one program. Several seeds are one vmapped program, and times are per update of one
+seed. The last column is the time of a learner's gradients relative to ddpg, each per product.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def compute_reward(achieved_goal, desired_goal):
 
 
 def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayState:
-    """A ring of 10^6 transitions, shaped like Push, of random numbers."""
+    """A ring of 10^6 transitions of random numbers, shaped like Push."""
     shapes = Episode(
         observation=jax.ShapeDtypeStruct((num_steps + 1, 25), jnp.float32),
         achieved_goal=jax.ShapeDtypeStruct((num_steps + 1, 3), jnp.float32),
@@ -47,10 +47,11 @@ def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayS
 
 
 def flops(learner: Any, batch_size: int, hidden_sizes: tuple[int, ...]) -> float:
-    """Of the matrix products of an update, on average over a delayed actor's.
+    """Matrix-product operations of an update, averaged over the policy delay.
 
-    In passes through a network of one kind, forward one and backward two, or one to the inputs alone: actors forward as target,
-    forward and backward; critics forward as target, forward and backward, and for the actor forward and backward to the inputs.
+    Counted in passes through a network: 1 forward, 2 backward, or 1 backward to the inputs alone. Actors run forward as
+    target, and forward and backward. Critics run forward as target, forward and backward, and for the actor forward and
+    backward to the inputs.
     """
     sizes = (28, *hidden_sizes)
     hidden = sum(a * b for a, b in itertools.pairwise(sizes))
@@ -81,7 +82,7 @@ class Timed:
         return draw_batches(self.ring, key, self.shape, self.sampler, Context(compute_reward, self.hparams), self.cumulative)
 
     def draw_all(self, key: Any) -> Any:
-        """[draws] one number of each batch, so that none is left out."""
+        """[draws] one number of each batch, so that the compiler omits none."""
         add_up = lambda _, key: (None, sum(jnp.sum(x) for x in jax.tree.leaves(self.draw(key))))  # noqa: E731
         return jax.lax.scan(add_up, None, jax.random.split(key, self.draws))[1]
 
@@ -100,7 +101,7 @@ class Timed:
         return jax.lax.scan(draw_and_update, state, jax.random.split(key, self.draws))
 
     def seconds(self) -> tuple[float, float, float]:
-        """Seconds of an update of one seed: whole, its gradients, its drawing."""
+        """Seconds per update of one seed: total, gradients, drawing."""
         drawing, updating, whole = (jax.jit(jax.vmap(f)) for f in (self.draw_all, self.updates_only, self.both))
         batches = jax.jit(jax.vmap(self.draw))(self.keys)
         calls = (
@@ -121,7 +122,7 @@ def main() -> None:
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--dtype", default="float32", help="of the hidden layers: float32 or bfloat16")
     parser.add_argument("--hidden-sizes", type=int, nargs="+", default=list(Config.hidden_sizes))
-    parser.add_argument("--updates", type=int, default=500, help="at least so many in each timed program")
+    parser.add_argument("--updates", type=int, default=500, help="minimum number in each timed program")
     parser.add_argument("--num-critics", type=int, default=2)
     parser.add_argument("--policy-delay", type=int, default=1)
     args = parser.parse_args()

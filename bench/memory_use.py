@@ -1,9 +1,9 @@
-"""Memory over the number of environments: what one training run holds at its peak.
+"""Peak memory of one training run over the number of environments.
 
     python bench/memory_use.py [--env push] [--engine auto] [--preset gpu] [--num-envs 512 2048 8192]
 
-Each row is a program of its own that trains one epoch of one cycle. On a GPU: the peak of JAX's allocator, and what Warp holds
-beside it. On a CPU: the peak of the whole program.
+Each row is a separate program that trains one epoch of one cycle. On a GPU: the peak of JAX's allocator, and Warp's memory. On
+a CPU: the peak of the whole program.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", default=[512, 2048, 8192])
     args = parser.parse_args()
     rows = []
-    # This program and those that it measures share the device.
+    # This program and the measured ones share the device.
     environ = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     for env in args.env:
         for num_envs in args.num_envs:

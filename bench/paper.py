@@ -1,14 +1,14 @@
-"""Runs the experiment of docs/results.md: each figure is one command, which goes on where it was stopped.
+"""Runs the experiment of docs/results.md. Each figure is one command; run it again to resume.
 
-    python bench/paper.py --plan              # what would run, and how long it takes by an estimate
+    python bench/paper.py --plan              # what would run, and the estimated time
     python bench/paper.py samplers            # one figure: its sweeps, and its curves into docs/paper
-    python bench/paper.py k_push k_slide      # some of the sweeps of a figure, by name
-    python bench/paper.py all                 # the whole set
+    python bench/paper.py k_push k_slide      # some sweeps of a figure, by name
+    python bench/paper.py all                 # all figures
     python docs/make_results_figures.py       # tables and pictures of docs/results.md from the curves
 
-A figure is one or more calls of `train.py sweep`, each with a folder of its own under --out. One GPU is meant; two share the
-work as `bench/paper.py samplers k` and `bench/paper.py slide readings ...` on one folder. `--toy` takes Reach, two seeds and
-sizes that a CPU trains in seconds: to try the mechanics, never for a figure.
+A figure is one or more calls of `train.py sweep`, each with a separate folder under --out. It is meant for one GPU. Two GPUs
+share the work as `bench/paper.py samplers k` and `bench/paper.py slide readings ...` on one folder. `--toy` takes Reach, two
+seeds and sizes that a CPU trains in seconds, to test the mechanics; never for a figure.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ CURVES = ROOT / "docs" / "paper"
 COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")
 XLA_FLAGS = "--xla_gpu_enable_cublaslt=true --xla_gpu_enable_triton_gemm=false"
 SEEDS = 10
-# An epoch of the paper is 50 cycles of two episodes a worker; here it is one cycle of as many episodes and updates.
+# The paper's epoch is 50 cycles of two episodes per worker. Here it is one cycle of as many episodes and updates.
 FAST = "--cycles-per-epoch 1 --updates-per-cycle 2000 --learner-dtype bfloat16"
-EPISODES = {"push": 800, "pick_and_place": 1600, "slide": 800}  # an epoch
+EPISODES = {"push": 800, "pick_and_place": 1600, "slide": 800}  # per epoch
 TOY = (
     "--preset paper --engine native --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 8"
     " --hidden-sizes 8 --eval-episodes 2 --final-episodes 2 --replay-size 400 --checkpoint-every 0"
@@ -55,14 +55,14 @@ class Sweep(NamedTuple):
     options: str
     seeds: int = SEEDS
     first_seed: int = 0
-    own_cycles: bool = False  # the paper's 50 cycles an epoch and float32, instead of FAST
+    own_cycles: bool = False  # the paper's 50 cycles per epoch and float32, instead of FAST
 
 
 _LINEAR = "--sampler weighted --weight-kernel linear --weight-normalization"
 _SOFTMAX = "--sampler weighted --weight-kernel softmax --weight-normalization"
 _K = "--sampler future --sweep.her-k 1 2 8 16"
 _EVENTFUL = "--sampler future --sweep.priority-fraction 0.5"
-_BOTH, _NEW = "--sampler future weighted", {"first_seed": 20, "own_cycles": True}  # seeds that no choice was made with
+_BOTH, _NEW = "--sampler future weighted", {"first_seed": 20, "own_cycles": True}  # seeds that influenced no choice
 FIGURES: dict[str, tuple[Sweep, ...]] = {
     "own_cycles": (
         Sweep("own_push", "push", 50, 2, _BOTH, 20, **_NEW),
@@ -117,7 +117,7 @@ BY_NAME = {sweep.name: sweep for sweep in SWEEPS}
 
 
 def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
-    """Returns the arguments of `train.py` for a sweep."""
+    """Arguments of `train.py` for a sweep."""
     if toy:
         sizes = f"{TOY} --env reach --seeds 2 --total-steps 300"  # three epochs
         options = sweep.options.replace("--replay-size 1000000", "--replay-size 200")
@@ -137,16 +137,16 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
     ]
 
 
-# What an estimate is made of, all measured on one H200 (bench/README.md, docs/engines.md), 40 runs side by side.
-_UPDATE = 23.8e-6  # seconds of gradients and drawing of an update of 2,048 in bfloat16, a run
-_FLOAT32 = 82.2e-6  # the same in float32, 20 runs side by side
+# Parts of an estimate, measured on one H200 (bench/README.md, docs/engines.md) with 40 parallel runs.
+_UPDATE = 23.8e-6  # seconds of gradients and drawing per run and update of 2,048 in bfloat16
+_FLOAT32 = 82.2e-6  # the same in float32 with 20 parallel runs
 _STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
-_MORE = 1.25  # whole epochs took that much more than their parts, in the sweeps of 2026-11-22
-_AROUND = 38.0  # seconds a command: compiling (24 to 47), imports, last evaluations, tables (12)
+_MORE = 1.25  # whole epochs over the sum of their parts, in the sweeps of 2026-11-22
+_AROUND = 38.0  # seconds per command: compiling (24 to 47), imports, last evaluations, tables (12)
 
 
 def estimate(sweep: Sweep) -> float:
-    """Returns the seconds that a sweep takes on one H200, by the parts that were measured. It was not measured itself."""
+    """Seconds of a sweep on one H200, estimated from measured parts."""
     workers = 2 if sweep.task == "pick_and_place" else 1  # times 8, and with them the batch
     steps = (EPISODES[sweep.task] + 100) * 50  # with the evaluation
     update = _FLOAT32 if sweep.own_cycles else _UPDATE
@@ -155,13 +155,13 @@ def estimate(sweep: Sweep) -> float:
 
 
 def chosen(names: Iterable[str]) -> list[Sweep]:
-    """Returns the sweeps of figures, of `all` of them, and those named by themselves, each once."""
+    """Sweeps by the names of figures, `all`, or sweeps, without duplicates."""
     each = [sweep for name in names for sweep in (SWEEPS if name == "all" else FIGURES.get(name) or (BY_NAME[name],))]
     return list(dict.fromkeys(each))
 
 
 def plan(sweeps: Sequence[Sweep], out: Path, toy: bool) -> str:
-    """Returns the commands of sweeps, and by an estimate how long they take."""
+    """The commands of sweeps, and their estimated time."""
     lines = []
     for name, figure in FIGURES.items():
         if ours := [sweep for sweep in figure if sweep in sweeps]:
@@ -172,9 +172,9 @@ def plan(sweeps: Sequence[Sweep], out: Path, toy: bool) -> str:
 
 
 def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: int) -> int:
-    """Runs sweeps, `at_once` of them side by side, and collects the curves of each that ends; returns the first bad status.
+    """Runs sweeps, `at_once` of them in parallel, and collects their curves. Returns the first nonzero status.
 
-    The first signal goes on to those that run, which save what they have; those that wait do not begin.
+    The first signal is passed to the running sweeps, which save their progress. Waiting sweeps do not begin.
     """
     waiting, running, status, number = list(sweeps), {}, 0, None
 
@@ -182,7 +182,7 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
         for child in running.values():
             child.send_signal(number)
 
-    # An error, or a second signal, ends those that run, too.
+    # An error or a second signal also ends the running sweeps.
     with signals.taken(), signals.held(print, out), signals.cleaning(lambda: send(signal.SIGTERM)):
         while running or (waiting and not status):
             while waiting and not status and len(running) < at_once:
@@ -193,18 +193,18 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
                 status = status or own
             if number is None and (number := signals.asked()) is not None:
                 status = status or 128 + number
-                send(number)  # a terminal has sent it to all of them: two in so short a time are one
+                send(number)  # a terminal sends it to all of them: two in quick succession are one
             time.sleep(0.2)
     return status
 
 
 def start(sweep: Sweep, out: Path, toy: bool, quiet: bool) -> subprocess.Popen:
-    """Starts a sweep. Where it is quiet, what it prints goes to a file beside its folder."""
+    """Starts a sweep. If `quiet`, its output goes to a file next to its folder."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} {'' if toy else XLA_FLAGS}".strip()
     argv = [sys.executable, str(ROOT / "train.py"), *command(sweep, out, toy)]
     environment = {**os.environ, "XLA_FLAGS": flags}
     log = out / f"{sweep.name}.log"
-    print(f"== {time.strftime('%H:%M:%S')} {sweep.name}{f', what it prints is in {log}' if quiet else ''}", flush=True)
+    print(f"== {time.strftime('%H:%M:%S')} {sweep.name}{f', output in {log}' if quiet else ''}", flush=True)
     if not quiet:
         return subprocess.Popen(argv, env=environment)
     out.mkdir(parents=True, exist_ok=True)
@@ -213,17 +213,17 @@ def start(sweep: Sweep, out: Path, toy: bool, quiet: bool) -> subprocess.Popen:
 
 
 def ended(sweep: Sweep, status: int, out: Path, curves: Path) -> int:
-    """Collects the curves of a sweep that ended well; tells what did not; returns its status, as a shell gives it."""
+    """Collects the curves of a successful sweep, or prints an error. Returns its status, as a shell gives it."""
     print(f"== {time.strftime('%H:%M:%S')} {sweep.name} ended", flush=True)
     if status:
-        print(f"{sweep.name} ended with status {status}; the same command goes on with it", file=sys.stderr)
+        print(f"{sweep.name} ended with status {status}; run the same command again to resume it", file=sys.stderr)
         return status if status > 0 else 128 - status
     print(f"wrote {collect(sweep, out, curves)}", flush=True)
     return 0
 
 
 def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:
-    """Returns the rows of a sweep's curves, with settings by the names that comparison.csv gives them."""
+    """Rows of a sweep's curves, with settings named as in comparison.csv."""
     rows = []
     for groups in comparison.groups(tables.read(folder)).values():
         for group in groups:
@@ -236,7 +236,7 @@ def read_curves(folder: Path, sweep: Sweep) -> list[dict[str, str]]:
 
 
 def named(sweep: Sweep, label: str) -> str:
-    """Returns a setting's name with what all settings of its sweep share: a label names only what differs among them."""
+    """A setting's name, completed with the values that all settings of its sweep share. A label names only the differences."""
     shared = {
         "readings": lambda: _reading(sweep, label),
         "ring": lambda: f"future, ring of {'200,000' if 'own' in sweep.name else 'a million'}",
@@ -254,9 +254,9 @@ def _reading(sweep: Sweep, label: str) -> str:
 
 
 def collect(sweep: Sweep, out: Path, folder: Path) -> Path:
-    """Writes the curves of a sweep under `out` into its task's file in `folder`; returns the file.
+    """Writes the curves of a sweep under `out` into its task's file in `folder`, and returns the file.
 
-    Curves of other sweeps in it stay: the set can be made in parts, on several machines.
+    Curves of other sweeps in it are kept: the set can be made in parts, on several machines.
     """
     path, own = folder / f"{sweep.task}_curves.csv", read_curves(out / sweep.name, sweep)
     folder.mkdir(parents=True, exist_ok=True)
@@ -276,13 +276,13 @@ def collect(sweep: Sweep, out: Path, folder: Path) -> Path:
 
 
 def main() -> int:
-    """Runs or plans figures; returns 0, or the status of the first sweep that did not end."""
+    """Runs or plans figures. Returns 0, or the status of the first sweep that failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = f"{', '.join(FIGURES)}, one of their sweeps, or all, the default"
     parser.add_argument("figures", nargs="*", metavar="FIGURE", help=names)
     parser.add_argument("--out", type=Path, default=Path("sweeps/paper"), help="folder of the sweeps")
     parser.add_argument("--curves", type=Path, help="folder of the curves: docs/paper, and under --out with --toy")
-    parser.add_argument("--at-once", type=int, default=1, help="sweeps side by side: one computes while another compiles")
+    parser.add_argument("--at-once", type=int, default=1, help="parallel sweeps: one computes while another compiles")
     parser.add_argument("--plan", action="store_true", help="print the commands and an estimate, and run nothing")
     parser.add_argument("--toy", action="store_true", help="Reach, two seeds, tiny sizes: tries the mechanics on a CPU")
     args = parser.parse_args()

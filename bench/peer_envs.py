@@ -1,6 +1,6 @@
-"""Tasks of Brax, MuJoCo Playground and JaxGCRL through `from_brax`. Needs a virtual environment that has them.
+"""Tasks of Brax, MuJoCo Playground and JaxGCRL through `from_brax`. Needs a virtual environment with these packages.
 
-For the slow test it is `peer_envs` in the user's cache folder, in which `pip install -e .` has run, and these two lines:
+The slow test looks for it as `peer_envs` in the user's cache folder. It needs `pip install -e .` and these two lines:
 
 pip install brax==0.14.2 playground==0.2.0
 pip install --no-deps jaxgcrl==0.2.8  # it asks for JAX 0.4, and its environments run with later ones
@@ -23,7 +23,7 @@ from mjx_dher.envs.brax import BraxEnv, from_brax
 
 
 def brax_reacher(episode_length: int = 50) -> BraxEnv:
-    """Brax's Reacher: the observation has the target, and the tip minus the target."""
+    """Brax's Reacher. The observation contains the target, and the tip minus the target."""
     from brax.envs import get_environment
 
     env = get_environment("reacher", backend="generalized")
@@ -38,7 +38,7 @@ def brax_reacher(episode_length: int = 50) -> BraxEnv:
 
 
 def playground_reacher(episode_length: int = 100) -> BraxEnv:
-    """Playground's ReacherEasy with MJX: the goal is where the target geom is, and the finger should be there."""
+    """Playground's ReacherEasy with MJX: the finger should reach the target geom."""
     with mock.patch.object(mujoco, "__version__", "9"):  # it compares versions as texts
         from mujoco_playground import dm_control_suite
 

@@ -1,20 +1,20 @@
-"""Beside Stable-Baselines3 and gymnasium-robotics: success over time on the same cores, with the same budget of wall clock.
+"""Comparison with Stable-Baselines3 and gymnasium-robotics: success over time, for the same cores and wall-clock budget.
 
     python bench/peers.py --env push --minutes 10 [--peers tqc sac] [--seeds 1] [--learner tqc] [--out DIR]
 
 Trains, one after the other, `python train.py --preset cpu` on the engine native, and sb3-contrib's TQC and Stable-Baselines3's
-SAC with HerReplayBuffer on the original task, and writes success.csv, success.png and a table. The peers have the settings of
-rl-baselines3-zoo (bench/peers_worker.py says which); `--peer-set batch_size=256 'net_arch=[256,256,256]'` changes them. They
-and the original tasks need a virtual environment of their own. The first call makes it in the user's cache folder with pip,
-whose configuration decides whether it gets a PyTorch for CPUs alone or a larger one; `--python` names one that is there.
+SAC with HerReplayBuffer on the original task. Writes success.csv, success.png and a table. The peers have the settings of
+rl-baselines3-zoo (see bench/peers_worker.py); `--peer-set batch_size=256 'net_arch=[256,256,256]'` changes them. They and the
+original tasks need a separate virtual environment. The first call makes it in the user's cache folder with pip, whose
+configuration selects PyTorch for CPUs or the larger one. `--python` names an existing environment.
 
-Seconds are of training, evaluations included, on both sides; imports, compilation and the making of environments are not, and
-stand in the table as start-up. Ours evaluates after each epoch, a peer `--eval-every` seconds after the evaluation before. The
-budget ends no evaluation and no epoch that has begun. Ours may end earlier, at the preset's total_steps. The final success is
-that of the last policy in the original task, of both, over the same --final-episodes starts and goals.
+Seconds are of training, evaluations included, on both sides. Imports, compilation and the making of environments are excluded,
+and listed as start-up. Ours evaluates after each epoch, a peer `--eval-every` seconds after its last evaluation. Evaluations
+and epochs are completed beyond the budget. Ours may end earlier, at the preset's total_steps. The final success is measured
+with the last policy in the original task, for both over the same --final-episodes starts and goals.
 
-`--parts steps relabel` prints their rates: environment steps with random actions, in one process and in one process a core, and
-hindsight transitions that HerReplayBuffer draws. bench/throughput.py and bench/relabel.py print ours.
+`--parts steps relabel` prints the peers' rates: environment steps with random actions, in one process and in one process per
+core, and transitions drawn by HerReplayBuffer. bench/throughput.py and bench/relabel.py print ours.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ HERE = Path(__file__).resolve().parent
 REQUIREMENTS = (*transfer.REQUIREMENTS, "stable-baselines3==2.9.2", "sb3-contrib==2.9.2", "torch==2.13.0")
 TASKS = ("push", "pick_and_place", "slide")
 COLUMNS = ("who", "env", "seed", "seconds", "env_steps", "success_rate", "return_mean")
-SUCCESS = 0.9  # the table says when it was first reached
+SUCCESS = 0.9  # the table lists when it was first reached
 
 
 @dataclasses.dataclass
 class Run:
-    """What one training run was, evaluation by evaluation."""
+    """One training run, evaluation by evaluation."""
 
     who: str
     env: str
@@ -76,10 +76,10 @@ class Run:
 
 
 def find_python(given: Path | None) -> Path:
-    """Returns the Python that has the peers, made with pip unless it is there or `given`.
+    """The peers' Python, made with pip unless it exists or is `given`.
 
     Raises:
-      ValueError: the one that is given lacks something, or pip failed; says what to do.
+      ValueError: the given one lacks a package, or pip failed. The message says what to do.
     """
     if given:
         if not transfer.is_ready(given, REQUIREMENTS):
@@ -100,12 +100,12 @@ def find_python(given: Path | None) -> Path:
 
 
 def worker(python: Path, **request: Any) -> tuple[str, ...]:
-    """Returns the command of a part in the peers' Python."""
+    """The command of a part in the peers' Python."""
     return (str(python), str(HERE / "peers_worker.py"), json.dumps(request))
 
 
 def pin(cores: int) -> None:
-    """Keeps this process and all that it starts to its first `cores`, on Linux; raises ValueError where it has fewer."""
+    """Keeps this process and its children to its first `cores`, on Linux. Raises ValueError if it has fewer."""
     check_number("cores", cores, f"[1, {usable_cores()}]")
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
@@ -116,7 +116,7 @@ def pin(cores: int) -> None:
 
 @contextlib.contextmanager
 def started(command: Sequence[str], log: Path, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
-    """Starts a program whose messages go to a file, and kills it where the block is left before it has ended."""
+    """Starts a program with a log file for its messages, and kills it at the end of the block unless it has ended."""
     with log.open("wb") as file, subprocess.Popen(command, stdout=stdout or file, stderr=file, text=True) as process:
         try:
             yield process
@@ -125,7 +125,7 @@ def started(command: Sequence[str], log: Path, stdout: int | None = None) -> Ite
 
 
 def check_ended(process: subprocess.Popen[str], log: Path, allowed: Sequence[int] = (0,)) -> None:
-    """Waits for a program, and raises ValueError with the end of its log where its exit status is not `allowed`."""
+    """Waits for a program. If its exit status is not `allowed`, raises ValueError with the end of its log."""
     if process.wait() not in allowed:
         end = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-15:])
         raise ValueError(f"{log.stem} failed with exit status {process.returncode}; the end of {log}:\n{end}")
@@ -142,7 +142,7 @@ def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
     with started(command, log) as process:
         running = True
         while running:
-            running = process.poll() is None  # before the rows are read: none is missed
+            running = process.poll() is None  # polled before reading rows, so that none is missed
             for row in loggers.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
                 if not run.rows:
                     first = time.perf_counter() - row["wall_seconds"]  # when training began
@@ -160,7 +160,7 @@ def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
 
 
 def train_theirs(args: argparse.Namespace, learner: str, seed: int, python: Path) -> Run:
-    """Runs a learner of the peers for the budget, then its policy for the final episodes."""
+    """Runs a peer's learner for the budget, then its policy for the final episodes."""
     changes = [f"{name}={value}".replace(" ", "") for name, value in args.settings.items() if value != ZOO[name]]
     run, log = Run(" ".join((PEERS[learner], *changes)), args.env, seed), args.out / f"{learner}_seed{seed}.log"
     request = {"task": transfer.ORIGINALS[args.env], "learner": learner, "settings": args.settings, "seed": seed}
@@ -180,7 +180,7 @@ def train_theirs(args: argparse.Namespace, learner: str, seed: int, python: Path
 
 
 def train(args: argparse.Namespace, python: Path) -> None:
-    """Trains everybody in turns, and writes what there is after each run."""
+    """Trains ours and the peers in turn, and writes the results after each run."""
     print(f"{args.seeds * (1 + len(args.peers))} runs of {args.minutes:g} minutes at most, to {args.out}", flush=True)
     args.out.mkdir(parents=True)
     runs: list[Run] = []
@@ -191,7 +191,7 @@ def train(args: argparse.Namespace, python: Path) -> None:
     print_runs(runs)
 
 
-# What comes out.
+# Results.
 
 
 def write_csv(runs: Sequence[Run], path: Path) -> None:
@@ -205,7 +205,7 @@ def write_csv(runs: Sequence[Run], path: Path) -> None:
 
 
 def draw(runs: Sequence[Run], path: Path, episodes: int) -> None:
-    """Draws success over seconds and over environment steps, a line a run, those of one learner alike."""
+    """Draws success over seconds and over environment steps, one line per run and one colour per learner."""
     import matplotlib.pyplot as plt
     from plot_time_to_success import LOOKS
 
@@ -254,7 +254,7 @@ def print_runs(runs: Sequence[Run]) -> None:
 
 
 def print_rates(parts: Sequence[str], env_name: str, python: Path) -> None:
-    """Measures `parts`, of `steps` and `relabel`, and prints a table; raises ValueError where the worker failed."""
+    """Measures `parts` (`steps`, `relabel`) and prints a table. Raises ValueError if the worker failed."""
     from timing import print_table
 
     rows = []
@@ -270,10 +270,10 @@ def print_rates(parts: Sequence[str], env_name: str, python: Path) -> None:
 
 
 def read_settings(changes: Sequence[str]) -> dict[str, Any]:
-    """Returns `ZOO` with changes NAME=VALUE, their values in JSON.
+    """`ZOO` with changes NAME=VALUE, whose values are JSON.
 
     Raises:
-      ValueError: no such name, or a value of another kind; names it and what is allowed.
+      ValueError: unknown name, or a value of the wrong kind. The message lists the allowed ones.
     """
     settings = dict(ZOO)
     for name, _, text in (change.partition("=") for change in changes):
@@ -293,7 +293,7 @@ def read_settings(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """Returns the checked arguments; exits with a message where one cannot be used."""
+    """Checked arguments. Exits with a message if one is unusable."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=TASKS, default="push")
     parser.add_argument("--parts", nargs="+", choices=("train", "steps", "relabel"), default=["train"])
@@ -301,14 +301,16 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=1, help="runs of each learner, with the seeds 0, 1, ... (1)")
     parser.add_argument("--peers", nargs="+", choices=tuple(PEERS), default=list(PEERS))
     parser.add_argument("--peer-set", nargs="+", default=[], metavar="NAME=VALUE", help=", ".join(ZOO))
-    parser.add_argument("--learner", choices=tuple(COMPONENTS["learner"]), help="ours; the preset's unless given")
-    parser.add_argument("--sampler", choices=COMPONENTS["sampler"], help="ours; train.py's default unless given")
-    parser.add_argument("--episodes", type=int, default=100, help="of an evaluation (100)")
-    parser.add_argument("--final-episodes", type=int, default=100, help="of the last policy in the original task (100)")
-    parser.add_argument("--eval-every", type=float, help="seconds from one to a peer's next (60, or a quarter of the budget)")
-    parser.add_argument("--cores", type=int, default=min(2, usable_cores()), help="that each run is kept to (2)")
-    parser.add_argument("--out", type=Path, help="folder to write, which must not exist (runs/peers_ENV)")
-    parser.add_argument("--python", type=Path, help="of an environment that has the peers")
+    parser.add_argument("--learner", choices=tuple(COMPONENTS["learner"]), help="our learner (default: the preset's)")
+    parser.add_argument("--sampler", choices=COMPONENTS["sampler"], help="our sampler (default: train.py's)")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes per evaluation (100)")
+    parser.add_argument(
+        "--final-episodes", type=int, default=100, help="episodes of the final evaluation, in the original task (100)"
+    )
+    parser.add_argument("--eval-every", type=float, help="seconds between a peer's evaluations (60 or a quarter of the budget)")
+    parser.add_argument("--cores", type=int, default=min(2, usable_cores()), help="cores per run (2)")
+    parser.add_argument("--out", type=Path, help="new folder (runs/peers_ENV)")
+    parser.add_argument("--python", type=Path, help="Python of an environment with the peers")
     args = parser.parse_args(argv)
     try:
         check_number("minutes", args.minutes, "(0, 10000]", float)
@@ -321,7 +323,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         if "train" in args.parts:
             require_extra("success.png", "matplotlib", "plot")
             if args.out.exists():
-                raise ValueError(f"out: {args.out} exists already; name a folder that does not")
+                raise ValueError(f"out: {args.out} exists already; pass a new folder")
         pin(args.cores)
     except ValueError as error:
         parser.error(str(error))
@@ -329,7 +331,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> int:
-    """Runs what the command line asks for; returns the exit status."""
+    """Runs the parts given on the command line. Returns the exit status."""
     args = parse()
     os.environ["JAX_PLATFORMS"] = "cpu"
     try:

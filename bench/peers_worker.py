@@ -1,13 +1,13 @@
-"""The other side of bench/peers.py: Stable-Baselines3 and sb3-contrib on the tasks of gymnasium-robotics, in their own Python.
+"""The peers of bench/peers.py: Stable-Baselines3 and sb3-contrib on the tasks of gymnasium-robotics, in a separate Python.
 
     python bench/peers_worker.py '{"part": "train", "task": "FetchPush-v4", ...}'
 
-It prints lines of JSON, the last one with the result. Neither JAX nor this library is there.
+It prints lines of JSON, the last one with the result. It imports neither JAX nor this library.
 
 `ZOO` has the numbers that rl-baselines3-zoo sets for TQC with HER on FetchPush, FetchPickAndPlace and FetchSlide, one set for
-all three (DLR-RM/rl-baselines3-zoo, hyperparams/tqc.yml at commit eec15dc2, entries Fetch*-v1). These do not normalize
-observations, and have no time feature. What they leave open has the libraries' defaults. For SAC that file's neighbour sac.yml
-has no settings for these tasks: SAC takes the same numbers.
+all three (DLR-RM/rl-baselines3-zoo, hyperparams/tqc.yml at commit eec15dc2, entries Fetch*-v1). Observations are not
+normalized, and there is no time feature. Unset values have the libraries' defaults. The zoo's sac.yml has no settings for
+these tasks, so SAC takes the same numbers.
 """
 # mypy: disable-error-code="import-not-found"
 # The peers are not installed where types are checked.
@@ -36,19 +36,19 @@ ZOO: dict[str, Any] = {
     "net_arch": [512, 512, 512],
     "n_critics": 2,
     "n_sampled_goal": 4,
-    # The libraries' defaults.
+    # The libraries' defaults:
     "learning_starts": 100,
     "train_freq": 1,
     "gradient_steps": 1,
     "n_envs": 1,
 }
 EPISODE_LENGTH = 50
-TEST_ENVS = 10  # in processes of their own: evaluations use all cores, as ours do
+TEST_ENVS = 10  # in separate processes: evaluations use all cores, as ours do
 FIRST_SEED = 1000  # of the final episodes
 
 
 def usable_cores() -> int:
-    """Counts the cores that this process may use; those that it starts inherit them."""
+    """Number of cores that this process and its children may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -61,7 +61,7 @@ def make_env(task: str) -> Any:
     """Makes a task of gymnasium-robotics."""
     import gymnasium
 
-    with contextlib.redirect_stderr(io.StringIO()):  # a notice about other tasks, once a process
+    with contextlib.redirect_stderr(io.StringIO()):  # a notice about other tasks, once per process
         import gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
@@ -69,7 +69,7 @@ def make_env(task: str) -> Any:
 
 
 def make_vector(task: str, num_envs: int) -> Any:
-    """Makes a vectorized task of Stable-Baselines3: one environment in this process, or several in a process each."""
+    """Makes a vectorized task of Stable-Baselines3: one environment in this process, or several in one process each."""
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -91,10 +91,10 @@ def make_model(learner: str, settings: dict[str, Any], env: Any, seed: int) -> A
 
 
 def play(model: Any, envs: Any, episodes: int, first_seed: int | None = None) -> tuple[list[int], list[float]]:
-    """Plays the deterministic policy, episode i with the seed `first_seed` + i; on from where `envs` stand without one.
+    """Plays the deterministic policy, episode i with the seed `first_seed` + i; without one, from the current state of `envs`.
 
     Returns:
-      Of each episode, success at its end, 0 or 1, and the undiscounted return.
+      Success at the end, 0 or 1, and the undiscounted return of each episode.
     """
     successes: list[int] = []
     returns: list[float] = []
@@ -113,16 +113,16 @@ def play(model: Any, envs: Any, episodes: int, first_seed: int | None = None) ->
 def train(
     task: str, learner: str, settings: dict[str, Any], seed: int, seconds: float, every: float, episodes: int, final: int
 ) -> dict[str, Any]:
-    """Trains for so many seconds of wall clock, evaluations included, and prints a line for each evaluation.
+    """Trains for `seconds` of wall clock, evaluations included, and prints a line for each evaluation.
 
     Args:
       task: gymnasium id.
       learner: a key of `PEERS`.
       settings: as `ZOO`.
       seed: of the learner and its environments.
-      seconds: budget. The evaluation that it ends in is finished.
+      seconds: budget. The last evaluation is completed beyond it.
       every: seconds from the end of an evaluation to the beginning of the next.
-      episodes: of an evaluation.
+      episodes: per evaluation.
       final: episodes of the last policy, with the seeds `FIRST_SEED` + i; they are not timed.
 
     Returns:
@@ -137,7 +137,7 @@ def train(
 
 
 def make_watch(evaluate: Callable[[], tuple[list[int], list[float]]], seconds: float, every: float) -> Any:
-    """Makes the callback that evaluates `every` so many seconds, prints the outcome, and ends after so many `seconds`."""
+    """Makes the callback that evaluates and prints every `every` seconds, and ends training after `seconds`."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     class Watch(BaseCallback):
@@ -161,7 +161,7 @@ def make_watch(evaluate: Callable[[], tuple[list[int], list[float]]], seconds: f
 
 
 def step_rates(task: str, seconds: float = 10.0) -> dict[str, float]:
-    """Measures environment steps a second with random actions, in one process and in one process a core."""
+    """Environment steps per second with random actions, in one process and in one process per core."""
     rates = {}
     for name, num_envs in (("one process", 1), ("a process a core", usable_cores())):
         env = make_vector(task, num_envs)
@@ -177,7 +177,7 @@ def step_rates(task: str, seconds: float = 10.0) -> dict[str, float]:
 
 
 def relabel_rate(task: str) -> dict[str, float]:
-    """Measures hindsight transitions a second that HerReplayBuffer draws, after 256 episodes of random actions."""
+    """Hindsight transitions per second drawn by HerReplayBuffer, after 256 episodes of random actions."""
     steps, num_envs = 256 * EPISODE_LENGTH, 32
     model = make_model("sac", {**ZOO, "learning_starts": steps}, make_vector(task, num_envs), seed=0)
     model.learn(steps)

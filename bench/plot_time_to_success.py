@@ -1,4 +1,4 @@
-"""Draws the learning curves that bench/time_to_success.py wrote, those of each file in a colour. Needs the extra `plot`.
+"""Draws the learning curves written by bench/time_to_success.py, one colour per file. Needs the extra `plot`.
 
 python bench/plot_time_to_success.py docs/push_learning_curve.csv docs/push_learning_curve.png
 python bench/plot_time_to_success.py --label environments docs/push_gpu/{512,2048,8192}.csv docs/push_gpu/num_envs.png
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-# Apart for colour-blind readers (Okabe and Ito) and, by their dashes, in grey.
+# Distinct for colour-blind readers (Okabe and Ito) and, by their dashes, in grey.
 LOOKS = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"))
 
 
@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", type=Path)
     parser.add_argument("target", type=Path)
-    parser.add_argument("--label", default="", help="what the files' names count")
+    parser.add_argument("--label", default="", help="quantity that the files are named after")
     parser.add_argument("--threshold", type=float, default=0.9)
     args = parser.parse_args()
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True)

@@ -1,9 +1,9 @@
-"""A power cut, as POSIX allows it to be: what was not flushed by `fsync` is gone.
+"""Simulates a power cut within the limits of POSIX: data not flushed by `fsync` may be lost.
 
-`install` makes this process keep, in another folder, what each file held and which names each folder had when they were last
-flushed; `rebuild` makes of that what a disk would have after a cut. A disk may also have more than was flushed, in no order:
-a name before the content of its file, a length before the bytes. `rebuild` with random numbers makes one of these, too. Deleted
-files are moved aside, so that no number of an inode is used again.
+`install` makes this process keep, in another folder, the content of each file and the names in each folder at the last flush.
+`rebuild` makes from these the contents of a disk after a cut. A disk may also keep unflushed data in any order: a name before
+the content of its file, a length before the bytes. `rebuild` with random numbers makes such a disk. Deleted files are moved
+aside, so that no inode number is reused.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 
 def install(root: Path, store: Path) -> None:
-    """Records what is flushed in `root`, whose present names are taken for flushed. Both folders exist, on one disk."""
+    """Records flushes in `root`, whose present names count as flushed. Both folders exist, on one disk."""
     fsync, replace, rmtree, unlink, rmdir = os.fsync, os.replace, shutil.rmtree, os.unlink, os.rmdir
     (store / "trash").mkdir()
     numbers = itertools.count()
@@ -62,7 +62,7 @@ def install(root: Path, store: Path) -> None:
 
 
 def rebuild(root: Path, store: Path, target: Path, rng: random.Random | None = None) -> None:
-    """Makes in `target` what of `root` was flushed; with `rng`, of some files and folders what they have come to since."""
+    """Rebuilds the flushed state of `root` in `target`. With `rng`, some files and folders have later, unflushed states."""
     now = {path.lstat().st_ino: path for place in (root, store / "trash") for path in (place, *place.rglob("*"))}
     _rebuild(root.stat().st_ino, store, target, now, rng)
 
@@ -81,7 +81,7 @@ def _rebuild(inode: int, store: Path, target: Path, now: dict[int, Path], rng: r
 
 
 def _content(kept: Path, path: Path | None, rng: random.Random | None) -> bytes:
-    """What a file has: what was flushed, or all, a part, or only the length of what was written since."""
+    """A file's content: the flushed part only, or with all, a part, or only the length of the later data."""
     flushed = kept.read_bytes() if kept.exists() else b""
     if rng is None or path is None:
         return flushed

@@ -1,10 +1,10 @@
-"""Where the time of a training epoch goes on a GPU: kernels by their share, and whether anything waits for the host.
+"""Profile of a training epoch on a GPU: kernels by their share of the time, and transfers to and from the host.
 
     python bench/profile_epoch.py [--env push] [--preset gpu] [--top 25] [--out DIR]
 
-Trains two epochs, and profiles a third with jax.profiler; an epoch is one cycle with 200 updates here, and an evaluation. It
-prints the time in which the GPU is busy, copies between device and host (a round trip inside an epoch would show as one), and
-the kernels that take longest. The trace goes to DIR.
+Trains two epochs, and profiles a third with jax.profiler. Here an epoch is one cycle with 200 updates, and an evaluation. It
+prints the time in which the GPU is busy, the copies between device and host, and the kernels that take longest. A round trip
+inside an epoch would show as a copy. The trace is written to DIR.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mjx_dher.trainer import make_train
 
 
 def device_events(folder: Path):
-    """(name, start, duration), both in µs, of what ran on the GPU."""
+    """(name, start, duration), both in µs, of the GPU's activities."""
     (path,) = folder.rglob("*.trace.json.gz")
     trace = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     names = {e["pid"]: e["args"]["name"] for e in trace if e.get("name") == "process_name"}
@@ -40,7 +40,7 @@ def device_events(folder: Path):
 
 
 def busy(events) -> float:
-    """µs in which at least one of the events was under way."""
+    """µs in which at least one of the events was running."""
     total, end = 0.0, -1.0
     for _, start, duration in sorted(events, key=lambda event: event[1]):
         total += max(0.0, start + duration - max(end, start))

@@ -1,14 +1,14 @@
-"""History of speed: measures this machine, and appends one line to bench/history.jsonl; or draws what is there.
+"""History of speed: measures this machine and appends one line to bench/history.jsonl, or draws the history.
 
     python bench/record.py [--repeats 5] [--out bench/history.jsonl] [--anyway]
     python bench/record.py --draw
 
-A line has the commit, the date, the machine, the versions, and the figures: environment steps a second of a rollout of Push,
-updates a second of DDPG as the machine's preset makes them, and the seconds of `python train.py` from Enter to its first epoch,
-where nothing has been compiled and after that. It takes some minutes. A machine that is busy, and a working tree with changes,
-are refused, because the line would be of something else than it says; with `--anyway` it says so.
+A line has the commit, the date, the machine, the versions, and the figures: environment steps per second of a rollout of Push,
+updates per second of DDPG with the machine's preset, and the seconds of `python train.py` from Enter to its first epoch,
+before and after compilation. It takes some minutes. A busy machine or a working tree with changes is an error, because the
+line would not describe the commit; with `--anyway` the line has a remark instead.
 
---draw writes history.md and history.svg beside the file (extra `plot`).
+--draw writes history.md and history.svg next to the file (extra `plot`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 HISTORY = Path(__file__).parent / "history.jsonl"
-BUSY = 0.15  # of the cores, by the load of the last minute: more than that makes a figure one of what else runs
-# Figures by name: what it is, and its digits.
+BUSY = 0.15  # of the cores, by the load of the last minute; beyond it other programs affect the figures
+# Description and digits of the figures by name.
 FIGURES = {
     "env_steps_per_second": ("environment steps a second", 0),
     "updates_per_second": ("updates a second", 0),
@@ -41,18 +41,18 @@ FIELDS = ("date", "commit", "remarks", "machine", "versions", "setup", "figures"
 
 
 def git(*arguments: str) -> str:
-    """What git says of this checkout."""
+    """Output of a git command on this checkout."""
     return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def remarks_of(load: float, cores: int, changes: str) -> list[str]:
-    """What keeps a line from being of this commit, on this machine alone."""
+    """Reasons why a line would not describe this commit on an idle machine."""
     busy = [f"machine busy: load {load:.2f} on {cores} cores"] if load > BUSY * cores else []
     return busy + (["working tree with changes"] if changes else [])
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """All lines of a history, oldest first; exits where one is none."""
+    """All lines of a history, oldest first. Exits if one is invalid."""
     entries = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.exists() else [], start=1):
         try:
@@ -68,7 +68,7 @@ def read(path: Path) -> list[dict[str, Any]]:
 
 
 def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """The figures, and with which settings they were taken. Start-up comes first: it needs the GPU's memory."""
+    """The figures, and their settings. Start-up is measured first, because it needs the GPU's memory."""
     import startup
 
     from mjx_dher import config, presets
@@ -106,7 +106,7 @@ def record(path: Path, repeats: int, anyway: bool) -> dict[str, Any]:
     import mjx_dher
     from mjx_dher.system.limits import usable_cores
 
-    read(path)  # a file that is none is not appended to
+    read(path)  # raises for an invalid file, before anything is measured
     remarks = remarks_of(os.getloadavg()[0], usable_cores(), git("status", "--porcelain"))
     if remarks and not anyway:
         raise SystemExit(f"not recorded: {'; '.join(remarks)} (--anyway records it with that remark)")
@@ -147,7 +147,7 @@ def page(entries: list[dict[str, Any]]) -> str:
 
 
 def draw(entries: list[dict[str, Any]]) -> Any:
-    """Each figure over time, a line a machine; entries with remarks are hollow."""
+    """Draws each figure over time, one line per machine. Entries with remarks are hollow."""
     from mjx_dher.tools import figures
 
     figure, axes = figures.subplots(2, 2, 11, 6)
@@ -172,9 +172,9 @@ def draw(entries: list[dict[str, Any]]) -> Any:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=HISTORY, help="file to append to, or to draw")
-    parser.add_argument("--repeats", type=int, default=5, help="of each figure, whose median is taken")
-    parser.add_argument("--anyway", action="store_true", help="record a busy machine or changes, and say so")
-    parser.add_argument("--draw", action="store_true", help="write history.md and history.svg beside the file")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements per figure; the median counts")
+    parser.add_argument("--anyway", action="store_true", help="record despite a busy machine or changes, with a remark")
+    parser.add_argument("--draw", action="store_true", help="write history.md and history.svg next to the file")
     args = parser.parse_args()
     if not 1 <= args.repeats <= 100:
         parser.error(f"--repeats must lie in [1, 100]; got {args.repeats}")

@@ -1,9 +1,9 @@
-"""Sampling and relabelling: transitions a second, for each goal sampler, from a ring of 10^6 transitions.
+"""Sampling and relabelling: transitions per second, for each goal sampler, from a ring of 10^6 transitions.
 
     python bench/relabel.py [--batch-size 1024] [--flashbax]
 
-Batches are drawn as the trainer draws them, many at once. `--flashbax` adds a row for the item buffer of flashbax (pip install
-flashbax==0.1.3) with the same transitions, as many batches at once: drawn uniformly, and not relabelled.
+Batches are drawn as in training, many at once. `--flashbax` adds a row for the item buffer of flashbax (pip install
+flashbax==0.1.3) with the same transitions and as many batches at once, drawn uniformly and not relabelled.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ ROUNDS = 10
 
 
 def total(tree):
-    """Reads all that was drawn, so that the compiler cannot leave it out."""
+    """Reads all that was drawn, so that the compiler cannot omit it."""
     return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree))
 
 
 def transitions_a_second(draw, num_drawn):
-    """Of `draw(key)`, which draws `num_drawn` of them."""
+    """Transitions per second of `draw(key)`, which draws `num_drawn`."""
 
     @jax.jit
     def run(keys):
@@ -42,7 +42,7 @@ def transitions_a_second(draw, num_drawn):
 
 
 def flashbax(ring, num_drawn):
-    """A function key -> transitions [num_drawn] from an item buffer that holds those of `ring`."""
+    """A function key -> transitions [num_drawn] from an item buffer with the transitions of `ring`."""
     import flashbax as fbx
 
     episodes = ring.episodes

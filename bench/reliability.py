@@ -1,11 +1,11 @@
-"""What survives? Kills, signals, a full disk, damage, power cuts, other programs, edits and wrong calls, of the real command.
+"""Fault injection for the real command: kills, signals, a full disk, damage, power cuts, other programs, edits, wrong calls.
 
     python bench/reliability.py [--parts kills signals ...] [--kills 200] [--signals 50] [--flips 200] [--pairs 100]
 
-Every state that is restored is compared, by the SHA-256 of all its leaves, with that of a run that nothing happened to, and
-every run, or sweep, that ends with what it would have left undisturbed. A line a part; exits with 1 where something is not
-right to the bit, more than one interval between checkpoints was lost, or a refusal was not an error with a name.
-docs/reliability.md has the results. `--workers` of `pairs`, `power` and `signals` run at a time.
+Every restored state is compared, by the SHA-256 of all its leaves, with the state of an undisturbed run. Every run or sweep
+that ends is compared with an undisturbed one. The table has one row per part. The exit status is 1 if a result differs in any
+bit, more than one interval between checkpoints was lost, or a refusal was not an error with a name. docs/reliability.md has
+the results. `--workers` of `pairs`, `power` and `signals` run at a time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ PARTS += (*BESIDE,)
 
 
 class Failure(Exception):
-    """Something was not as it must be."""
+    """A result differs from the expected one."""
 
 
 def expect(condition, what):
@@ -59,7 +59,7 @@ def expect(condition, what):
 
 
 class Runs:
-    """Runs of one setting, and what their states must be."""
+    """Runs of one setting, and their expected states."""
 
     def __init__(self, env_name, folder):
         env = envs.make(env_name)
@@ -75,7 +75,7 @@ class Runs:
         self.template = loop.state_template(self.program)
 
     def start(self, out, limit=None):
-        """The command, training into `out` or resuming what is there; `limit`, kB that a file can have."""
+        """The command, training into `out` or resuming from it. `limit`: largest size of a file in kB."""
         if run_folder.checkpoints(out):
             command = ["resume", out]
         else:
@@ -94,7 +94,7 @@ class Runs:
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def check(self, out, lost=INTERVAL):
-        """The epoch that is restored from `out`, 0 where there is no checkpoint; at most `lost` epochs were done since."""
+        """The epoch restored from `out`, or 0 if there is no checkpoint. At most `lost` epochs were done after it."""
         lines = (out / "metrics.csv").read_text().splitlines() if (out / "metrics.csv").exists() else []
         done = max(0, len([line for line in lines if line]) - 1)
         if not run_folder.checkpoints(out):
@@ -103,7 +103,7 @@ class Runs:
         found = checkpoint.restore(out, self.template)
         expect(not found.refused, f"a checkpoint is not whole: {found.refused}")
         expect(digest(found.state) == self.right[found.epoch], f"the state of epoch {found.epoch} is another")
-        # The line of an epoch is written before its checkpoint, and may be cut by the kill.
+        # An epoch's line is written before its checkpoint, and may be truncated by the kill.
         expect(done - found.epoch <= lost, f"epochs {found.epoch} to {done} are lost")
         return found.epoch
 
@@ -116,7 +116,7 @@ def digest(state):
 
 
 def kills(runs, count, rng):
-    """SIGKILL at random moments, the run resumed each time."""
+    """SIGKILL at random moments. The run is resumed each time."""
     out = runs.folder / "kills"
     inside, lost, ended = 0, [], 0
     for _ in range(count):
@@ -152,7 +152,7 @@ def saved(runs, name):
 
 
 def flips(runs, count, rng):
-    """One bit at a time, anywhere in the newest checkpoint, which is the only one."""
+    """Flips one bit at a time, anywhere in the newest checkpoint, which is the only one."""
     out = saved(runs, "flips")
     newest, *older = run_folder.checkpoints(out)
     for path in older:
@@ -202,7 +202,7 @@ def damage(runs, count, rng):
 
 
 def disk(runs, count, rng):
-    """Files cannot grow beyond so many kB, too few for a checkpoint, as on a full disk."""
+    """Limits the size of files to less than a checkpoint needs, as on a full disk."""
     out = saved(runs, "disk")
     before = runs.check(out)
     for limit in (16, 4, 1):
@@ -210,7 +210,7 @@ def disk(runs, count, rng):
         stdout, stderr = process.communicate()
         named = "error: cannot write the checkpoint" in stderr or "cannot be written to" in stderr
         expect(process.returncode == 2 and named, f"{limit}: {process.returncode} {stderr}")
-        # A run goes on without a checkpoint that cannot be written, and says so, until its metrics cannot be written.
+        # A run warns and continues if a checkpoint cannot be written. It ends when its metrics cannot be written.
         told = stdout.count("cannot write the checkpoint")
         expect(runs.check(out, lost=(told + 1) * INTERVAL) >= before, "a checkpoint is gone")
     return "files limited to 16, 4 and 1 kB", "each epoch not saved is told, then a named error; the checkpoints stay whole"

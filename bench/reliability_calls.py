@@ -16,13 +16,13 @@ from mjx_dher import Options, cli, envs, train_runs
 from mjx_dher.runs.folder import run_folder
 
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "docs" / "examples")]
-TOLD = ("total_steps", "final_episodes")  # what `resume` takes, and says so
+TOLD = ("total_steps", "final_episodes")  # fields that `resume` accepts changed, with a message
 REMOVED = object()
-EVERY = 20  # of the wrong calls, one is made as a program of its own, too
+EVERY = 20  # every 20th wrong call is also made as a separate process
 
 
 def call(*arguments):
-    """The status of a command, and what it printed; a traceback is status -1."""
+    """Status of a command, and its output. A traceback is status -1."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         try:
@@ -33,7 +33,7 @@ def call(*arguments):
 
 
 def fields(content, path=()):
-    """The path of each field and its value, those of groups of fields first."""
+    """Path and value of each field, groups of fields first."""
     for name, value in content.items():
         yield (*path, name), value
         if isinstance(value, dict):
@@ -41,7 +41,7 @@ def fields(content, path=()):
 
 
 def others(value):
-    """Other values, others of the wrong type, and none."""
+    """Other values, values of the wrong type, and none."""
     if isinstance(value, str):
         other = {"linear": "softmax", "future": "final", "auto": "native", "none": "native", "float32": "bfloat16"}
         yield other.get(value, f"{value}x")
@@ -114,12 +114,12 @@ def changed(content, path, other):
 
 
 def named_by(field, value, other):
-    """What a reader finds the edit by: the field, one that was in it, or the text that it has now."""
+    """Words that identify the edit to a reader: the field, a nested field, or the new value's text."""
     return [field, *(value if isinstance(value, dict) else ()), *([repr(other)] if isinstance(other, str) else ())]
 
 
 def fault_of(kind, names, status, text, folder, before, right):
-    """What is wrong with a command on an edited folder; empty if nothing is."""
+    """Fault of a command on an edited folder, or an empty text."""
     if status == 0:
         return silent(kind, names[0], text, folder, right)
     if status == -1:
@@ -133,7 +133,7 @@ def fault_of(kind, names, status, text, folder, before, right):
 
 
 def silent(kind, field, text, folder, right):
-    """What has another result than it had without the edit, and does not say so."""
+    """Results that changed through the edit without a message."""
     if kind == "whole":
         return "" if text == right else f"silent: another evaluation: {text[-200:]}"
     if kind == "sweep":
@@ -145,7 +145,7 @@ def silent(kind, field, text, folder, right):
 
 
 def calls(folder):
-    """All wrong calls of tests/wrong_calls.py, in an empty folder; returns their number and the faults."""
+    """All wrong calls of tests/wrong_calls.py, in an empty folder. Returns their number and the faults."""
     import wrong_calls
 
     folder.mkdir()
@@ -189,6 +189,6 @@ def differing(before, now):
 
 
 def everything(folder: Path):
-    """When each file of a folder was changed, and its size; of a folder, that it is there."""
+    """Modification time and size of each file of a folder, and the names of its folders."""
     paths = [(path, path.lstat()) for path in folder.rglob("*")]
     return {path: () if path.is_dir() else (status.st_mtime_ns, status.st_size) for path, status in paths}

@@ -1,9 +1,9 @@
-"""Run folders that a stranger has made: each tries to run code, to read or write elsewhere, or to end a command badly.
+"""Run folders made by an attacker: each tries to run code, to read or write elsewhere, or to end a command badly.
 
     python bench/reliability_hostile.py FOLDER COUNT SEED
 
-`hostile` makes cases from a seed, opens each with a command in a process of its own, and returns the faults. A case is a
-whole run, or a sweep, of the point mass with one to three changes; all digests are forged so that they agree.
+`hostile` makes cases from a seed, opens each with a command in a separate process, and returns the faults. A case is a whole
+run, or a sweep, of the point mass with one to three changes. All digests are forged so that they agree.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mjx_dher import cli
 from mjx_dher.components import COMPONENTS
 from mjx_dher.runs.folder import fingerprint, run_folder
 
-SECONDS = 60  # that a case may take
-SERVED = 12  # after so many seconds a page that is served is closed
+SECONDS = 60  # time limit of a case
+SERVED = 12  # seconds until a served page is closed
 MODULE = """
 import pathlib
 pathlib.Path({canary!r}).touch()
@@ -80,7 +80,7 @@ class Pickled:
 
 
 class Case:
-    """One hostile folder, in a folder of its own."""
+    """One hostile folder, inside a separate folder."""
 
     def __init__(self, place, base, rng):
         self.place, self.rng, self.told = place, rng, []
@@ -97,7 +97,7 @@ class Case:
         chosen = {rng.choice(CHANGES) for _ in range(rng.choice((1, 1, 2, 3)))}
         for change in sorted(chosen, key=lambda change: (change in BREAKING, change.__name__)):
             self.told.append(change.__name__)
-            with contextlib.suppress(OSError, ValueError, KeyError):  # one that the change before has made impossible
+            with contextlib.suppress(OSError, ValueError, KeyError):  # made impossible by the previous change
                 change(self)
 
     def edit(self, **changes):
@@ -227,12 +227,12 @@ def manifest(case):
 
 
 CHANGES = (environment, environment, environment, component, component, learner, demonstrations, link, link, folder_link, names)
-BREAKING = (link, folder_link, file)  # what they leave cannot be edited
+BREAKING = (link, folder_link, file)  # their results cannot be edited further
 CHANGES += (text, file, unpickled, manifest)
 
 
 def in_a_process(place, act, seconds=SECONDS):
-    """Exit status of `act`, called in a fork in the folder `place`, whose file "output" keeps the output. None: too late."""
+    """Exit status of `act`, called in a fork in the folder `place` with its output in the file "output". None: timed out."""
     if (pid := os.fork()) == 0:
         status = 99
         try:
@@ -264,7 +264,7 @@ def in_a_process(place, act, seconds=SECONDS):
 
 
 def make_base(base):
-    """A finished run with a checkpoint, and a sweep, as a stranger with a state folder of their own has trained them."""
+    """A finished run with a checkpoint, and a sweep, as an attacker with a separate state folder would train them."""
 
     def act():
         train = [*SHAPES, "--total-steps", "80", "--keep-end", "--out", "received", "--no-curve"]

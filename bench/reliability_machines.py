@@ -1,4 +1,4 @@
-"""Machines that lack something: disks of six sizes, and four containers. Both need root, for mounts of their own."""
+"""Limited machines: disks of six sizes, and four containers. Both need root for mounts in a private namespace."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def end(process):
 
 
 def faults_of(name, out, status, stdout, stderr):
-    """What a program on a full disk must not do."""
+    """Faults of a program on a full disk."""
     left = [path for path in out.rglob("*") if "partial" in path.name] if out.exists() else []
     if left:
         yield f"{name}: lost: left {left}"
@@ -42,7 +42,7 @@ def faults_of(name, out, status, stdout, stderr):
 
 
 def fill(process, out):
-    """Once the run has two checkpoints, takes every block of the disk that is free, until the program has ended."""
+    """Once the run has two checkpoints, occupies every free block of the disk until the program has ended."""
     filler = out.parent / "filler"
     while process.poll() is None:
         if filler.exists() or len(list((out / "checkpoints").glob("epoch-*"))) == 2:
@@ -52,7 +52,7 @@ def fill(process, out):
 
 
 def disks(folder):
-    """A run on a disk of each size, and on one that fills up; then, with space, to the end."""
+    """A run on a disk of each size, and on one that fills up. With space, each is then run to the end."""
     whole = folder / "whole"
     assert end(start(*RUN, "--out", whole))[0] == 0
     right = of_run(whole)

@@ -1,4 +1,4 @@
-"""Hostile messages to every port that a command opens: the viewer's, those of JAX's processes, and Ray's.
+"""Hostile messages to every port that a command opens: of the viewer, of JAX's processes, and of Ray.
 
     python bench/reliability_messages.py [--messages 200] [--seed 0] [--programs view distributed ray]
 
@@ -44,7 +44,7 @@ encode = msgspec.msgpack.encode
 
 
 def bytes_to_any_port(rng):
-    """What port scanners, health checks, browsers and worse send."""
+    """Messages of port scanners, health checks, browsers and attackers."""
     host = "Host: 127.0.0.1\r\n"
     requests = [
         *(f"GET {path} HTTP/1.1\r\n{host}\r\n" for path in ("/", "/../../etc/passwd", "/%2e%2e/etc/passwd", "/x" * 3000)),
@@ -64,7 +64,7 @@ def bytes_to_any_port(rng):
 
 
 def send_bytes(port, rng, held):
-    """Sends some bytes to a port; keeps the connection in `held`, at times."""
+    """Sends some bytes to a port. Sometimes keeps the connection in `held`."""
     data, holds = bytes_to_any_port(rng)
     with contextlib.suppress(OSError):
         stranger = socket.create_connection(("127.0.0.1", port), 5)
@@ -86,7 +86,7 @@ def values(rng):
 
 
 def message(rng, controls):
-    """A message for viser: one of its types with any values, a valid one with a field changed, or no message."""
+    """A message for viser: one of its types with any values, a valid one with a field changed, or an invalid one."""
     types = viser._messages.Message.get_subclasses()
     kind = rng.choice(types)
     fields = {name: values(rng) for name in getattr(kind, "__dataclass_fields__", {})}
@@ -114,14 +114,14 @@ def message(rng, controls):
 
 
 def browser(port, origin=None, **options):
-    """A client that speaks as the viewer's page does."""
+    """A client with the protocol of the viewer's page."""
     headers = options.pop("headers", {})
     own = {"subprotocols": [PROTOCOL], "compression": None, "max_size": None, "open_timeout": 20, "proxy": None}
     return connect(f"ws://127.0.0.1:{port}", additional_headers=headers, origin=origin, **{**own, **options})
 
 
 async def send_messages(port, rng, controls):
-    """A stranger at the viewer's websocket, of another page or with messages of no use."""
+    """An attacker at the viewer's websocket, from another page or with useless messages."""
     refused = [
         {"origin": rng.choice(["http://evil.example", "null", "http://127.0.0.1:1", "file://"])},
         {"headers": {"Host": "evil.example"}},
@@ -141,7 +141,7 @@ async def send_messages(port, rng, controls):
 
 
 class Watcher:
-    """A legitimate browser, which looks all the time."""
+    """A legitimate browser that watches all the time."""
 
     def __init__(self, port):
         self.port, self.received, self.messages = port, 0, []  # the first messages
@@ -163,7 +163,7 @@ class Watcher:
             self.messages += [message] if self.received < 50 else []
 
     async def sees_more(self, seconds=20.0):
-        """Whether the picture goes on."""
+        """Whether new pictures arrive."""
         before, end = self.received, time.monotonic() + seconds
         while self.received < before + 3 and time.monotonic() < end and not self.task.done():
             await asyncio.sleep(0.05)
@@ -171,7 +171,7 @@ class Watcher:
 
 
 def control_ids(messages):
-    """Numbers of the panel's controls, from the messages that a browser gets."""
+    """Numbers of the panel's controls, from the messages to a browser."""
     found = set()
     for message in messages:
         plain, packed = struct.unpack_from("<QQ", message)
@@ -181,7 +181,7 @@ def control_ids(messages):
 
 
 async def attack_viewer(port, number, seed):
-    """Sends hostile messages to a viewer; returns a line for each time that its browser saw nothing more."""
+    """Sends hostile messages to a viewer. Returns a line each time its browser stopped receiving."""
     rng, held, faults = random.Random(seed), [], []
     async with Watcher(port) as watcher:
         if not await watcher.sees_more(60):
@@ -226,7 +226,7 @@ def ports_of(processes):
 
 @contextlib.contextmanager
 def started(folder, name, *command, **variables):
-    """A command, with its output in a file; stopped as Ctrl-C does."""
+    """A command with its output in a file. Stopped as Ctrl-C does."""
     with (folder / f"{name}.log").open("w") as log:
         command = [sys.executable, "-u", "train.py", *map(str, command)]
         process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log, env={**os.environ, **variables})
@@ -268,7 +268,7 @@ def view(folder, number, seed):
 
 
 def attack_ports(folder, name, processes, number, seed):
-    """Sends bytes to every port of programs that train, which must go on; returns the number of ports, and faults."""
+    """Sends bytes to every port of training programs, which must continue. Returns the number of ports, and faults."""
     rng, held, faults = random.Random(seed), [], []
     ports, lines = ports_of(processes), epochs(folder)
     for port in ports:
@@ -322,7 +322,7 @@ PROGRAMS = {"view": view, "distributed": distributed, "ray": ray}
 
 
 def messages(folder, number, seed, programs=tuple(PROGRAMS)):
-    """Attacks each program; returns the number of ports, and a line for each thing that went wrong."""
+    """Attacks each program. Returns the number of ports, and a line per fault."""
     tried, wrong = 0, []
     for name in programs:
         Path(folder, name).mkdir(parents=True)

@@ -1,6 +1,6 @@
-"""Two programs on one folder: `train` with two seeds, and sweeps, of which one may be killed.
+"""Two programs on one folder: `train` with two seeds, or two sweeps, one of which may be killed.
 
-They start at random offsets; or one is held at a random moment of its start until the other one has come further.
+They start at random offsets, or one is stopped at a random moment of its start until the other has progressed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def rows(path):
 
 
 def of_run(folder):
-    """What a run leaves, times left out."""
+    """A run's results, without times."""
     content = json.loads((folder / "result.json").read_text())
     config = json.loads((folder / "config.json").read_text())
     with np.load(folder / "policy.npz") as file:
@@ -49,12 +49,12 @@ def of_run(folder):
 
 
 def of_sweep(folder):
-    """The tables of a sweep, times left out."""
+    """The tables of a sweep, without times."""
     return [rows(folder / name) for name in ("results.csv", "finals.csv", "comparison.csv")]
 
 
 def same(read, folder, right):
-    """Whether a folder has what is right; one that cannot be read has not."""
+    """Whether a folder has the right results. False if it cannot be read."""
     try:
         return read(folder) == right
     except Exception:
@@ -62,12 +62,9 @@ def same(read, folder, right):
 
 
 def ended(process, allowed):
-    """What is wrong with how a process ended, and what it printed; `allowed` are statuses that need no sentence."""
+    """Faults of how a process ended, and its output. `allowed` are statuses that need no message."""
     stdout, stderr = process.communicate(timeout=600)
-    named = any(
-        line.startswith("error: ") and ("another process" in line or "another program" in line or "exists" in line)
-        for line in stderr.splitlines()
-    )
+    named = any(line.startswith("error: ") and ("another process" in line or "exists" in line) for line in stderr.splitlines())
     if "Traceback" in stderr:
         return [f"traceback: {stderr[-300:]}"], stdout
     if process.returncode in allowed or (process.returncode == 2 and named):
@@ -95,7 +92,7 @@ def train_pair(folder, right, rng):
 
 
 def train_held(folder, right, rng):
-    """Two `train` with one `--out`, started together; one stands still until the other trains, or has ended."""
+    """Two `train` with one `--out`, started together. One is stopped until the other trains, or has ended."""
     processes = {seed: start(*TRAIN, "--seed", seed, "--out", folder) for seed in right}
     held, other = rng.sample(sorted(right), 2)
     if rng.random() < 0.5:
@@ -109,7 +106,7 @@ def train_held(folder, right, rng):
 
 
 def has_jax(process):
-    """Whether a process has loaded JAX: by then it has looked at its arguments."""
+    """Whether a process has loaded JAX, and so has checked its arguments."""
     try:
         return "jaxlib" in Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8")
     except OSError:
@@ -117,7 +114,7 @@ def has_jax(process):
 
 
 def one_of(folder, right, processes):
-    """The faults of two `train` on one folder, by seed: one trains as if it were alone, the other is refused."""
+    """The faults of two `train` on one folder, by seed: one trains as if it were alone, the other fails with an error."""
     faults = [fault for process in processes.values() for fault in faults_of(process, (0,))]
     seeds = [seed for seed, process in processes.items() if process.returncode == 0]
     if len(seeds) != 1:
@@ -135,7 +132,7 @@ def sweep_pair(folder, right, rng):
 
 
 def sweep_held(folder, right, rng):
-    """The same sweep twice; one stands still from where it knows what is to be done until the other has done some of it."""
+    """The same sweep twice. One is stopped after listing its runs, until the other has finished some of them."""
     processes = [start(*SWEEP, "--out", folder) for _ in range(2)]
     held = rng.choice(processes)
     while (line := held.stdout.readline()) and "; writing to" not in line:
@@ -150,7 +147,7 @@ def sweep_held(folder, right, rng):
 
 
 def and_once_more(folder, right, processes, rng):
-    """The faults of sweeps on one folder, of which one may be killed, and of the whole sweep after them."""
+    """The faults of sweeps on one folder, one possibly killed, and of the whole sweep afterwards."""
     seen, faults = {}, []
     killed = rng.choice((None, *processes))
     kill_at = time.monotonic() + rng.uniform(0, 15)
@@ -163,12 +160,12 @@ def and_once_more(folder, right, processes, rng):
         faults += faults_of(process, (0, -signal.SIGKILL if process is killed else 0))
     faults += faults_of(last := start(*SWEEP, "--out", folder), (0,)) + note(folder, seen)
     if last.returncode != 0:
-        return [*faults, "the command once more does not write the tables"]
+        return [*faults, "the repeated command does not write the tables"]
     return faults if same(of_sweep, folder, right) else [*faults, "silent: the tables are not those of an undisturbed sweep"]
 
 
 def note(folder, seen):
-    """Results that were written twice; `seen` has when each was written last."""
+    """Results that were written twice. `seen` has the time of each result's last writing."""
     faults = []
     for path in folder.glob("cells/*/result.json"):
         written = path.stat().st_mtime_ns
@@ -179,7 +176,7 @@ def note(folder, seen):
 
 
 def pairs(folder, count, rng, workers):
-    """Half of them `train`, half sweeps; of each half one program of every other pair is held."""
+    """One half are `train`, the other half sweeps. In every second pair of each half, one program is stopped for a while."""
     folder.mkdir()
     right = {}
     for seed in (1, 2):

@@ -1,6 +1,6 @@
-"""Power cuts at random moments of runs and of sweeps; then the run is resumed, or the sweep's command repeated.
+"""Power cuts at random moments of runs and sweeps. Then the run is resumed, or the sweep's command repeated.
 
-After every other cut all that was not flushed is gone; after the others some of it is there, as the disk liked.
+After every other cut all unflushed data is lost. After the others some of it is kept at random.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def start_recorded(disk, store, *arguments):
 
 
 def cut(process, written, rng):
-    """Lets a process work until `written` is there and a little longer, then ends it."""
+    """Lets a process work until a little after `written` exists, then ends it."""
     deadline = time.monotonic() + 120
     while process.poll() is None and not written() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -64,12 +64,12 @@ def cut(process, written, rng):
 
 
 def contents(folder):
-    """What a finished run's files hold, whatever else lies in its folder."""
+    """Contents of a finished run's files. Other files in its folder are ignored."""
     return {name: value for name, value in of_run(folder).items() if name != "files"}
 
 
 def run_cut(folder, right, rng, disk_rng):
-    """A run; returns the faults, and the epochs that were lost."""
+    """A run. Returns the faults, and the number of lost epochs."""
     disk, store, after = folder / "disk", folder / "store", folder / "after"
     process = start_recorded(disk, store, *TRAIN, "--out", disk / "run")
     cut(process, (disk / "run" / "metrics.csv").exists, rng)
@@ -106,7 +106,7 @@ def sweep_cut(folder, right, rng, disk_rng, lanes):
 
 
 def power(folder, count, rng, workers):
-    """Two of three are runs, the others sweeps of one lane and of two; returns the faults, and the most epochs lost."""
+    """Two of three are runs, the others sweeps of one lane and of two. Returns the faults, and the most epochs lost."""
     folder.mkdir()
     faults_of(start(*TRAIN, "--out", folder / "right"), (0,))
     right = of_run(folder / "right")

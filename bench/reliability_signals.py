@@ -25,7 +25,7 @@ import reliability_pairs
 from mjx_dher.runs.folder import run_folder
 
 ROOT = Path(__file__).parent.parent
-SECONDS = 10.0  # that a command may take to end
+SECONDS = 10.0  # time limit for a command to end
 LONG = ["--total-steps", "20000", "--checkpoint-every", "0"]
 GRID = ["sweep", *reliability_pairs.SHAPES, "--sampler", "future", "--seeds", "2", "--lanes", "1", *LONG]
 COMMANDS = {
@@ -41,7 +41,7 @@ class Trials:
 
     Args:
       name: of the command.
-      folder: for what it writes.
+      folder: for its output.
       rng: decides signals and moments.
     """
 

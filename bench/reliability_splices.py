@@ -1,4 +1,4 @@
-"""Files of one run in the folder of another by the same code: lines of metrics, policies, results, checkpoints, configs."""
+"""Files of one run in the folder of another with the same code: lines of metrics, policies, results, checkpoints, configs."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""One device and several: runs side by side, and one run in parts.
+"""Scaling over devices: parallel runs, and one run split over devices.
 
     python bench/scaling.py lanes --devices 2 --env push --lanes 40       # 40 lanes on one device, 80 on two
     python bench/scaling.py lanes --devices 2 --env pick_and_place slide
-    python bench/scaling.py run --devices 2 --env push --times 1 2 4 8    # so many times the environments and the batch
+    python bench/scaling.py run --devices 2 --env push --times 1 2 4 8    # multiples of the environments and the batch
 
 `run` has three rows for each size: one device; all devices, with as many times the environments and batch; all devices, with
-the same. The third says what the exchange costs where work is too small to share. A row is the median epoch of `--epochs`,
-after the first one. The rows of a size are measured in turn, `--rounds` times over, and the best round of each counts.
+the same. The third row shows the cost of the exchange if work is too small to share. A row is the median epoch of `--epochs`,
+without the first one. The rows of a size are measured in turn, `--rounds` times, and the best round of each counts.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mjx_dher.system.caches import prepare
 
 
 class Case:
-    """So many runs of a spec on so many devices, compiled."""
+    """`runs` compiled runs of a spec on `devices` devices."""
 
     def __init__(self, env, spec, runs, devices):
         self.env, self.spec, self.devices = env, spec, devices
@@ -46,12 +46,12 @@ class Case:
 
     @property
     def steps(self):
-        """Environment steps a second, of all runs."""
+        """Environment steps per second, of all runs."""
         return self.runs * config_lib.steps_per_epoch(self.spec.config, self.env.episode_length) / self.seconds
 
     @property
     def transitions(self):
-        """Transitions a second that updates learn from, of all runs."""
+        """Transitions per second that updates learn from, of all runs."""
         config = self.spec.config
         return self.runs * config.cycles_per_epoch * config.updates_per_cycle * config.batch_size / self.seconds
 
@@ -63,7 +63,7 @@ def measure(cases, args):
 
 
 def resized(spec, args, times=1):
-    """The spec with what the command line says, and `times` the environments and the batch."""
+    """The spec with the command line's changes, and `times` the environments and the batch."""
     changes = {name: getattr(args, name) for name in ("num_envs", "batch_size", "updates_per_cycle", "cycles_per_epoch")}
     changes = {name: value for name, value in changes.items() if value is not None}
     if args.hidden_sizes:
@@ -110,7 +110,7 @@ def main():
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="gpu")
-    parser.add_argument("--lanes", type=int, default=40, help="a device")
+    parser.add_argument("--lanes", type=int, default=40, help="lanes per device")
     parser.add_argument("--times", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--epochs", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=3)

@@ -3,11 +3,12 @@
     python bench/soak.py [--env push] [--minutes 60] [--out soak.csv] [-- OPTIONS OF train.py]
 
 Trains, with checkpoints and a log of JSON lines, until the time is up, and is then stopped as by SIGTERM. After each epoch it
-notes the memory held (resident), how often XLA has compiled, and how fast the machine is just then: another process, which
-began with the run and does nothing in between, plays episodes and multiplies matrices on all cores for half a second. The
-epochs after the first tenth of the time, in which the replay ring fills, are cut into ten blocks; a line is fitted to the
-blocks' medians. Exits with 1 if anything compiled after the first epoch, if the 95 % interval of memory's slope lies above
-zero, or if environment steps per second, as a multiple of the machine's speed, change by 5 % or more along the line.
+records the resident memory, the number of XLA compilations, and the machine's current speed. For the speed, another process,
+idle otherwise, plays episodes and multiplies matrices on all cores for half a second.
+
+The epochs after the first tenth of the time, in which the replay ring fills, are cut into ten blocks. A line is fitted to the
+blocks' medians. The exit status is 1 if anything compiled after the first epoch, if the 95 % interval of memory's slope lies
+above zero, or if the environment steps per second, relative to the machine's speed, change by 5 % or more along the line.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from mjx_dher.runs.folder import loggers
 from mjx_dher.system import memory
 
 BLOCKS = 10
-REFERENCE_EPISODES = 24  # some 0.1 s on two cores
-REFERENCE_PRODUCTS = 600  # some 0.3 s
+REFERENCE_EPISODES = 24  # about 0.1 s on two cores
+REFERENCE_PRODUCTS = 600  # about 0.3 s
 COLUMNS = ("epoch", "env_steps", "seconds", "epoch_seconds", "reference_seconds", "memory", "compilations")
 COMPILATION = "/jax/core/compile/backend_compile_duration"
 
 
 class Watch:
-    """A sink that notes what each epoch leaves, and stops the run when its time is up.
+    """A sink that records each epoch, and stops the run when its time is up.
 
-    Rows go to a file at once: kept in memory they would grow like what is looked for.
+    Rows are written to a file at once: in memory they would grow like the leak to be found.
     """
 
     def __init__(self, path, seconds):
@@ -53,7 +54,7 @@ class Watch:
         self.writer = csv.DictWriter(self.file, COLUMNS)
         self.writer.writeheader()
         command = [sys.executable, __file__, "--reference"]
-        # A session of its own: Ctrl-C is for the run.
+        # A new session: Ctrl-C is for the run.
         self.clock = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
         self._reference()
 
@@ -90,7 +91,7 @@ class Watch:
 
 
 def tell_speed() -> None:
-    """The other process: for each line that it reads it does the same work once and prints the seconds that it took."""
+    """The other process. For each line of input it does the same work once and prints the seconds."""
     env = envs.make("push", engine="native")
     actions = jnp.zeros((env.episode_length, REFERENCE_EPISODES, env.action_size))
 
@@ -108,7 +109,7 @@ def tell_speed() -> None:
 
 
 def line(minutes, values):
-    """Slope a minute and its 95 % interval, of the medians of BLOCKS blocks."""
+    """Slope per minute and its 95 % interval, of the medians of BLOCKS blocks."""
     blocks = np.array_split(np.arange(len(values)), BLOCKS)
     found = scipy.stats.linregress([np.mean(minutes[b]) for b in blocks], [np.median(values[b]) for b in blocks])
     half = scipy.stats.t.ppf(0.975, BLOCKS - 2) * found.stderr
@@ -121,7 +122,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--reference", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("options", nargs="*", help="of train.py, after --")
+    parser.add_argument("options", nargs="*", help="options of train.py, after --")
     args = parser.parse_args()
     if args.reference:
         tell_speed()

@@ -1,9 +1,9 @@
-"""What a user waits for: from Enter to the first epoch, and from the last epoch to the prompt.
+"""Waiting times of a user: from Enter to the first epoch, and from the last epoch to the prompt.
 
     python bench/startup.py [--env push] [--engine auto] [--preset cpu] [--sampler weighted] [--repeats 3]
 
-Each row is the command `python train.py` itself, for two epochs. It is "cold" in an empty home folder, where neither JAX nor
-Warp nor the GPU's driver has compiled anything, and "warm" in the same one after that (medians).
+Each row is the command `python train.py` itself, for two epochs. It is "cold" in an empty home folder, without compilations
+cached by JAX, Warp or the GPU's driver, and "warm" in the same one after that (medians).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from timing import print_table
 from mjx_dher import config, presets
 
 ROOT = Path(__file__).parent.parent
-# What train.py prints when a part has ended, and the part.
+# Output of train.py at the end of a part, and the part.
 PARTS = {
     "writing to": "imports, arguments",
     "compiling for": "checks, first networks",
@@ -35,7 +35,7 @@ CACHES = ("JAX_COMPILATION_CACHE_DIR", "WARP_CACHE_PATH", "XDG_CACHE_HOME", "CUD
 
 
 def measure(command: list[str], home: str) -> dict[str, float]:
-    """Runs a command with this home folder; returns the seconds of each part, and of all."""
+    """Runs a command with this home folder. Returns the seconds of each part, and of all."""
     environ = {name: value for name, value in os.environ.items() if name not in CACHES}
     with tempfile.TemporaryDirectory() as folder:
         start = last = time.perf_counter()
@@ -62,7 +62,7 @@ def measure(command: list[str], home: str) -> dict[str, float]:
 
 
 def machine_preset() -> str:
-    """Asks in a program of its own: this one must not hold the GPU's memory."""
+    """The machine's preset, from a separate process: this one must not hold the GPU's memory."""
     code = "from mjx_dher import presets; print(presets.machine_preset())"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout.split()[-1]
 
@@ -71,7 +71,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engine", default="auto")
-    parser.add_argument("--preset", help="by default the one for this machine")
+    parser.add_argument("--preset", help="preset (default: the one for this machine)")
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--repeats", type=int, default=3, help="warm runs")
     args = parser.parse_args()

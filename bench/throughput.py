@@ -1,8 +1,8 @@
-"""Environment steps a second, inside a jitted rollout as training makes it: the policy network and exploration included.
+"""Environment steps per second inside a jitted rollout as in training, with the policy network and exploration.
 
     python bench/throughput.py [--env push pick_and_place slide] [--engines native jax] [--num-envs 16 32 128]
 
-On a GPU: --engines warp --num-envs 2048 8192 32768. A custom task is module:attribute. --path chooses how warp runs the model
+On a GPU: --engines warp --num-envs 2048 8192 32768. A custom task is module:attribute. --path selects how warp runs the model
 (both: --path fused graph), and --random plays random actions in place of the policy's. Each line is printed as soon as it is
 measured. Hands, each case in less than a minute after kernels are compiled:
 
@@ -24,7 +24,7 @@ from mjx_dher.rollout import rollout
 
 
 def measure(task: str, engine: str, num_envs: int, path: str, random: bool, repeats: int) -> tuple[str, float, float]:
-    """The engine and its path, environment steps a second, and seconds of the first call, which compiles."""
+    """The engine and its path, environment steps per second, and seconds of the first call, which compiles."""
     hparams, env = HParams(), envs.make(task, engine=engine, **({"path": path} if engine == "warp" else {}))
     learner = learners.make("ddpg", Config(), env_spec(env))
     state = learner.init(jax.random.key(0))
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--num-envs", type=int, nargs="+", default=[16, 32, 128])
     parser.add_argument("--path", nargs="+", default=["auto"], choices=["auto", "fused", "graph"])
     parser.add_argument("--random", action="store_true", help="random actions")
-    parser.add_argument("--repeats", type=int, default=5, help="episodes that are timed")
+    parser.add_argument("--repeats", type=int, default=5, help="timed episodes")
     args = parser.parse_args()
     print(f"{machine()}\n\n| task | engine | num_envs | env steps/s | first call, s |\n|{'---|' * 5}", flush=True)
     for task, engine, num_envs, path in itertools.product(args.env, args.engines, args.num_envs, args.path):

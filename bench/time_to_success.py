@@ -1,10 +1,10 @@
-"""Time to success: trains several seeds of a preset, one after the other, and prints when each first reached a threshold.
+"""Time to success: trains several seeds of a preset in turn, and prints when each first reached a threshold.
 
     python bench/time_to_success.py [--env push] [--sampler weighted] [--seeds 5] [--threshold 0.9] [--out FILE.csv]
         [--set num_envs=512 noise_std=0.2]
 
-Seconds are those of training, evaluations included and compilation apart. "First" is the first evaluation (eval_episodes
-episodes) at or above the threshold; the final success is over 500 fresh episodes.
+Seconds are of training, with evaluations and without compilation. "First" is the first evaluation (eval_episodes episodes) at
+or above the threshold. The final success is over 500 fresh episodes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--sampler", default="weighted")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--threshold", type=float, default=0.9)
-    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="what to change in the preset")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="changes to the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
     spec = presets.preset(args.preset, args.env)

@@ -1,4 +1,4 @@
-"""What the benchmarks share: timing compiled functions, and a table that names the machine."""
+"""Shared by the benchmarks: timing of compiled functions, and a table that names the machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mjx_dher.system.limits import usable_cores
 
 
 def median_seconds(run: Callable[[], Any], repeats: int = 7) -> float:
-    """Median of `repeats` timed calls, after one that is not counted. `run` returns what is to be waited for."""
+    """Median of `repeats` timed calls, after one that is not counted. `run` returns the arrays to wait for."""
     jax.block_until_ready(run())
     times = []
     for _ in range(repeats):
