@@ -167,7 +167,7 @@ def test_fields_of_memory_follow_one_another():
         assert begin["jacobian"] == own[0] == 0
         assert begin["inertia"] == 3 * model.nbody  # moments, three numbers each
         assert begin["factor"] == begin["pos"] == max(6 * model.nv + begin["momentum"], rows * model.nv)
-        assert begin["mass"] >= begin["pos"] + model.nv**2  # neither of them reaches into what stays
+        assert begin["mass"] >= begin["pos"] + model.nv * (model.nv + 1) // 2  # neither of them reaches into what stays
         assert 0 <= layout.size - begin["change"] - rows <= 1
     assert 4 * layout.size < 48 * 1024  # bytes of shared memory that every GPU gives a block
 

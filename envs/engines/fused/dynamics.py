@@ -216,12 +216,12 @@ def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(d
 @wp.func
 def crb(bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, threads: int):
     """Computes the mass matrix from the momenta (composite rigid bodies)."""
-    for at in range(thread, dofs.number * dofs.number, threads):
-        i, j = at // dofs.number, at % dofs.number
-        later, sooner = wp.max(i, j), wp.min(i, j)
+    for at in range(thread, memory.mass.shape[0], threads):
+        i = int(0.5 * (wp.sqrt(float(8 * at + 1)) - 1.0))  # row of this number in a lower half
+        j = at - i * (i + 1) // 2
         mass = float(0.0)
-        if (bodies.moved_by[dofs.body[later]] >> sooner) & 1 == 1:
-            mass = wp.dot(memory.motion[sooner], memory.momentum[later])
+        if (bodies.moved_by[dofs.body[i]] >> j) & 1 == 1:
+            mass = wp.dot(memory.motion[j], memory.momentum[i])
         if i == j:
             mass += dofs.armature[i]
         memory.mass[at] = mass

@@ -19,7 +19,9 @@ _ON_A_GPU = """
             const bool is_row = thread < L && i < n;
             b[r] = is_row ? solution.data[i] : 0.0f;
             #pragma unroll
-            for (int j = 0; j < N; ++j) h[r * N + j] = is_row && j <= i ? (summed ? factor : matrix).data[i * n + j] : 0.0f;
+            for (int j = 0; j < N; ++j) {
+                h[r * N + j] = is_row && j <= i ? (summed ? factor : matrix).data[i * (i + 1) / 2 + j] : 0.0f;
+            }
         }
         for (int row = 0; row < rows; ++row) {
             const float lacks = residual.data[row];
@@ -73,7 +75,7 @@ _ON_A_GPU = """
             const int i = thread + r * L;
             #pragma unroll
             for (int j = 0; j < N; ++j) {
-                if (thread < L && i < n && j < i) factor.data[i * n + j] = h[r * N + j];
+                if (thread < L && i < n && j < i) factor.data[i * (i + 1) / 2 + j] = h[r * N + j];
             }
         }
         __syncwarp(group);
@@ -84,7 +86,7 @@ _ON_A_GPU = """
                 #pragma unroll
                 for (int r = 0; r < R; ++r) {
                     const int i = thread + r * L;
-                    if (thread < L && i < k) b[r] -= factor.data[k * n + i] * x;
+                    if (thread < L && i < k) b[r] -= factor.data[k * (k + 1) / 2 + i] * x;
                     if (thread < L && i == k) solution.data[i] = x;
                 }
             }
@@ -105,34 +107,33 @@ _ON_A_GPU = """
 """
 _ON_A_CPU = """
     float gain = 0.0f;
-    for (int i = 0; i < n; ++i) {
-        for (int j = 0; j <= i && !summed; ++j) factor.data[i * n + j] = matrix.data[i * n + j];
-    }
+    const auto h = [&](int i, int j) -> float& { return factor.data[i * (i + 1) / 2 + j]; };
+    for (int at = 0; at < n * (n + 1) / 2 && !summed; ++at) factor.data[at] = matrix.data[at];
     for (int row = 0; row < rows; ++row) {
         const float lacks = residual.data[row], w = weight.data[row], left = w * lacks;
         if (row < equal || lacks < 0.0f) {
             const float* const j_row = jacobian.data + row * n;
             for (int i = 0; i < n; ++i) {
                 solution.data[i] -= j_row[i] * left;
-                if (stiff) for (int j = 0; j <= i; ++j) factor.data[i * n + j] += w * j_row[i] * j_row[j];
+                if (stiff) for (int j = 0; j <= i; ++j) h(i, j) += w * j_row[i] * j_row[j];
             }
         }
     }
     for (int k = 0; k < n; ++k) {
-        const float pivot = factor.data[k * n + k];
+        const float pivot = h(k, k);
         const float inverse = 1.0f / sqrtf(pivot > 1.0e-20f ? pivot : 1.0e-20f);
-        factor.data[k * n + k] = inverse;
+        h(k, k) = inverse;
         solution.data[k] *= inverse;
         gain += solution.data[k] * solution.data[k];
         for (int i = k + 1; i < n; ++i) {
-            factor.data[i * n + k] *= inverse;
-            solution.data[i] -= factor.data[i * n + k] * solution.data[k];
-            for (int j = k + 1; j <= i; ++j) factor.data[i * n + j] -= factor.data[i * n + k] * factor.data[j * n + k];
+            h(i, k) *= inverse;
+            solution.data[i] -= h(i, k) * solution.data[k];
+            for (int j = k + 1; j <= i; ++j) h(i, j) -= h(i, k) * h(j, k);
         }
     }
     for (int k = n - 1; k >= 0; --k) {
-        solution.data[k] *= factor.data[k * n + k];
-        for (int i = 0; i < k; ++i) solution.data[i] -= factor.data[k * n + i] * solution.data[k];
+        solution.data[k] *= h(k, k);
+        for (int i = 0; i < k; ++i) solution.data[i] -= h(k, i) * solution.data[k];
     }
     return gain;
 """
@@ -165,10 +166,10 @@ def direction(
     D is the weight of rows that act: the first `equal` ones, and those whose residual is below 0.
 
     Args:
-      matrix: M [n * n], symmetric.
+      matrix: lower half of M, row by row, [n * (n + 1) / 2].
       jacobian: J [rows * n].
       weight, residual: [rows].
-      factor: [n * n] to compute in; if `summed` is 1, it holds M.
+      factor: like `matrix`, to compute in; if `summed` is 1, it holds M.
       solution: the right side [n], in whose place x is written.
 
     Returns:

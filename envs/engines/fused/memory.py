@@ -21,8 +21,7 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, spars
     lengths = {
         **dict.fromkeys(("pos", "quat", "mat", "moment", "inertia", "velocity", "bias", "force"), nb),
         **dict.fromkeys(("motion", "turning", "momentum", "smooth", "qacc", "inert", "search", "step", "qvel"), nv),
-        "mass": nv * nv,
-        "factor": nv * nv,
+        **dict.fromkeys(("mass", "factor"), nv * (nv + 1) // 2),
         "qpos": model.nq,
         **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
         **dict.fromkeys(("touching", "slot"), contacts.slots),

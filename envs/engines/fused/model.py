@@ -176,7 +176,7 @@ class Memory:
     slot: _ints  # [nslot] first row of each of those contacts
     limited: _ints  # [nlimit] row of each joint at its limit, or -1
     # Those that stay.
-    mass: _floats  # [nv * nv]
+    mass: _floats  # [nv * (nv + 1) / 2] lower half of the mass matrix, row by row
     smooth: _floats  # [nv] forces except those of constraints
     qacc: _floats  # [nv]
     inert: _floats  # [nv] mass matrix times qacc
@@ -192,7 +192,7 @@ class Memory:
     sparse_residual: _floats
     sparse_change: _floats
     sparse_slope: _floats  # side of a limit, and minus the derivative of an equality's polynomial
-    factor: _floats  # [nv * nv] Cholesky factor
+    factor: _floats  # Cholesky factor in the same order
     jacobian: _floats  # [rows * nv]
 
 

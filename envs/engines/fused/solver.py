@@ -35,6 +35,17 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 
 @wp.func
+def _times_mass(memory: Memory, row: int, x: wp.array(dtype=float), size: int) -> float:
+    """Row of the mass matrix, of which memory holds the lower half, times a vector [size]."""
+    sum = float(0.0)
+    at = row * (row + 1) // 2
+    for i in range(size):
+        sum += memory.mass[at] * x[i]
+        at += wp.where(i < row, 1, i + 1)
+    return sum
+
+
+@wp.func
 def _slopes(
     world: World,
     sparse: Sparse,
@@ -139,7 +150,7 @@ def _begin(
     Rounding J a - aref causes it: at the minimum, a step cannot gain more than the sum of D times the squared error.
     """
     for i in range(thread, nv, threads):
-        memory.inert[i] = _dot(memory.mass, i, memory.qacc, nv)
+        memory.inert[i] = _times_mass(memory, i, memory.qacc, nv)
     unsure = float(0.0)
     for row in range(thread, rows, threads):
         asked = memory.residual[row]
@@ -190,7 +201,7 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
         slope = float(0.0)
         curve = float(0.0)
         for i in range(thread, nv, threads):
-            step_i = _dot(memory.mass, i, memory.search, nv)
+            step_i = _times_mass(memory, i, memory.search, nv)
             slope -= memory.search[i] * memory.step[i]
             curve += memory.search[i] * step_i
             memory.step[i] = step_i
@@ -224,7 +235,8 @@ def accelerate(
     """Advances velocities by all forces, implicitly in damping."""
     sync(threads)
     for i in range(thread, nv, threads):
-        memory.mass[i * nv + i] = memory.mass[i * nv + i] + world.timestep * damping(dofs, memory, inputs, i)
+        diagonal = i * (i + 3) // 2
+        memory.mass[diagonal] = memory.mass[diagonal] + world.timestep * damping(dofs, memory, inputs, i)
         memory.search[i] = memory.smooth[i]
     if has_sparse:
         add_sparse(sparse, memory, nv, 0, thread, threads)
@@ -264,7 +276,8 @@ def _gyrate(world: World, bodies: Bodies, memory: Memory, nv: int, thread: int, 
                 omega[i] = memory.qvel[dof + i]
                 alpha[i] = memory.search[dof + i]
                 for j in range(3):
-                    mass[i, j] = memory.mass[(dof + i) * nv + dof + j]
+                    later, sooner = dof + wp.max(i, j), dof + wp.min(i, j)
+                    mass[i, j] = memory.mass[later * (later + 1) // 2 + sooner]
             axes = bodies.principal[b]
             inertia = axes * wp.diag(bodies.inertia[b]) * wp.transpose(axes)
             change = wp.skew(omega) * inertia - wp.skew(inertia * omega)

@@ -206,7 +206,7 @@ def take_sparse(sparse: Sparse, memory: Memory, far: float, thread: int, threads
 def add_sparse(sparse: Sparse, memory: Memory, nv: int, stiff: int, thread: int, threads: int):
     """Adds the rows' forces to `search`; and with `stiff` 1 puts the mass matrix and their stiffness into `factor`."""
     if stiff == 1:
-        for at in range(thread, nv * nv, threads):
+        for at in range(thread, memory.mass.shape[0], threads):
             memory.factor[at] = memory.mass[at]
         sync(threads)
     for i in range(thread, nv, threads):
@@ -218,7 +218,8 @@ def add_sparse(sparse: Sparse, memory: Memory, nv: int, stiff: int, thread: int,
                 memory.search[i] = memory.search[i] - coef * pull[0]
                 if stiff == 1 and pull[1] > 0.0:
                     for term in range(sparse.begin[row], sparse.begin[row + 1]):
-                        place = i * nv + sparse.dof[term]
-                        more = coef * pull[1] * _coefficient(sparse, memory, term, row)
-                        memory.factor[place] = memory.factor[place] + more
+                        if sparse.dof[term] <= i:
+                            place = i * (i + 1) // 2 + sparse.dof[term]
+                            more = coef * pull[1] * _coefficient(sparse, memory, term, row)
+                            memory.factor[place] = memory.factor[place] + more
     sync(threads)
