@@ -132,10 +132,11 @@ class EnvState(Protocol):
     """Environment state, as far as the trainer reads it. It may hold more.
 
     Optional fields, all [] bool:
-      failed: the simulation diverged. Nothing is learned from the episode.
-      done: the episode ends here (needs `EnvSpec.ends`).
-      terminal: the episode ends here and no future follows for any goal, for example after an object was dropped (needs
-        `EnvSpec.ends`).
+
+    - `failed`: the simulation diverged. Nothing is learned from the episode.
+    - `done`: the episode ends here (needs `EnvSpec.ends`).
+    - `terminal`: the episode ends here and no future follows for any goal, for example after an object was dropped (needs
+      `EnvSpec.ends`).
     """
 
     @property
