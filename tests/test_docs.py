@@ -42,6 +42,7 @@ ELSEWHERE = {
     "docs/policies.md": "test_export.py",
     "docs/start.md": "test_start.py",
     "docs/tutorial.md": "test_examples.py",
+    "docs/real_robot.md": "test_your_robot.py",
     "docs/your_robot.md": "test_your_robot.py",
 }
 SNIPPETS = list(blocks("python"))

@@ -1,4 +1,4 @@
-"""docs/your_robot.md and its arm, docs/examples/my_arm.py: from an MJCF to ONNX, on every engine."""
+"""docs/your_robot.md, docs/real_robot.md and their arm, docs/examples/my_arm.py: from an MJCF to ONNX, on every engine."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from mjx_dher.envs.kinematics import Place
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
 
-PAGE = (ROOT / "docs" / "your_robot.md").read_text()
+PAGE, REAL = ((ROOT / "docs" / name).read_text() for name in ("your_robot.md", "real_robot.md"))
 
 
 def test_the_page_shows_the_example():
@@ -40,9 +40,9 @@ def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
     assert float(re.findall(r"^success ([\d.]+)", capsys.readouterr().out, re.M)[0]) >= 0.9
     assert (tmp_path / "arm.onnx").stat().st_size > 10_000
     assert json.loads((tmp_path / "runs/arm/config.json").read_text())["interface"]["dt"] == 0.04
-    (robot,) = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.S) if "def targets" in block]
+    (robot,) = [block for block in re.findall(r"```python\n(.*?)```", REAL, re.S) if "def targets" in block]
     names = {"Reach": my_arm.Reach}
-    exec(compile(robot, "your_robot.md", "exec"), names)
+    exec(compile(robot, "real_robot.md", "exec"), names)
     state = names["env"].reset(jax.random.key(0))
     ctrl = names["targets"](state.physics.qpos, state.physics.qvel, state.obs["desired_goal"])
     action = names["policy"](jax.tree.map(np.asarray, state.obs))
