@@ -184,6 +184,7 @@ class Gripped(Goal):
 
     size = 7
     threshold = 1.0
+    unit = ""
     wanted = np.array([0.0375, 0.0, 0.0, -0.0375, 0.0, 0.0, 0.075], np.float32)
     allowed = (0.05, 0.02)  # m
 

@@ -31,6 +31,7 @@ class Goal:
     low: Any = None  # lowest and highest goals to draw or drag to, [G] or [3]
     high: Any = None
     place: Place | None = None  # the site or body of the goal
+    unit: str = "m"  # of distances: "m", "rad" or "" for another one
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
@@ -93,6 +94,7 @@ class Rotation(Goal):
     """
 
     size = 6
+    unit = "rad"
 
     def __init__(self, of: str, axis: Bounds | None = None, threshold: float = 0.1):
         self.of, self.axis, self.threshold = of, axis, threshold
@@ -117,6 +119,11 @@ class Rotation(Goal):
             half = jax.random.uniform(key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
             quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * np.asarray(self.axis)])
         return quat_to_matrix(quat)[:, :2].T.ravel()
+
+    def turned(self, goal: Array, quat: Array) -> Array:
+        """The goal for which the body has the orientation `quat` [4] (w, x, y, z)."""
+        assert self.place is not None
+        return (quat_to_matrix(quat) @ self.place.offset[1])[:, :2].T.ravel()
 
     @staticmethod
     def distance(achieved: Array, desired: Array) -> Array:
@@ -161,6 +168,10 @@ class Pose(Goal):
         position_key, rotation_key = jax.random.split(key)
         return jnp.concatenate([self.position.sample(position_key), self.rotation.sample(rotation_key)])
 
+    def turned(self, goal: Array, quat: Array) -> Array:
+        """The goal at the same position for which the body has the orientation `quat` [4] (w, x, y, z)."""
+        return jnp.concatenate([goal[:3], self.rotation.turned(goal[3:], quat)])
+
     def distance(self, achieved: Array, desired: Array) -> Array:
         angle = Rotation.distance(achieved[..., 3:], desired[..., 3:])
         return jnp.maximum(euclidean(achieved[..., :3], desired[..., :3]), self.threshold / self.rotation.threshold * angle)
@@ -178,6 +189,8 @@ class Joints(Goal):
       low, high: lowest and highest positions of goals. Default: the joints' ranges.
       threshold: rad or m.
     """
+
+    unit = ""
 
     def __init__(self, names: str = "*", low: Bounds | None = None, high: Bounds | None = None, threshold: float = 0.1):
         self.names, self.low, self.high, self.threshold = names, low, high, threshold

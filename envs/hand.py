@@ -56,6 +56,7 @@ class ObjectPose(Goal):
 
     size = 7
     threshold = 0.1
+    unit = "rad"
 
     def __init__(self, rotation: str, positions: bool = False, reach: float = 0.01, ignores_z: bool = False):
         check_name("rotation", rotation, ROTATIONS)
@@ -106,6 +107,10 @@ class ObjectPose(Goal):
         if not isinstance(goal, jax.core.Tracer) and not 0 < float(length) < np.inf:
             raise ValueError(f"desired_goal must end with a quaternion of finite length, more than 0; got {np.asarray(goal)}")
         return jnp.concatenate([goal[:3], jnp.where(jnp.abs(length - 1.0) < 1e-5, goal[3:], goal[3:] / length)])
+
+    def turned(self, goal: Array, quat: Array) -> Array:
+        """The goal with another orientation [4]; of q and -q the one that is nearer to the goal's."""
+        return jnp.concatenate([goal[:3], jnp.where(jnp.sum(goal[3:] * quat) < 0.0, -quat, quat)])
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
         assert self.place is not None

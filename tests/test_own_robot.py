@@ -318,4 +318,10 @@ def test_the_viewer_moves_goals_and_objects():
         float(game.env.goal_distance(player.obs["achieved_goal"], player.obs["desired_goal"]))
     )
     assert [body for body, _, _ in player.marks] == [-1, game.env.model.body("box").id]
-    assert make_game(make(goal=task.Joints("a b c", [0] * 3, [1] * 3))).move_goal is None
+    player.turn_goal(np.array([2.0, 0.0, 0.0, 2.0]))
+    np.testing.assert_allclose(player.obs["desired_goal"], [0.5, 1, 0.25, *turned(np.pi / 2)], atol=1e-6)
+    for orientation in (np.zeros(4), np.full(4, np.nan), np.ones(3)):
+        with refuses("goal"):
+            player.turn_goal(orientation)
+    joints = make_game(make(goal=task.Joints("a b c", [0] * 3, [1] * 3)))
+    assert (joints.move_goal, joints.turn_goal) == (None, None)

@@ -15,6 +15,7 @@ import pytest
 from conftest import ROOT, refuses
 
 from mjx_dher import cli, envs
+from mjx_dher.envs.task import MujocoTask, Rotation
 from mjx_dher.policy import bundled
 from mjx_dher.viewer import address, server, sources
 
@@ -139,21 +140,49 @@ def test_a_policy_that_cannot_be_played_is_told_and_the_other_goes_on(port):
 
 def test_a_hand_moves_the_goal(port):
     with server.Viewer([of_package("reach")], lambda source: reach(), "127.0.0.1", port, 1) as viewer:
-        viewer._drag("goal", np.zeros(3), "start")
+        upright = np.array([1.0, 0, 0, 0])
+        viewer._drag("goal", (np.zeros(3), upright), "start")
         assert not viewer.player.is_own  # it is held, not moved
-        viewer._drag("goal", np.array([1.3, 0.8, 0.5]), "update")
+        viewer._drag("goal", (np.array([1.3, 0.8, 0.5]), upright), "update")
         viewer.show(True)
-        np.testing.assert_allclose(viewer._ball.position, [1.3, 0.8, 0.5], atol=1e-6)
+        np.testing.assert_allclose(viewer._balls[0].position, [1.3, 0.8, 0.5], atol=1e-6)
         np.testing.assert_allclose(
             viewer._handle.position, viewer.player.game.reset(np.uint32(1)).obs["desired_goal"], atol=1e-6
         )
-        viewer._drag("goal", np.array([9.0, 0.8, 0.5]), "update")
-        viewer._drag("goal", np.zeros(3), "end")
+        viewer._drag("goal", (np.array([9.0, 0.8, 0.5]), upright), "update")
+        viewer._drag("goal", (np.zeros(3), upright), "end")
         viewer.show(True)
         highest = viewer.player.game.env.goal_bounds[1, 0]
         np.testing.assert_allclose(
             viewer._handle.position, [highest, 0.8, 0.5], atol=1e-6
         )  # it springs back to where goals lie
+
+
+class Turn(MujocoTask):
+    """A box that lies in front of a servo; the goal is its orientation."""
+
+    model = """<mujoco><worldbody><body><joint name="a" range="-1 1"/><geom size=".1"/></body>
+    <body name="box" pos="1 0 0"><freejoint/><geom type="box" size=".1 .2 .3"/></body></worldbody>
+    <actuator><position joint="a" kp="1" ctrlrange="-1 1"/></actuator></mujoco>"""
+    goal = Rotation("body:box", threshold=0.2)
+
+
+def test_a_hand_turns_the_goal(port):
+    source = sources.by_random("test_view:Turn")
+    with server.Viewer([source], lambda source: Turn(engine="native"), "127.0.0.1", port, 1) as viewer:
+        quat = np.array([0.5, 0.5, -0.5, 0.5])
+        place = np.array(viewer._handle.position)
+        np.testing.assert_allclose(place, [1, 0, 0], atol=1e-6)  # at the ghost, which is where the box is
+        viewer._drag("goal", (place + 1.0, quat), "update")
+        viewer._drag("goal", (place, quat), "end")
+        viewer.show(True)
+        (ghost,) = viewer._ghosts.values()
+        np.testing.assert_allclose(ghost.wxyz, quat, atol=1e-6)
+        np.testing.assert_allclose(viewer._handle.position, place, atol=1e-6)
+        np.testing.assert_allclose(viewer._handle.wxyz, quat, atol=1e-6)
+        assert viewer.player.is_own
+        assert viewer._panel._distance.title == "Distance to the goal, °"
+        assert f"{np.degrees(viewer.player.distance):.1f} ° from the goal" in viewer._panel._score.content
 
 
 # The commands

@@ -118,7 +118,10 @@ def test_no_message_of_one_browser_disturbs_another(viewer, hostile):
     camera, drag, encode = hostile.CAMERA, hostile.DRAG, hostile.encode
     bad = [
         *(changed(drag, position=position) for position in ([math.nan, 0, 0], [1e39, 0, 0], [1, 2], [[1, 2, 3]], "xyz", None)),
-        *(changed(drag, **{field: value}) for field, value in [("name", "/ball"), ("owner", "0"), ("more", 1), ("wxyz", [])]),
+        *(
+            changed(drag, **{field: value})
+            for field, value in [("name", "/ball"), ("owner", "0"), ("more", 1), ("wxyz", []), ("wxyz", [0.0] * 4)]
+        ),
         *(changed(camera, **{field: [0, 0, 0]}) for field in ("up_direction",)),
         changed(camera, look_at=camera["position"]),
         *(changed(camera, fov=value) for value in (math.inf, 0, -1, 4)),

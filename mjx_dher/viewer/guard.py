@@ -212,4 +212,6 @@ class Connection(ServerConnection):
         if isinstance(message, _Control):
             is_value = self._guard.controls.get(message.uuid, lambda value: False)
             return self.has_camera and is_value(message.updates.value)
+        if isinstance(message, _Drag) and math.hypot(*message.wxyz) < 1e-3:
+            return False
         return self.has_camera

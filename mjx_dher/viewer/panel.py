@@ -123,16 +123,18 @@ class Panel:
         _assign(self._renew, "value", player.renew)
         _assign(self._score, "content", score(player))
         if with_curves:
+            _assign(self._distance, "title", "Distance to the goal" + (f", {unit}" if (unit := player.unit[1]) else ""))
             self._distance.data = distance_curve(player)
             if self._value.visible:
                 self._value.data = value_curve(player)
 
 
 def distance_curve(player: Player) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times in s, distances to the goal in cm, and the distance at which it is reached, or 0 if the task has none."""
+    """Times in s, distances to the goal in the player's unit, and the one at which it is reached, or 0 if there is none."""
     times, distances, _ = (np.array(x) for x in zip(*player.history))
     threshold = getattr(player.game.env, "distance_threshold", 0.0)
-    return times, 100 * distances, np.full_like(times, 100 * threshold)
+    scale, _ = player.unit
+    return times, scale * distances, np.full_like(times, scale * threshold)
 
 
 def value_curve(player: Player) -> tuple[np.ndarray, np.ndarray]:
@@ -144,7 +146,8 @@ def value_curve(player: Player) -> tuple[np.ndarray, np.ndarray]:
 
 def score(player: Player) -> str:
     """Counters as Markdown."""
-    state = "**reached**" if player.success else f"{100 * player.distance:.1f} cm from the goal"
+    scale, unit = player.unit
+    state = "**reached**" if player.success else f"{scale * player.distance:.1f} {unit}".rstrip() + " from the goal"
     lines = [f"Episodes reached: **{player.episodes}**"]
     if player.own.attempts or player.is_own:
         lines.append(f"Your own: **{player.own}**")

@@ -32,6 +32,7 @@ class Game(NamedTuple):
     step: Callable[[Any, Any], Any]  # state, action [A] -> state
     move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None if it cannot be moved
     move_object: Callable[[Any, Any], Any] | None  # the same
+    turn_goal: Callable[[Any, Any], Any] | None = None  # state, orientation [4] -> state; None if it cannot be turned
 
     @property
     def dt(self) -> float:
@@ -57,18 +58,26 @@ def make_game(env: Any) -> Game:
     def move_goal(state: Any, position: Any) -> Any:  # a pose keeps its orientation
         return env.with_goal(state, jnp.concatenate([position, state.obs["desired_goal"][3:]]))
 
+    turned: Any = getattr(getattr(env, "goal", None), "turned", None)
+
+    def turn_goal(state: Any, orientation: Any) -> Any:
+        return env.with_goal(state, turned(state.obs["desired_goal"], orientation))
+
     game = Game(
         env=env,
         reset=jax.jit(lambda seed: env.reset(jax.random.key(seed))),
         step=jax.jit(env.step),
         move_goal=jax.jit(move_goal) if hasattr(env, "with_goal") and has_position else None,
         move_object=jax.jit(env.with_object) if hasattr(env, "with_object") and has_object else None,
+        turn_goal=jax.jit(turn_goal) if hasattr(env, "with_goal") and turned is not None else None,
     )
     state = game.reset(np.uint32(0))
     game.step(state, np.zeros(env.action_size, np.float32))
     for move in (game.move_goal, game.move_object):
         if move is not None:
             move(state, np.zeros(3, np.float32))
+    if game.turn_goal is not None:
+        game.turn_goal(state, np.array([1.0, 0.0, 0.0, 0.0], np.float32))
     return game
 
 
@@ -158,16 +167,25 @@ class Player:
         """Moves the goal to a position [3] in m, or as near as allowed, and begins a user's attempt."""
         self._move(self.game.move_goal, "goal", position)
 
+    def turn_goal(self, orientation: np.ndarray) -> None:
+        """Gives the goal's body an orientation [4] (w, x, y, z) of any length but 0; see `move_goal`."""
+        orientation = np.asarray(orientation, np.float32)
+        with np.errstate(all="ignore"):
+            length = np.linalg.norm(orientation.astype(float))
+            self._move(self.game.turn_goal, "goal", orientation / length, (4,))
+
     def move_object(self, position: np.ndarray) -> None:
         """Moves the object to a position [3] in m, or as near as allowed; see `move_goal`."""
         self._move(self.game.move_object, "object", position)
 
-    def _move(self, move: Callable[[Any, Any], Any] | None, dragged: str, position: np.ndarray) -> None:
+    def _move(
+        self, move: Callable[[Any, Any], Any] | None, dragged: str, position: np.ndarray, shape: tuple[int] = (3,)
+    ) -> None:
         position = np.asarray(position, np.float32)
-        if move is None or position.shape != (3,) or not np.all(np.isfinite(position)):
+        if move is None or position.shape != shape or not np.all(np.isfinite(position)):
             raise ValueError(f"the {dragged} cannot be moved to {position}")
         box = bounds(self.game.env, dragged)
-        if box is not None:
+        if box is not None and shape == (3,):
             position = np.clip(position, *np.transpose(box)).astype(np.float32)
         if self._failed:  # only a reset helps
             self.new_episode()
@@ -193,9 +211,16 @@ class Player:
 
     @property
     def distance(self) -> float:
-        """Distance to the goal in m."""
+        """Distance to the goal, in the goal's `unit`."""
         distance = getattr(self.game.env, "goal_distance", context.euclidean)
         return float(distance(self.obs["achieved_goal"], self.obs["desired_goal"]))
+
+    @property
+    def unit(self) -> tuple[float, str]:
+        """Factor and unit in which distances are shown: cm, degrees, or the goal's own number."""
+        return {"m": (100.0, "cm"), "rad": (180.0 / np.pi, "°")}.get(
+            getattr(getattr(self.game.env, "goal", None), "unit", "m"), (1.0, "")
+        )
 
     @property
     def qpos(self) -> np.ndarray:

@@ -117,18 +117,27 @@ class Viewer:
         for body, node in self._nodes.items():
             if body:  # the world does not move
                 node.position, node.wxyz = positions[body], orientations[body]
-        places = {"goal": self.player.obs["desired_goal"][:3], "object": self.player.obs["achieved_goal"][:3]}
+        marks = self.player.marks
         if self._handle is not None and not self._held:
-            self._handle.position = places[self._taken]
+            self._handle.position, self._handle.wxyz = self._place_of(self._taken, marks)
         colour = _REACHED if self.player.success else _rgb(GOAL_RGBA)
-        if self._ball.color != colour:
-            self._ball.color = colour
-        marks = {body: (pos, quat) for body, pos, quat in self.player.marks}
-        self._ball.visible = -1 in marks
-        for body, node in {-1: self._ball, **self._ghosts}.items():
-            if body in marks:
-                node.position, node.wxyz = marks[body]
+        balls = iter(self._balls)
+        for body, *place in marks:
+            mark: Any = next(balls) if body < 0 else self._ghosts.get(body)
+            if mark is not None:  # else a body without visible geoms
+                mark.position, mark.wxyz = place
+            if body < 0 and mark.color != colour:
+                mark.color = colour
         self._panel.update(curves)
+
+    def _place_of(self, dragged: str, marks: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Position [3] and orientation [4] of a dragged part. A goal that is only an orientation is at its ghost."""
+        game, ghosts = self.player.game, [place for body, *place in marks if body >= 0]
+        pos, quat = self.player.obs["achieved_goal" if dragged == "object" else "desired_goal"][:3], np.array([1.0, 0, 0, 0])
+        if dragged == "goal" and game.turn_goal is not None and ghosts:
+            quat = ghosts[0][1]
+            pos = pos if game.move_goal else ghosts[0][0]
+        return pos, quat
 
     def take(self, dragged: str) -> None:
         """Attaches the handle to one of `DRAGGED`."""
@@ -138,44 +147,61 @@ class Viewer:
     def _draw_scene(self) -> None:
         """Redraws the environment."""
         scene, env = self._server.scene, self.player.game.env
-        for name in ("/bodies", "/ghosts", "/handle", "/ball"):
+        for name in ("/bodies", "/ghosts", "/handle", "/balls"):
             with contextlib.suppress(KeyError, ValueError):
                 scene.remove_by_name(name)
         self._held = False
         self._poses, self._nodes = Poses(env.model), add(scene, env.model)
-        self._ghosts = add(scene, env.model, {body for body, _, _ in self.player.marks}, GOAL_RGBA)
-        moves = {"goal": self.player.game.move_goal, "object": self.player.game.move_object}
-        self._handle = None if moves.get(self._taken) is None else self._add_handle(self._taken)
+        bodies = [body for body, _, _ in self.player.marks]
+        self._ghosts = add(scene, env.model, bodies, GOAL_RGBA)
+        self._handle = self._add_handle(self._taken) if any(self._moves(self._taken)) else None
         look: dict[str, Any] = {"opacity": GOAL_RGBA[3], "cast_shadow": False, "receive_shadow": False}
-        self._ball = scene.add_icosphere("/ball", GOAL_RADIUS, _rgb(GOAL_RGBA), subdivisions=3, **look)
+        self._balls = [
+            scene.add_icosphere(f"/balls/{i}", GOAL_RADIUS, _rgb(GOAL_RGBA), subdivisions=3, **look)
+            for i in range(sum(body < 0 for body in bodies))
+        ]
         self._aim(env.model)
         self.show(True)
 
+    def _moves(self, dragged: str) -> tuple[bool, bool]:
+        """Whether a part can be moved, and whether it can be turned."""
+        game = self.player.game
+        moves = {"goal": (game.move_goal, game.turn_goal), "object": (game.move_object, None)}
+        return tuple(move is not None for move in moves.get(dragged, (None, None)))  # type: ignore[return-value]
+
     def _add_handle(self, dragged: str) -> Any:
+        moves, turns = self._moves(dragged)
         limits = bounds(self.player.game.env, dragged) or ((0.0, 1.0),) * 3
         handle = self._server.scene.add_transform_controls(
             "/handle",
             scale=0.14,
             line_width=4.0,
-            disable_rotations=True,
+            disable_axes=not moves,
+            disable_sliders=not moves,
+            disable_rotations=not turns,
             # Viser's limits apply to the dragged distance, so the player limits the position instead.
-            active_axes=tuple(high - low > 1e-9 for low, high in limits),
+            active_axes=tuple(turns or high - low > 1e-9 for low, high in limits),
         )
 
         async def on_update(event: Any) -> None:  # a coroutine, because threads could change the order
-            position, phase = np.array(event.target.position), event.phase
-            self._commands.put("move" if phase == "update" else "hold", lambda: self._drag(dragged, position, phase))
+            place, phase = (np.array(event.target.position), np.array(event.target.wxyz)), event.phase
+            self._commands.put("move" if phase == "update" else "hold", lambda: self._drag(dragged, place, phase))
 
         handle.on_update(on_update)
         return handle
 
-    def _drag(self, dragged: str, position: np.ndarray, phase: str) -> None:
-        """Follows the handle. `phase` is start, update or end. Ignored if the handle now belongs to another part."""
+    def _drag(self, dragged: str, place: tuple[np.ndarray, np.ndarray], phase: str) -> None:
+        """Follows the handle to a position and orientation, if it still belongs to the part. `phase` is start, update or end."""
         if self._handle is None or dragged != self._taken:
             return
         self._held = phase != "end"
-        if phase == "update":
-            {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](position)
+        if phase != "update":
+            return
+        (moves, turns), before = self._moves(dragged), self._place_of(dragged, self.player.marks)
+        if turns and abs(before[1] @ place[1]) < 1.0 - 1e-9:  # of unit quaternions
+            self.player.turn_goal(place[1])
+        if moves and not np.allclose(before[0], place[0], rtol=0.0, atol=1e-6):
+            {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](place[0])
 
     def _aim(self, model: Any) -> None:
         """Moves the cameras to the model's camera "front", if it exists."""
