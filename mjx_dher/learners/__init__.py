@@ -33,7 +33,7 @@ class Learner(Protocol):
     A learner defines `init`, `act`, `explore` and `update`. Subclasses inherit the other methods; any other object must define
     them too. Optional members:
 
-    - `value(state, obs, action [..., A], hparams) -> [...]`: estimated return of taking an action and then following the policy.
+    - `value(state, obs, action [..., A], hparams) -> [...]`: estimated return of an action, followed by the policy.
       Needed by priorities, metrics and goal generators that use the learner's values.
     - `axis_name`: a dataclass field, None by default. If several devices share a run, it is the name of their mapped axis.
       `update` then averages its gradients over the axis (`jax.lax.pmean`), and `update_normalizers` its moments.

@@ -191,7 +191,7 @@ class Viewer:
         return handle
 
     def _drag(self, dragged: str, place: tuple[np.ndarray, np.ndarray], phase: str) -> None:
-        """Follows the handle to a position and orientation, if it still belongs to the part. `phase` is start, update or end."""
+        """Follows the handle to a pose, if it still belongs to the part. `phase` is start, update or end."""
         if self._handle is None or dragged != self._taken:
             return
         self._held = phase != "end"
