@@ -1,8 +1,8 @@
 """Writes the tables of bench/ablation.py and bench/bakeoff.py into their pages: `python docs/make_comparison_tables.py`.
 
-They are made from docs/ablation_runs.csv and docs/bakeoff_runs.csv, which the two write into the folder of their sweeps, and so
-are the forest plots. docs/bakeoff_repeat_runs.csv and docs/bakeoff_third_runs.csv are the bakeoff_runs.csv of the second sweep
-and of the third. An arm is shown when all of its seeds have been run.
+Tables and forest plots are made from docs/ablation_runs.csv and docs/bakeoff_runs.csv, which the two scripts write into their
+sweeps' folders. docs/bakeoff_repeat_runs.csv and docs/bakeoff_third_runs.csv are the bakeoff_runs.csv of the second and the
+third sweep. An arm is shown when all of its seeds have been run.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Page(NamedTuple):
 
 
 def repeat(*names: str) -> Experiment:
-    """Returns the bake-off of those arms alone, as a family of its own: what --arms names, and the baseline."""
+    """The bake-off of those arms (as in --arms) and the baseline, as a separate family."""
     arms = tuple(arm for arm in BAKEOFF.arms if arm.name in (BAKEOFF.baseline, *names))
     return dataclasses.replace(BAKEOFF, arms=arms, learners=("best",), tasks=("pick_and_place", "slide"))
 
@@ -57,7 +57,7 @@ PAGES = (
 
 
 def read(page: Page) -> list[Row]:
-    """Returns what a file of runs says of each arm whose seeds are all there, learner by learner and task by task."""
+    """Rows of a file's arms whose seeds are complete, learner by learner and task by task."""
     experiment, runs, found = page.experiment, load(page.data), []
     tests = (len(experiment.arms) - 1) * (len(experiment.tasks) if page.over_tasks else 1)
     for learner in experiment.learners:
@@ -70,7 +70,7 @@ def read(page: Page) -> list[Row]:
 
 
 def cells(row: Row) -> list[str]:
-    """Returns the cells of an arm, from its name on."""
+    """The cells of an arm, from its name on."""
     start = [f"`{row.arm}`", f"{row.mean_success:.3f}"]
     if math.isnan(row.difference):
         return [*start, "", "", "", "", f"{row.final:.3f}", "", ""]
@@ -81,7 +81,7 @@ def cells(row: Row) -> list[str]:
 
 
 def whole_table(page: Page, rows: Sequence[Row]) -> str:
-    """Returns the table of all arms; learner and task are named in the first row that has them."""
+    """Table of all arms. Learner and task are named in their first row."""
     several, lines, before = len(page.experiment.learners) > 1, [], None
     for row in rows:
         family = (row.learner, row.task)
@@ -92,7 +92,7 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
 
 
 def claims(rows: Sequence[Row], experiment: Experiment) -> str:
-    """Returns the table of what is claimed of each arm, and the differences that were found; bold where they are shown."""
+    """Table of each arm's claims and the measured differences, significant ones in bold."""
     lines = [[f"`{arm.name}`", arm.claim, arm.source, _found(arm.name, rows)] for arm in experiment.arms[1:]]
     return table("arm | claimed | source | found with our variant", lines)
 
@@ -107,13 +107,13 @@ def _found(arm: str, rows: Sequence[Row]) -> str:
 
 
 def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
-    """Returns the tables of a page by name."""
+    """Tables of a page by name."""
     found = {page.name: whole_table(page, rows)}
     return {**found, "claims": claims(rows, page.experiment)} if page.claims else found
 
 
 def with_table(page: Page, rows: Sequence[Row]) -> str:
-    """Returns the text of the page with the tables as they are now."""
+    """The page's text with the current tables."""
     return with_tables(page.page.read_text(), SCRIPT, blocks(page, rows))
 
 

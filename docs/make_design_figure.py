@@ -8,13 +8,13 @@ from xml.sax.saxutils import escape
 WIDTH, HEIGHT = 1240, 904
 SANS = "Helvetica Neue, Helvetica, Arial, DejaVu Sans, sans-serif"
 MONO = "SFMono-Regular, Menlo, Consolas, DejaVu Sans Mono, monospace"
-# Stroke and fill of what is on the host, on the device, handed in, and on disk.
+# Stroke and fill by place: host, device, user's values, disk.
 HOST, DEVICE, VALUE, FILE = ("#5b6470", "#ffffff"), ("#2563a8", "#ffffff"), ("#b4530a", "#fff6ea"), ("#3f7d4a", "#f0f8f0")
 INK, SOFT = "#1c232b", "#4d5763"
 
 
 def text(x: float, y: float, words: str, size: int = 14, **style: str) -> str:
-    """Returns a line of text that is centred at `x`; `style` has anchor, color, font, weight and turn (degrees)."""
+    """Line of text centred at `x`. `style` has anchor, color, font, weight and turn (degrees)."""
     turn = f' transform="rotate({style["turn"]} {x} {y})"' if "turn" in style else ""
     return (
         f'<text x="{x}" y="{y}" font-size="{size}" font-family="{style.get("font", SANS)}"'
@@ -24,7 +24,7 @@ def text(x: float, y: float, words: str, size: int = 14, **style: str) -> str:
 
 
 def rectangle(x: float, y: float, width: float, height: float, stroke: str, fill: str, dash: str = "none") -> str:
-    """Returns a rectangle with round corners; `dash` is that of its line."""
+    """Rectangle with round corners. `dash` is its line style."""
     place = f'x="{x}" y="{y}" width="{width}" height="{height}" rx="8"'
     return f'<rect {place} fill="{fill}" stroke="{stroke}" stroke-width="1.5" stroke-dasharray="{dash}"/>'
 
@@ -32,7 +32,7 @@ def rectangle(x: float, y: float, width: float, height: float, stroke: str, fill
 def box(
     x: float, y: float, width: float, height: float, kind: tuple[str, str], title: str, *lines: str, font: str = SANS
 ) -> str:
-    """Returns a rectangle with a title and lines below it, centred as one block."""
+    """Rectangle with a title and lines below it, centred as one block."""
     top = y + height / 2 - 9.5 * len(lines) + 5
     parts = [rectangle(x, y, width, height, *kind)]
     parts.append(text(x + width / 2, top, title, 15, weight="bold", color=kind[0], font=font))
@@ -41,13 +41,13 @@ def box(
 
 
 def arrow(*points: tuple[float, float], color: str = SOFT) -> str:
-    """Returns a line through `points` with a head at its end."""
+    """Line through `points` with a head at its end."""
     path = " L ".join(f"{x} {y}" for x, y in points)
     return f'<path d="M {path}" fill="none" stroke="{color}" stroke-width="1.8" marker-end="url(#head-{color[1:]})"/>'
 
 
 def heads(*colors: str) -> str:
-    """Returns the definitions of arrow heads."""
+    """Definitions of arrow heads."""
     return "\n".join(
         f'<marker id="head-{color[1:]}" viewBox="0 0 10 10" refX="9.5" refY="5" markerWidth="7" markerHeight="7"'
         f' orient="auto"><path d="M 0 0 L 10 5 L 0 10 z" fill="{color}"/></marker>'
@@ -68,7 +68,7 @@ def commands() -> list[str]:
 
 
 def values() -> list[str]:
-    """Draws the values that a user hands in, on the left, and `make_train`, which takes them."""
+    """Draws the user's values on the left, and `make_train`, which takes them."""
     parts = [text(115, 200, "what a user hands in", 15, weight="bold", color=VALUE[0])]
     for number, (title, line) in enumerate(
         (
@@ -132,7 +132,7 @@ def device() -> list[str]:
 
 
 def host_loop() -> list[str]:
-    """Draws what the host does after each epoch, on the right."""
+    """Draws the host's work after each epoch, on the right."""
     parts = [text(1102, 196, "after every epoch", 15, weight="bold", color=HOST[0])]
     rows = (
         (212, HOST, "should_stop()", "ends it, with a checkpoint"),
@@ -150,7 +150,7 @@ def host_loop() -> list[str]:
 
 
 def folders() -> list[str]:
-    """Draws what is left on disk and what reads it, across the bottom."""
+    """Draws the files on disk and their readers, across the bottom."""
     parts = [
         box(250, 800, 300, 72, FILE, "run folder, one each", "config.json, metrics.csv,", "policy.npz, result.json"),
         box(30, 800, 180, 72, HOST, "load_policy", "and eval, render,", "transfer, export"),
@@ -168,7 +168,7 @@ def folders() -> list[str]:
 
 
 def make() -> str:
-    """Returns the picture as SVG."""
+    """The picture as SVG."""
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" role="img">',
         "<title>mjx-dher: the compiled training loop on the device, and the host around it</title>",

@@ -19,23 +19,23 @@ STYLES = {
     "closest": ("#000000", ":"),
 }
 SAMPLERS = {"push": tuple(STYLES), "pick_and_place": ("future", "weighted"), "slide": ("future", "weighted")}
-# Task, its file, environment steps an epoch, and samplers.
+# Task, its file, environment steps per epoch, and samplers.
 PANELS = tuple((NAMES[task], task, STEPS[task], samplers) for task, samplers in SAMPLERS.items())
 
 
 @functools.cache
 def today() -> dict[str, Sweeps]:
-    """Returns the curves of the paper's experiment by task."""
+    """Curves of the paper's experiment by task."""
     return paper_set.current(paper_set.load_set(paper_set.FOLDER))
 
 
 def curves(task: str, sampler: str) -> np.ndarray:
-    """Returns the success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper/TASK_curves.csv."""
+    """Success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper/TASK_curves.csv."""
     return today()[task]["samplers", sampler].success
 
 
 def make() -> Any:
-    """Returns the figure."""
+    """The figure."""
     import matplotlib
 
     matplotlib.use("Agg")

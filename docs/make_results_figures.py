@@ -1,7 +1,7 @@
 """Writes tables and forest plots of the paper's experiment from the committed curves: `python docs/make_results_figures.py`.
 
-A table stands in the page between `<!-- NAME: docs/make_results_figures.py -->` and `<!-- end of NAME -->`. The curves are
-those of bench/paper.py, docs/paper/TASK_curves.csv, and those of 2026-11-22, docs/paper_TASK_curves.csv.
+A table's place in the page is between `<!-- NAME: docs/make_results_figures.py -->` and `<!-- end of NAME -->`. The curves are
+from bench/paper.py (docs/paper/TASK_curves.csv), and from 2026-11-22 (docs/paper_TASK_curves.csv).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ OWN_CYCLES, LONG_CYCLES = "50 an epoch", "1 an epoch"
 
 
 def verdicts(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of the paper's claims, with its own cycles or, if these have not been run, with longer ones."""
+    """Table of the paper's claims, with the paper's cycles or, if these have not been run, with longer ones."""
     push, pick = the_set["push"], the_set["pick_and_place"]
     found = paper_set.compared(the_set)
     claim = {result.comparison.task: result for result in found["the paper's own cycles"]}
@@ -106,7 +106,7 @@ def lottery(the_set: Mapping[str, Sweeps]) -> str:
 def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
     """Cells of a claim that success is larger, or smaller if `sign` is -1.
 
-    `p` is corrected over the claim's family, None where the claim is in none.
+    `p` is corrected over the claim's family; None for a claim without a family.
     """
     low, high = sorted((sign * d.low, sign * d.high))
     verdict = "**yes**" if low > 0 else "**no**, the opposite" if high < 0 else "not shown"
@@ -286,7 +286,7 @@ OF_BEFORE: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"kernels": kernel
 
 
 def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
-    """All tables by name, from the curves of the set and the curves of 2026-11-22."""
+    """All tables by name, from the curves of the set and of 2026-11-22."""
     today = paper_set.current(the_set)
     found = {name: make(today) for name, make in OF_TODAY.items()} | {name: make(before) for name, make in OF_BEFORE.items()}
     found |= {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "own_samplers": own_samplers(the_set)}
@@ -295,7 +295,7 @@ def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[
 
 
 def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
-    """The sweeps with `weighted` and `future` by task: with the paper's own cycles, the set's longer ones, and those before."""
+    """Sweeps with `weighted` and `future` by task: with the paper's cycles, the set's longer ones, and earlier ones."""
     today = paper_set.current(the_set)
     found = {}
     for task, sweeps in before.items():

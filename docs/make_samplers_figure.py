@@ -1,6 +1,6 @@
 """Writes the table of readings in docs/samplers.md and its picture: `python docs/make_samplers_figure.py`.
 
-The weights are those of the library's own functions, for 25 goals that come after a step, as distances in metres.
+The library's functions compute the weights of 25 goals after a step, given as distances in metres.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SITUATIONS = {
     "at the goal": 0.02 + 0.01 * np.cos(2 * np.pi * _STEPS / CANDIDATES),
     "solved": np.where(_STEPS < 10, 0.15 - 0.0145 * _STEPS, 0.005 + 0.003 * np.cos(2 * np.pi * _STEPS / 15)),
 }
-# What the picture draws, by kernel and normalization; the colours keep apart in print and for the colour-blind.
+# Lines of the picture by kernel and normalization. The colours are distinct in print and for the colour-blind.
 DRAWN = {
     ("mean", "linear"): ("#1b62a5", "-"),
     ("sum", "linear"): ("#8a8f98", "-"),
@@ -39,19 +39,19 @@ DRAWN = {
 
 
 def probabilities(sampler: samplers.Sampler, distances: NDArray) -> NDArray:
-    """Returns the probabilities [n] that a sampler gives goals at `distances` [n] from the desired one, all in the future."""
+    """Probabilities [n] of goals at `distances` [n] from the desired one, all in the future, under a sampler."""
     achieved = jnp.asarray(np.concatenate([distances[:1], distances]), jnp.float32)[:, None]
     log_weights = sampler.log_weights(achieved, jnp.zeros(1), jnp.array(0), HParams())
     return np.asarray(samplers.probabilities(log_weights))[1:]
 
 
 def total_variation(sampler: samplers.Sampler, distances: NDArray) -> float:
-    """Returns half the sum of the differences to `future`: the share of draws that are others than with that."""
+    """Total variation distance to `future`: the share of draws that differ."""
     return 0.5 * float(np.abs(probabilities(sampler, distances) - 1 / len(distances)).sum())
 
 
 def rows() -> list[tuple[str, list[float]]]:
-    """Returns what the table says: a name, and the total variation in each situation."""
+    """Rows of the table: a name, and the total variation in each situation."""
     made = {
         f"`{n}`, `{k}`": samplers.make("weighted", k, normalization=n)
         for n in COMPONENTS["weight_normalization"]
@@ -62,19 +62,19 @@ def rows() -> list[tuple[str, list[float]]]:
 
 
 def table() -> str:
-    """Returns the table as Markdown."""
+    """The table as Markdown."""
     lines = [f"| normalization, kernel | {' | '.join(SITUATIONS)} |", "|---|" + "---|" * len(SITUATIONS)]
     lines += [f"| {name} | {' | '.join(f'{value:.3f}' for value in values)} |" for name, values in rows()]
     return "\n".join(lines)
 
 
 def with_table(page: str) -> str:
-    """Returns the text of the page with the table as it is now."""
+    """The page's text with the current table."""
     return with_tables(page, SCRIPT, {"readings": table()})
 
 
 def draw(path: Path) -> None:
-    """Draws the probability of a goal, as a multiple of that of `future`, over its distance, for three situations."""
+    """Draws the probability of a goal, relative to `future`, over its distance, for three situations."""
     import matplotlib
 
     matplotlib.use("Agg")

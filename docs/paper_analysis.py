@@ -19,7 +19,7 @@ DOCS = Path(__file__).parent
 NAMES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide"}
 THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
 LAST = {"push": 10, "pick_and_place": 10, "slide": 20}  # epochs that count as the long term
-STEPS = {"push": 40_000, "pick_and_place": 80_000, "slide": 40_000}  # of an epoch
+STEPS = {"push": 40_000, "pick_and_place": 80_000, "slide": 40_000}  # per epoch
 START, FIRST, MARGIN = 0.2, 5, 0.02  # success at which a run has begun to learn; first epochs; what counts as no worse
 
 
@@ -44,7 +44,7 @@ class Difference(NamedTuple):
 
 
 def read(path: Path) -> Sweeps:
-    """Returns the curves in a CSV, by sweep and setting; a sweep that was cut short is as long as its shortest run."""
+    """Curves in a CSV, by sweep and setting. A truncated sweep is as long as its shortest run."""
     runs: dict[tuple[str, str], dict[int, list[float]]] = {}
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -62,7 +62,7 @@ def _curves(by_seed: dict[int, list[float]]) -> Curves:
 
 
 def area(curves: Curves, epochs: int | None = None) -> NDArray:
-    """Returns the mean success [S] over the (first) epochs, by trapezoids."""
+    """Mean success [S] over the (first) epochs, by trapezoids."""
     success = curves.success[:, :epochs]
     return stats.area_under_curve(np.arange(success.shape[1]), success)
 
@@ -73,7 +73,7 @@ def reach(curves: Curves, threshold: float) -> NDArray:
 
 
 def difference(a: NDArray, b: NDArray) -> Difference:
-    """Returns the difference a - b of scores [S] that are paired by seed."""
+    """Difference a - b of scores [S] that are paired by seed."""
     each = a - b
     if not np.isfinite(each).all():
         return Difference(each, math.nan, math.nan, math.nan, math.nan)
@@ -106,7 +106,7 @@ def window(sweeps: Sweeps, sweep: str, part: slice) -> Difference:
 
 
 def table(head: str, rows: list[list[str]]) -> str:
-    """Returns a table as Markdown; `head` has its columns' names, apart by |."""
+    """Table as Markdown. `head` has its columns' names, separated by |."""
     columns = [name.strip() for name in head.split("|")]
     if wrong := [row for row in rows if len(row) != len(columns)]:
         raise ValueError(f"a row of {len(columns)} columns has {len(wrong[0])} cells: {wrong[0]}")
@@ -115,10 +115,10 @@ def table(head: str, rows: list[list[str]]) -> str:
 
 
 def with_tables(page: str, script: str, blocks: Mapping[str, str]) -> str:
-    """Returns the page with the tables that a script writes into it as they are now, by name.
+    """The page's text with a script's current tables, by name.
 
     Raises:
-      ValueError: the page has no place for one of them.
+      ValueError: the page has no place for a table.
     """
     for name, text in blocks.items():
         begin, end = f"<!-- {name}: {script} -->\n", f"<!-- end of {name} -->"
@@ -129,17 +129,17 @@ def with_tables(page: str, script: str, blocks: Mapping[str, str]) -> str:
 
 
 def signed(d: Difference, digits: int = 3) -> list[str]:
-    """Returns the cells of a difference: its mean, its interval and p."""
+    """Cells of a difference: its mean, its interval and p."""
     return [f"{d.mean:+.{digits}f}", f"{d.low:+.{digits}f} to {d.high:+.{digits}f}", number(d.p)]
 
 
 def number(p: float) -> str:
-    """Returns p to two digits that count."""
+    """p to two significant digits."""
     return f"{p:.2f}" if p >= 0.095 else f"{p:.2g}"
 
 
 def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats.interquartile_mean) -> str:
-    """Returns the statistic of scores [S] with its bootstrap interval; "never" for an infinite epoch."""
+    """Statistic of scores [S] with its bootstrap interval; "never" for an infinite epoch."""
     values = (statistic(scores), *stats.bootstrap_interval(scores, statistic))
     middle, low, high = (
         f"{value:.{digits}f}" if digits else ("never" if math.isinf(value) else f"{value:g}") for value in values
@@ -148,5 +148,5 @@ def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats
 
 
 def load() -> dict[str, Sweeps]:
-    """Returns the curves of 2026-11-22 by task; `paper_set.load_set` has later ones."""
+    """Curves of 2026-11-22 by task; `paper_set.load_set` loads later ones."""
     return {task: read(DOCS / f"paper_{task}_curves.csv") for task in NAMES}

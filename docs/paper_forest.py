@@ -8,9 +8,9 @@ from pathlib import Path
 from paper_analysis import LAST, MARGIN, NAMES, START, THRESHOLDS, Difference, Sweeps, gain, sooner, window
 from paper_set import Compared
 
-REPEATED = ("samplers", "fast", "hopper", "hopper again")  # those whose runs are whole
+REPEATED = ("samplers", "fast", "hopper", "hopper again")  # sweeps whose runs are complete
 CLAIMED = {("push", START): (2, 3), ("push", 0.9): (5, 5), ("pick_and_place", START): (2, 3), ("pick_and_place", 0.9): (10, 10)}
-SHOWN = (-0.3, 0.18)  # differences that the picture of the set has room for
+SHOWN = (-0.3, 0.18)  # range of differences in the picture of the set
 WORDS = {
     "future, ": "",
     "her_k": "k",

@@ -1,7 +1,7 @@
-"""The comparisons of the set that bench/paper.py runs, stated before it has run, and what ten seeds can show in it.
+"""Comparisons of bench/paper.py's set, stated before it was run, and the effects that ten seeds can show in it.
 
-A family is a question; p is corrected by Holm's method within it, and beside it by Westfall and
-Young's sign flips. The least p of ten pairs is 2/1024, so a family of more than 25 comparisons could show nothing by Holm.
+A family is a question. p is corrected within it by Holm's method, and alternatively by Westfall and Young's sign flips. The
+least p of ten pairs is 2/1024, so a family of more than 25 comparisons could show nothing by Holm.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAIN = {"push": "samplers", "pick_and_place": "pick_and_place", "slide": "slide"
 
 
 class Comparison(NamedTuple):
-    """A setting of a task against another one, each by sweep and setting; the main sweep's `future` unless given."""
+    """A setting of a task against another one, each by sweep and setting. The default is the main sweep's `future`."""
 
     task: str
     sweep: str
@@ -107,9 +107,9 @@ def load_set(folder: Path) -> dict[str, Sweeps]:
 
 
 def current(data: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
-    """Returns of the set the sweeps that have `future` and `weighted`, by task, each as a sweep `samplers`.
+    """Sweeps of the set with `future` and `weighted`, by task, each as a sweep `samplers`.
 
-    `epsilon_closest` is that with the preset's epsilon.
+    `epsilon_closest` has the preset's epsilon.
     """
     names = {f"epsilon_closest, epsilon {HParams().epsilon:g}": "epsilon_closest"}
     return {
@@ -119,7 +119,7 @@ def current(data: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
 
 
 def ks(data: Mapping[str, Sweeps]) -> dict[str, dict[int, Curves]]:
-    """Returns the curves of `future` by task and k over the epochs that all have, of those tasks that have all of them."""
+    """Curves of `future` by task and k over the common epochs, for tasks with all k."""
     found = {}
     for task, sweeps in data.items():
         curves = {k: sweeps.get((f"k_{task}", f"future, her_k {k}")) for k in (1, 2, 8, 16)}
@@ -177,7 +177,7 @@ def _baseline(c: Comparison) -> tuple[str, str]:
 
 
 def _compare(sweeps: Sweeps, c: Comparison) -> tuple[Difference, int]:
-    """Difference of mean success over the epochs that both have, paired by the setting's seeds, and the number of epochs."""
+    """Difference of mean success over the common epochs, paired by the setting's seeds, and the number of epochs."""
     a = sweeps[c.sweep, c.setting]
     b = with_seeds(sweeps[_baseline(c)], a.seeds)
     epochs = min(a.success.shape[1], b.success.shape[1])
@@ -185,7 +185,7 @@ def _compare(sweeps: Sweeps, c: Comparison) -> tuple[Difference, int]:
 
 
 def detectable(spread: float, seeds: int, level: float, power: float = 0.8) -> float:
-    """Returns the least mean difference that a paired t test finds, with its sign, where differences have this spread."""
+    """Least mean difference that a paired t test detects, with its sign, for differences with this spread."""
     from scipy.optimize import brentq
     from scipy.stats import nct, t
 
@@ -201,7 +201,7 @@ SIZES = {1: "one comparison", 3: "the three tasks", 15: "the fifteen readings"}
 
 
 def power(data: Mapping[str, Sweeps]) -> str:
-    """Returns the table of the smallest effects that ten seeds can show, from the spread of the sweeps that there are."""
+    """Table of the smallest effects that ten seeds can show, from the spread of the existing sweeps."""
     rows = []
     for task, sweeps in data.items():
         pairs = [sweep for sweep in ("samplers", "fast", "hopper", "hopper again") if (sweep, "weighted") in sweeps]
@@ -217,6 +217,6 @@ def power(data: Mapping[str, Sweeps]) -> str:
 
 
 def blocks(data: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
-    """Returns the tables of the set, `data`, and of its power, which is computed from the curves before it."""
+    """Tables of the set, `data`, and of its power, which is computed from the earlier curves."""
     found = rows(data)
     return {"set": table(HEAD, found) if found else "Not run yet: there are no curves in docs/paper.", "power": power(before)}

@@ -1,7 +1,7 @@
 """Puts the policy of a run into the package, with a card: `python docs/publish_policy.py RUN --machine "..." --commit ...`.
 
-Copies the run folder to mjx_dher/policy/bundled, under the name of its task, and replaces the policy there. Before that it
-plays the policy here and, where the originals' environment is set up (`train.py transfer --set-up`), in the original task.
+Copies the run folder to mjx_dher/policy/bundled, under the name of its task, and replaces the policy there. First it plays the
+policy here and, if the originals' environment is set up (`train.py transfer --set-up`), in the original task.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TITLES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide", "r
 
 
 def command(run: RunSpec) -> list[str]:
-    """Returns the arguments of train.py that describe a run: the preset that needs the fewest others, and those."""
+    """Arguments of train.py for a run: the preset that needs the fewest others, and those."""
     return min((_arguments(name, run) for name in presets.PRESETS), key=len)
 
 
@@ -58,7 +58,7 @@ def _text(value: Any) -> str:
 
 
 def card(folder: Path) -> str:
-    """Returns the card of the policy in `folder`, made of what is there: config.json, result.json and card.json."""
+    """Card of the policy in `folder`, from its config.json, result.json and card.json."""
     content, run = run_folder.read_run(folder)
     result, facts = results.read_result(folder), bundled.facts(folder)
     versions = content["versions"]
@@ -75,7 +75,7 @@ def card(folder: Path) -> str:
         "versions": ", ".join(f"{name} {versions[name]}" for name in ("jax", "mujoco", "numpy", "python")),
         "published": facts["date"],
     }
-    settings = {**content["config"], **content["hparams"]}  # those that there were when it was trained
+    settings = {**content["config"], **content["hparams"]}  # the fields at the time of its training
     numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, list) else _text(x)}" for name, x in settings.items())
     return "\n".join(
         (
@@ -122,7 +122,7 @@ def check(folder: Path, run: RunSpec) -> None:
 
 
 def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) -> dict[str, Any]:
-    """Plays the policy here, on native, and in the original where `python` has it; returns both summaries."""
+    """Plays the policy here, on native, and in the original if `python` has it. Returns both summaries."""
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, load_plain
     from mjx_dher.system.caches import keep_compiled_programs
@@ -143,7 +143,7 @@ def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) 
 
 
 def publish(folder: Path, target: Path, facts: dict[str, Any], anyway: bool) -> None:
-    """Writes a run folder, with its card, in place of what is in `target`.
+    """Writes a run folder, with its card, in place of `target`.
 
     Raises:
       ValueError: the policy there is better, unless `anyway`, or all policies together are too large.
@@ -172,13 +172,13 @@ def main(argv: Sequence[str]) -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?")
-    parser.add_argument("--cards", action="store_true", help="write the cards of all policies of the package anew, and end")
-    parser.add_argument("--machine", help='that it was trained on, as a reader is told: "2 cores of ..."')
-    parser.add_argument("--commit", help="that it was trained with")
+    parser.add_argument("--cards", action="store_true", help="only rewrite the cards of all bundled policies")
+    parser.add_argument("--machine", help='machine of the training, for the card: "2 cores of ..."')
+    parser.add_argument("--commit", help="commit of the training")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--python", type=Path, default=transfer.interpreter(transfer.default_environment()))
-    parser.add_argument("--anyway", action="store_true", help="also where the policy that is there is better")
+    parser.add_argument("--anyway", action="store_true", help="replace a better policy, too")
     args = parser.parse_args(argv)
     if args.cards:
         for name in bundled.names():

@@ -1,6 +1,6 @@
 """The arm tasks of JaxGCRL: reach, push, grasp and pick with a Franka Panda whose actions are joint angles.
 
-Numbers are those of JaxGCRL 0.2.8 (https://github.com/MichalBortkiewicz/JaxGCRL, jaxgcrl/envs/manipulation), as Brax 0.14.2
+Numbers are from JaxGCRL 0.2.8 (https://github.com/MichalBortkiewicz/JaxGCRL, jaxgcrl/envs/manipulation), as Brax 0.14.2
 compiles its models. Brax joins bodies without a joint to their parents. The arm thereby loses its defaults: its joints have
 neither damping nor armature, and the hand has no mass. JaxGCRL simulates a free body that shows the goal; here it is drawn.
 """
@@ -98,9 +98,9 @@ def mjcf(areas: dict[str, tuple[float, float, float]], cube: tuple[float, float]
     """MJCF of a task.
 
     Args:
-      areas: x and y of the middle and half a side, m, by colour.
-      cube: where the cube starts, m; None for an arm without a gripper and a cube.
-      bins: whether the areas have walls, whatever their size.
+      areas: x and y of the centre and half a side in m, by colour.
+      cube: initial position of the cube in m, or None for an arm without gripper and cube.
+      bins: whether the areas have walls, which do not scale with their size.
     """
     hand = '<geom name="hand" type="capsule" size="0.04 0.06" pos="0 0 0.142" quat="{0} {0} -{1} -{1}"/>'
     hand = hand.format(0.653281535, 0.270597922)
@@ -176,10 +176,10 @@ class OpenOrClosed(Control):
 
 
 class Gripped(Goal):
-    """Fingertips on both sides of the cube, from its middle, m, and their distance, m: [7].
+    """Fingertips on both sides of the cube, relative to its centre, and their distance: [7] in m.
 
-    It is reached if the middle of the fingertips is near the cube and their distance is right. The distance of goals is the
-    larger of both errors, in units of what is allowed.
+    It is reached if the midpoint of the fingertips is near the cube and their distance is right. The distance of goals is the
+    larger of both errors, in units of the `allowed` ones.
     """
 
     size = 7
@@ -289,7 +289,7 @@ class ArmBinpickEasy(ArmPushEasy):
 class ArmGrasp(ArmPushEasy):
     """Closes the fingers around the cube.
 
-    There, the goal is the fingertips' positions and follows the cube. Here it is from the cube's middle, and constant.
+    In JaxGCRL the goal is the fingertips' positions and follows the cube. Here it is relative to the cube, and constant.
     """
 
     name = "arm_grasp"

@@ -1,4 +1,4 @@
-"""Steps any MuJoCo model by MuJoCo C on all cores, from inside a compiled JAX program. Here a figure falls and kicks.
+"""Steps any MuJoCo model by MuJoCo C on all cores, inside a compiled JAX program. Here a figure falls and kicks.
 
 python docs/examples/any_model.py
 """
@@ -42,7 +42,7 @@ def main(argv=None):
     """Prints the heights of many figures after random kicks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--num-envs", type=int, default=256)
-    parser.add_argument("--steps", type=int, default=100, help="of five timesteps each")
+    parser.add_argument("--steps", type=int, default=100, help="steps of five timesteps each")
     args = parser.parse_args(argv)
     model = mujoco.MjModel.from_xml_string(FIGURE)
     sim = Simulator(model, derived=["subtree_com"], substeps=5)
@@ -59,7 +59,7 @@ def main(argv=None):
 
         data = jax.vmap(start)(jax.random.split(key, args.num_envs))
         data, _ = jax.lax.scan(step, data, jax.random.split(key, args.steps))
-        return jax.vmap(sim.forward)(data)  # makes the centre of mass that of the last state
+        return jax.vmap(sim.forward)(data)  # updates the centre of mass to the last state
 
     data = play(jax.random.key(0))
     height = data.derived["subtree_com"][:, 1, 2]  # [num_envs] m, of the torso and the bodies below it

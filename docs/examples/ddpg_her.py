@@ -13,7 +13,7 @@ Papers that the comments name:
   Plappert   Plappert et al. 2018, arXiv 1802.09464: the tasks, and the settings that most code for HER follows
   distances  "Distance Based Replay Sampling in Hindsight Experience Replay": closest, epsilon_closest, weighted
 
-Letters in the shape comments: E episodes in the buffer, T steps of an episode, N environments side by side, B transitions of a
+Letters in the shape comments: E episodes in the buffer, T steps of an episode, N parallel environments, B transitions of a
 batch, D numbers of an observation, G of a goal, A of an action.
 """
 
@@ -80,7 +80,7 @@ class Networks(NamedTuple):
 
 
 class Static(NamedTuple):
-    """Everything that stays as it is during a run."""
+    """Everything that is constant during a run."""
 
     env: Any
     settings: Settings
@@ -142,7 +142,7 @@ def add_episodes(buffer, new):
 # --- Goal samplers ------------------------------------------------------------------------------------------------------------
 # A sampler gives each of the T+1 achieved goals of one episode a weight; `draw_batch` chooses in proportion to it.
 #     sampler(achieved [T+1, G], desired [G], step [], epsilon) -> weights [T+1]
-# The transition leads from `step` to `step + 1`. Its future is what comes after `step`: what its action could still cause.
+# The transition leads from `step` to `step + 1`. Its future is all goals after `step`, which its action could still affect.
 
 
 def future(achieved, desired, step, epsilon):
@@ -194,14 +194,14 @@ class Batch(NamedTuple):
 
 
 def draw_batch(static, episodes, count, key, batch_size):
-    """Draws transitions from `episodes`, of which `count` were written, and relabels most of them (HER, algorithm 1)."""
+    """Draws transitions from the `count` written `episodes`, and relabels most of them (HER, algorithm 1)."""
     settings, rows = static.settings, jnp.arange(batch_size)
     row_key, step_key, goal_key, coin_key = jax.random.split(key, 4)
     row = jax.random.randint(row_key, (batch_size,), 0, jnp.minimum(count, len(episodes.action)))
     step = jax.random.randint(step_key, (batch_size,), 0, episodes.action.shape[1])
     achieved, desired = episodes.achieved_goal[row], episodes.desired_goal[row]  # [B, T+1, G], [B, G]
 
-    # To choose in proportion to the weights, invert their cumulative sum: one random number a transition.
+    # To choose in proportion to the weights, invert their cumulative sum: one random number per transition.
     weights = jax.vmap(SAMPLERS[settings.sampler], in_axes=(0, 0, 0, None))(achieved, desired, step, settings.epsilon)
     cumulative = jnp.cumsum(weights, axis=-1)
     threshold = jax.random.uniform(goal_key, (batch_size, 1)) * cumulative[:, -1:]
@@ -221,7 +221,7 @@ class Learner(NamedTuple):
     """Everything that learning changes."""
 
     params: Networks
-    target: Networks  # slow copies of the parameters, which make the values to learn towards (DDPG, section 3)
+    target: Networks  # slow copies of the parameters, which compute the target values (DDPG, section 3)
     opt_state: Any
     observation_norm: Moments
     goal_norm: Moments
@@ -266,7 +266,7 @@ def update(static, learner, batch):
 
 # --- Playing ------------------------------------------------------------------------------------------------------------------
 def play(static, learner, key, num_envs, explore):
-    """Plays N whole episodes side by side; returns them, and their success [N] at the last step."""
+    """Plays N whole episodes in parallel. Returns them, and their success [N] at the last step."""
     env, settings = static.env, static.settings
     reset_key, noise_key = jax.random.split(key)
 
@@ -274,7 +274,7 @@ def play(static, learner, key, num_envs, explore):
         observation = normalize(learner.observation_norm, state.obs["observation"])
         goal = normalize(learner.goal_norm, state.obs["desired_goal"])
         action = jnp.tanh(static.nets.actor.apply(learner.params.actor, observation, goal))
-        if explore:  # Gaussian noise and, now and then, a random action (Plappert, appendix B)
+        if explore:  # Gaussian noise and sometimes a random action (Plappert, appendix B)
             coin_key, random_key, noise_key = jax.random.split(key, 3)
             noisy = jnp.clip(action + settings.noise_std * jax.random.normal(noise_key, action.shape), -1, 1)
             uniform = jax.random.uniform(random_key, action.shape, minval=-1, maxval=1)
@@ -297,7 +297,7 @@ def cycle(static, learner, buffer, key):
     play_key, norm_key, learn_key = jax.random.split(key, 3)
     episodes, _ = play(static, learner, play_key, settings.num_envs, explore=True)
     buffer = add_episodes(buffer, episodes)
-    # The networks will see relabelled goals, so the goals' statistics are those of relabelled goals.
+    # The networks see relabelled goals, so the goals' statistics use relabelled goals.
     goals = draw_batch(static, episodes, settings.num_envs, norm_key, settings.num_envs * env.episode_length).goal
     observation_norm = add_moments(learner.observation_norm, episodes.observation)
     learner = learner._replace(observation_norm=observation_norm, goal_norm=add_moments(learner.goal_norm, goals))
@@ -309,7 +309,7 @@ def cycle(static, learner, buffer, key):
 
 
 def train(settings, report=print):
-    """Trains; returns (environment steps, success rate) of each evaluation."""
+    """Trains. Returns (environment steps, success rate) of each evaluation."""
     env = envs.make(settings.env)
     nets = Networks(MLP(settings.hidden_size, env.action_size), MLP(settings.hidden_size, 1))
     static = Static(env, settings, nets, optax.adam(settings.learning_rate))

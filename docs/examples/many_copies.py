@@ -1,4 +1,4 @@
-"""Thousands of copies of an environment, stepped by one compiled program: `vmap` is the batch, `scan` the time."""
+"""Steps thousands of copies of an environment in one compiled program: `vmap` over the batch, `scan` over time."""
 
 import argparse
 import time
@@ -9,7 +9,7 @@ from mjx_dher import envs
 
 
 def main(argv=None):
-    """Prints how many steps there were a second, and what the last ones gave."""
+    """Prints the steps per second, and the last rewards."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="push", help="a name, or module:attribute")
     parser.add_argument("--engine", default="auto", help="native, jax, warp or auto")

@@ -1,4 +1,4 @@
-"""Many seeds trained at once: `make_train` gives pure functions, and `vmap` makes every seed a lane of one program."""
+"""Trains many seeds at once: `make_train` returns pure functions, and `vmap` makes every seed a lane of one program."""
 
 import argparse
 
@@ -28,7 +28,7 @@ def main(argv=None):
     )
     program = make_train(PointMass(), config, sampler=samplers.make("weighted"))
     keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
-    hparams = jax.tree.map(lambda x: jnp.full(args.seeds, x), HParams(gamma=0.9, polyak=0.98))  # or a value a lane
+    hparams = jax.tree.map(lambda x: jnp.full(args.seeds, x), HParams(gamma=0.9, polyak=0.98))  # or one value per lane
     states = jax.jit(jax.vmap(program.init))(keys, hparams)
     epoch = jax.jit(jax.vmap(program.epoch), donate_argnums=0)
     for number in range(1, args.epochs + 1):

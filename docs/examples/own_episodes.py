@@ -1,4 +1,4 @@
-"""Episodes of a loop of one's own, put into the replay ring and relabelled.
+"""Adds episodes of a custom loop to the replay ring and relabels them.
 
 python docs/examples/own_episodes.py
 """
@@ -17,7 +17,7 @@ env = PointMass()
 
 
 def play(key: jax.Array) -> Episode:
-    """Plays 16 episodes of random actions in a scan of its own."""
+    """Plays 16 episodes of random actions in a custom scan."""
     first = jax.vmap(env.reset)(jax.random.split(key, 16))
     actions = jax.random.uniform(key, (env.episode_length, 16, env.action_size), minval=-1, maxval=1)
     last, obs = jax.lax.scan(lambda state, action: (jax.vmap(env.step)(state, action), state.obs), first, actions)

@@ -1,7 +1,7 @@
-"""Replay and weighted relabelling in a loop of one's own.
+"""Replay and weighted relabelling in a custom training loop.
 
-The learner is not DDPG but a regression (goal-conditioned supervised learning, Ghosh et al. 2021): which action was taken
-where a goal was reached later on? Rewards play no part; `relabel.relabel` would give them with the goals.
+The learner is not DDPG but a regression (goal-conditioned supervised learning, Ghosh et al. 2021): which action was taken in
+episodes that later reached a goal? Rewards are not used; `relabel.relabel` would return them with the goals.
 """
 
 import argparse
@@ -20,7 +20,7 @@ def main(argv=None):
     """Prints the success rate of each round's episodes, which are played with noise."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--updates", type=int, default=100, help="a round, after 64 episodes; of 256 transitions each")
+    parser.add_argument("--updates", type=int, default=100, help="updates per round of 64 episodes, of 256 transitions each")
     args = parser.parse_args(argv)
     env, actor, adam, weighted = PointMass(), Actor(2, (64, 64)), optax.adam(1e-3), samplers.make("weighted")
     ring = replay.init(episode_template(env), num_episodes=1000)

@@ -1,4 +1,4 @@
-"""Reach, push and pick with an arm of seven joints and a gripper, which has the published sizes of a Franka Panda.
+"""Reach, push and pick with an arm of seven joints and a gripper, with the published sizes of a Franka Panda.
 
 python train.py --env docs.examples.seven_joints:Reach
 """

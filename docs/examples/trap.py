@@ -3,8 +3,8 @@
     python docs/examples/trap.py
     PYTHONPATH=docs/examples python train.py --env trap:Trap --sampler future
 
-If each step before the goal cost -1, falling would pay, because no cost follows it. Hence rewards are 0 and 1, or lie between 0
-and 5 with `dense=True`. The `EnvSpec` declares this range, and that episodes can end.
+With a reward of -1 for each step before the goal, falling would be rewarded, because no cost follows it. Hence rewards are 0
+and 1, or lie between 0 and 5 with `dense=True`. The `EnvSpec` declares this range, and that episodes can end.
 """
 
 import argparse
@@ -18,18 +18,18 @@ from mjx_dher.rollout import rollout
 from mjx_dher.types import EnvSpec, GoalObs
 
 STEP = 0.1  # distance that an action of 1 moves the point, along each axis
-REACH = 0.1  # distance to the goal that counts as there
+REACH = 0.1  # distance at which the goal is reached
 TRAP = 0.15  # radius of the trap, around 0
 
 
 @struct.dataclass
 class TrapState:
-    """Everything that an episode in progress is made of."""
+    """State of an episode."""
 
     obs: GoalObs  # observation [2], achieved_goal [2], desired_goal [2]
     reward: jax.Array  # []
     success: jax.Array  # [] 1.0 if the goal is reached, else 0.0
-    terminal: jax.Array  # [] whether the point has fallen: no goal can be reached any more, so no future follows
+    terminal: jax.Array  # [] whether the point has fallen: no goal can be reached, so no future follows
 
 
 class Trap:

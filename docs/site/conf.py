@@ -1,7 +1,7 @@
-"""Settings of Sphinx for the site: `.ci/run --docs` builds it. Its source is the repository, so that links are those of GitHub.
+"""Settings of Sphinx for the site, which `.ci/run --docs` builds. Its source is the repository, so links work as on GitHub.
 
-Pages are Markdown that reads as well without Sphinx. Three things are made of it here: the table of contents, which is that of
-docs/index.md; the API pages, on which the line of a module becomes its docstrings; and docstrings, which are Markdown, too.
+Pages are Markdown that is readable without Sphinx. This file builds the table of contents from docs/index.md, inserts
+docstrings in place of the API pages' module lines, and converts docstrings from Markdown.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ html_extra_path = ["index.html"]  # the front page's address: it leads to docs/i
 html_copy_source = False
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # a test runs the notebook
-default_role = "py:obj"  # what is in backticks in a docstring
+default_role = "py:obj"  # for text in backticks in a docstring
 autodoc_default_options = {
     "members": True,
     "undoc-members": True,
@@ -62,7 +62,7 @@ AUTOMODULE = "## `{0}`\n\n```{{eval-rst}}\n.. automodule:: {0}\n```\n"
 
 
 def expand(app: Any, docname: str, source: list[str]) -> None:
-    """Makes the table of contents of the index's links, and docstrings of the API pages' lists."""
+    """Builds the table of contents from the index's links, and docstrings from the API pages' lists."""
     del app
     if docname == root_doc:
         source[0] += contents(source[0])
@@ -73,7 +73,7 @@ def expand(app: Any, docname: str, source: list[str]) -> None:
 
 
 def contents(text: str) -> str:
-    """Returns the index's sections as hidden tables of contents, each of the pages that its section links to."""
+    """The index's sections as hidden tables of contents, each with the pages that its section links to."""
     parts = []
     for section in text.split("\n## ")[1:]:
         title, _, body = section.partition("\n")
@@ -84,7 +84,7 @@ def contents(text: str) -> str:
 
 
 def to_rst(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Rewrites a docstring, before napoleon reads it: an indented block after a paragraph is shown as it is."""
+    """Rewrites a docstring before napoleon reads it. An indented block after a paragraph becomes a literal block."""
     del app, what, name, obj, options
     if lines and lines[0].startswith("Alias for field number"):  # Python's own text for a field of a NamedTuple
         lines.clear()
@@ -101,7 +101,7 @@ def to_rst(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[s
 
 
 def escaped(line: str) -> str:
-    """Returns a line in which marks of reStructuredText that are none in Markdown mean themselves."""
+    """A line with the special characters of reStructuredText escaped, unless they are Markdown."""
     if re.match(r"\s*\*\*\w+:", line):  # an argument's name
         return line
     parts = line.split("`")
@@ -113,7 +113,7 @@ def escaped(line: str) -> str:
 
 
 def field_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Gives a field its text as it is written: napoleon takes what comes before a colon for its type."""
+    """Restores a field's text: napoleon takes the part before a colon for its type."""
     del app, obj, options
     owner, _, field = name.rpartition(".")
     if what == "attribute" and (text := texts_of(*owner.rpartition(".")[::2]).get(field)):
@@ -121,7 +121,7 @@ def field_text(app: Any, what: str, name: str, obj: Any, options: Any, lines: li
 
 
 def add_comments(module: str) -> None:
-    """Has autodoc take the comment beside a field, which has its shape, for the docstring of one that has none."""
+    """Makes autodoc use the comment next to a field, which has its shape, if the field has no docstring."""
     importlib.import_module(module)
     documented = ModuleAnalyzer.for_module(module).find_attr_docs()
     for owner in classes(module):
@@ -130,7 +130,7 @@ def add_comments(module: str) -> None:
 
 
 def classes(module: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes of a module that is imported, by name."""
+    """Classes of an imported module by name."""
     origin = getattr(sys.modules.get(module), "__file__", None)
     tree = ast.parse(Path(origin).read_text(encoding="utf-8")) if origin else ast.Module([], [])
     return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
@@ -138,7 +138,7 @@ def classes(module: str) -> dict[str, ast.ClassDef]:
 
 @functools.cache
 def texts_of(module: str, owner: str) -> dict[str, str]:
-    """Returns the docstrings of a class's fields, or else the comments beside and above them, by name; nothing for no class."""
+    """Docstrings of a class's fields, or else the comments next to and above them, by name. Empty if there is no such class."""
     if (node := classes(module).get(owner)) is None:
         return {}
     rows, texts = Path(sys.modules[module].__file__ or "").read_text(encoding="utf-8").splitlines(), {}
@@ -150,14 +150,14 @@ def texts_of(module: str, owner: str) -> dict[str, str]:
 
 
 def docstring(node: ast.stmt | None) -> str:
-    """Returns the text of a statement that is only that, as what stands below a field; "" of any other."""
+    """Text of a statement that is only a string, as below a field, or else ""."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
         return inspect.cleandoc(node.value.value)
     return ""
 
 
 def comment(rows: list[str], first: int, last: int) -> str:
-    """Returns the comment above row `first`, and the one at the end of row `last`."""
+    """The comment above row `first`, and the one at the end of row `last`."""
     above: list[str] = []
     while rows[first - 1].strip().startswith("# "):
         first -= 1
@@ -167,7 +167,7 @@ def comment(rows: list[str], first: int, last: int) -> str:
 
 
 def setup(app: Any) -> None:
-    """Registers what is done to pages and docstrings."""
+    """Registers the conversions of pages and docstrings."""
     app.connect("source-read", expand)
     app.connect("autodoc-process-docstring", to_rst, priority=400)  # before napoleon's
     app.connect("autodoc-process-docstring", field_text, priority=600)

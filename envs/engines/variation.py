@@ -32,9 +32,9 @@ _LINEAR = {
 
 
 class Variation:
-    """The numbers of a model that vary, each multiplied by one of `size` factors.
+    """Numbers of a model that vary, each multiplied by one of `size` factors.
 
-    Numbers that MuJoCo derives from masses for the softness of constraints (`invweight0`) stay those of the model.
+    Numbers that MuJoCo derives from masses for the softness of constraints (`invweight0`) keep the model's values.
 
     Args:
       model: the compiled MJCF.
@@ -64,7 +64,7 @@ class Variation:
                 which = _of_field(model, field, of_kind, self.size)
                 if (which < self.size).any():
                     self._fields[field] = np.array(getattr(model, field)), which
-        # Field -> its numbers [n], and by how much more of each factor changes them [size, n].
+        # Field -> its numbers [n], and their change per unit of each factor [size, n].
         self._sums = {}
         if "body_mass" in self._fields:
             slopes = [_constants(self._changed(model, row)) for row in np.eye(self.size)]
@@ -106,9 +106,9 @@ def _constants(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _choose(model: mujoco.MjModel, name: str, kind: str, patterns: str) -> list[int]:
-    """Numbers of the objects that a factor changes."""
+    """Indices of the objects that a factor changes."""
     columns = [names_of(model, _OBJECTS[kind])]
-    if kind == "gain":  # an actuator may be called by its joint
+    if kind == "gain":  # an actuator may be named by its joint
         driven = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
         joints = zip(model.actuator_trntype.tolist(), model.actuator_trnid[:, 0].tolist())
         columns.append([names_of(model, "joint")[joint] if trn in driven else "" for trn, joint in joints])
@@ -128,7 +128,7 @@ def _choose(model: mujoco.MjModel, name: str, kind: str, patterns: str) -> list[
 
 
 def _of_field(model: mujoco.MjModel, field: str, of_kind: np.ndarray, none: int) -> np.ndarray:
-    """Numbers [n, 2] of the factors of a field's entries, from those of the objects."""
+    """Indices [n, 2] of the factors of a field's entries, given the indices of the objects' factors."""
     if field == "dof_damping":
         of_kind = of_kind[model.dof_jntid]
     elif field == "pair_friction":
@@ -138,10 +138,10 @@ def _of_field(model: mujoco.MjModel, field: str, of_kind: np.ndarray, none: int)
 
 
 def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[float, float]]:
-    """Lowest and highest factor by name, of a mapping or of a text such as "mass:box=0.5-2, gain:*=0.9-1.1".
+    """Lowest and highest factor by name, from a mapping or a text such as "mass:box=0.5-2, gain:*=0.9-1.1".
 
     Raises:
-      ValueError: it has another form, or a range is not one of factors.
+      ValueError: it has another form, or a range is invalid.
     """
     if isinstance(varied, str):
         varied = _parsed(varied)

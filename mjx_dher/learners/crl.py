@@ -1,4 +1,4 @@
-"""Contrastive RL (Eysenbach et al. 2022, arXiv 2206.07568), as JaxGCRL has it (Bortkiewicz et al. 2024, arXiv 2408.11052).
+"""Contrastive RL (Eysenbach et al. 2022, arXiv 2206.07568), as in JaxGCRL (Bortkiewicz et al. 2024, arXiv 2408.11052).
 
     logits[i, j] = energy(phi(s_i, a_i), psi(g_j)),  g_i a goal that the episode achieved after (s_i, a_i)
     critic: mean_i (logsumexp_j logits[i, j] - logits[i, i]) + logsumexp_penalty mean_i (logsumexp_j logits[i, j])^2
@@ -49,8 +49,8 @@ def energy(name: str, phi: Array, psi: Array) -> Array:
 def energies(name: str, phi: Array, psi: Array) -> Array:
     """Energies [B, B] of each phi [B, R] with each psi [B, R].
 
-    Distances come from one matrix product, an order faster than differences. On the diagonal, where they are small and the
-    product would cancel, they are those of `energy`.
+    Distances come from one matrix product, an order of magnitude faster than differences. On the diagonal, where small
+    distances would cancel in the product, `energy` computes them.
     """
     product = jnp.matmul(phi, psi.T, precision=jax.lax.Precision.HIGHEST)
     rows, columns = _square(phi)[:, None], _square(psi)[None]
@@ -64,7 +64,7 @@ def info_nce(logits: Array, loss: str, penalty: Array | float) -> Array:
     """InfoNCE loss [] of logits [B, B], whose diagonal has the positive pairs; rows are actions and columns goals.
 
     Args:
-      logits: energies; -inf for pairs that are left out.
+      logits: energies; -inf for excluded pairs.
       loss: forward, backward or symmetric (`Config.contrastive_loss`).
       penalty: weight of the squared logsumexp over each row's goals.
     """
@@ -80,7 +80,7 @@ class CRL(ActorCriticBase):
 
     energy: str = "norm"
     loss: str = "forward"
-    mask: bool = False  # whether other goals of the same episode are left out
+    mask: bool = False  # whether other goals of the same episode are excluded
     policy_delay: int = 1
 
     def init(self, key: PRNGKey) -> ActorCriticState:
@@ -139,7 +139,7 @@ class CRL(ActorCriticBase):
         return dataclasses.replace(state, params=Params(actor, critic)), metrics
 
     def logits(self, critic: PyTree, observation: PyTree, goal: Array, batch: Batch) -> Array:
-        """Energies [B, B] of each action with each goal; those of all devices in a split run. Inputs are normalized."""
+        """Energies [B, B] of each action with each goal, of all devices in a split run. Inputs are normalized."""
         phi, psi = self.learning.critic.apply(critic, observation, goal, batch.action)
         device = jnp.zeros_like(batch.row)
         row = jnp.stack([batch.row, device], axis=-1)
