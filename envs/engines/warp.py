@@ -80,16 +80,14 @@ class WarpEngine:
         self.allow_cpu = allow_cpu
         self._variation = Variation(model, varied)
         self._varied = [name for name in self._variation.fields if name != "dof_M0"]  # which MuJoCo Warp does not have
-        self.path, self.note = _choose(model, path, constraints, bool(varied))
+        self.path, self.note, rows = _choose(model, path, constraints, bool(varied))
         self.name = "warp" if self.path == "fused" else "warp graph"  # separate names, because results differ
         if self.path == "graph":
-            most = graph.memory_for(model)
+            most_contacts, rows = graph.memory_for(model)
             defaults = (model.opt.iterations, model.opt.ls_iterations)
         else:
-            most = 0, simulation.rows_for(model, simulation.shared_memory())
-            defaults = (simulation.ITERATIONS, simulation.LS_ITERATIONS)
-        self._contacts, self._constraints = contacts or most[0], constraints or most[1]
-        self._most = most
+            most_contacts, defaults = 0, (simulation.ITERATIONS, simulation.LS_ITERATIONS)
+        self._contacts, self._constraints = contacts or most_contacts, constraints or rows
         self._model.opt.iterations, self._model.opt.ls_iterations = iterations or defaults[0], ls_iterations or defaults[1]
         self._begin()
 
@@ -176,8 +174,8 @@ class WarpEngine:
         if not lost:
             return
         if self.path == "fused":
-            enough = simulation.most_rows(self._model) <= self._most[1]
-            most = f"constraints={self._most[1]} are always enough" if enough else "path='graph' has room for more"
+            fits, enough = simulation.rows_for(self._model, simulation.shared_memory()), simulation.most_rows(self._model)
+            most = f"constraints={enough} are always enough" if fits == enough else "path='graph' has room for more"
             cure = f"constraints={self._constraints}; {most}"
         else:
             cure = f"contacts={self._contacts} and constraints={self._constraints}; try twice as many"
@@ -213,8 +211,8 @@ class WarpEngine:
         return made
 
 
-def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: bool) -> tuple[str, str]:
-    """Path that runs, and the reason.
+def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: bool) -> tuple[str, str, int]:
+    """Path that runs, the reason, and the constraint rows that `fused` has memory for.
 
     Raises:
       ValueError: the path does not support the model.
@@ -228,15 +226,16 @@ def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: b
             raise ValueError(f"engine warp: {reason}")
     if path != "graph" and not left_out:
         try:
-            simulation.check_fits(model, constraints or simulation.rows_for(model, simulation.shared_memory()))
-            return "fused", "the fused kernel"
+            rows = constraints or simulation.rows_for(model, simulation.shared_memory())
+            simulation.check_fits(model, rows)
+            return "fused", "the fused kernel", rows
         except ValueError as error:
             if path == "fused":
                 raise
             reason = str(error)
     if unknown := graph.unsupported(model):
         raise ValueError(f"engine warp does not support features of the model: {', '.join(unknown)}; use engine native")
-    return "graph", f"MuJoCo Warp; {reason}"
+    return "graph", f"MuJoCo Warp; {reason}", 0
 
 
 def _check_gpu() -> None:

@@ -113,14 +113,16 @@ def most_rows(model: mujoco.MjModel) -> int:
 def rows_for(model: mujoco.MjModel, shared: int | None) -> int:
     """Constraint rows to have memory for: all that can occur, if a block's shared memory suffices for them.
 
-    For large models it must suffice for half of the most warps. Else memory is for half as many again as random controls cause,
+    For large models it must suffice for the most warps. Else memory is for half as many again as random controls cause,
     and for as many more as fit beside as many environments.
     """
     most, threads = most_rows(model), threads_for(model)
-    least_warps = 1 if threads == THREADS else WARPS // 2
-    if shared is None or 4 * _structs(model, most)[-1].size * (32 // threads) * least_warps <= shared:
+    a_warp = lambda rows: 4 * _structs(model, rows)[-1].size * (32 // threads)  # noqa: E731
+    if shared is None or a_warp(most) * (1 if threads == THREADS else WARPS) <= shared:
         return most
-    least = max(_FEW_ROWS, setup.other_rows(model) + round(1.5 * graph.probe(model)[2]))
-    size = _structs(model, least)[-1].size
-    room = shared // (8 * (32 // threads) * most_warps(size, shared, threads)) * 2
-    return min(most, least + (room - size) // (model.nv + 3))
+    rows = min(most, max(_FEW_ROWS, setup.other_rows(model) + round(1.5 * graph.probe(model)[2])))
+    warps = most_warps(_structs(model, rows)[-1].size, shared, threads)
+    for more in (128, 64, 32, 16, 8, 4, 2, 1):
+        if rows + more <= most and a_warp(rows + more) * warps <= shared:
+            rows += more
+    return rows
