@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 
 import mujoco
@@ -22,8 +23,9 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
     Raises:
       ValueError: the simulation diverges. The message names the joint.
     """
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
+    model = copy.copy(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # which would set the numbers of warnings to 0
+    data = _fresh(model, qpos)
     mujoco.mj_forward(model, data)
     for contact in data.contact:
         if contact.dist < -_OVERLAP:
@@ -34,18 +36,27 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, 0.0).T
     inputs = {"held at the start": ctrl, "under random inputs": rng.uniform(low, high)}
     for what, held in inputs.items():
-        data = mujoco.MjData(model)
-        data.qpos[:], data.ctrl[:] = qpos, held
+        data = _fresh(model, qpos)
+        data.ctrl[:] = held
         for _ in range(int(min(seconds, _SECONDS) / model.opt.timestep)):
             mujoco.mj_step(model, data)
             for name in _BAD:
-                if data.warning[getattr(mujoco.mjtWarning, name)].number:
+                if data.warning[getattr(mujoco.mjtWarning, name)].number > 1:
                     dof = int(data.warning[getattr(mujoco.mjtWarning, name)].lastinfo)
                     joint = names_of(model, "joint")[model.dof_jntid[min(dof, model.nv - 1)]]
                     raise ValueError(
                         f"unstable model: joint {joint!r} diverges, {what}; a smaller timestep, more damping or armature, or"
                         " a start without overlapping geoms can help"
                     )
+
+
+def _fresh(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
+    """Data whose numbers of warnings are 1: MuJoCo prints and logs the first one."""
+    data = mujoco.MjData(model)
+    for warning in data.warning:
+        warning.number = 1
+    data.qpos[:] = qpos
+    return data
 
 
 def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> None:

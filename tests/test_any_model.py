@@ -128,7 +128,7 @@ def test_what_an_engine_cannot_do_is_rejected_when_it_is_made():
     with pytest.raises(ValueError, match="delays"):
         Simulator(model).advance(*start(model))
     cylinder = arm().replace('type="box" size=".02 .02 .04"', 'type="cylinder" size=".02 .04" contype="1"')
-    with pytest.raises(ValueError, match=r"engine jax: MJX .*CYLINDER.*; use engine native"):
+    with pytest.raises(ValueError, match=r"engine jax: MJX .*CYLINDER.*; .*<pair>.*NAME_stand_in.*use engine native"):
         make_engine("jax", mujoco.MjModel.from_xml_string(cylinder), SUBSTEPS)
 
 
@@ -183,3 +183,15 @@ def test_the_command_engines_says_what_takes_a_model_and_what_helps(capsys):
     assert "warp graph" in capsys.readouterr().out
     assert cli.main(["engines", "point_mass:PointMass"]) == 2
     names(capsys.readouterr().err, "point_mass:PointMass", "model")
+
+
+def test_too_little_memory_of_a_gpu_is_reported_with_a_cure(monkeypatch):
+    engine = make_engine("warp", mujoco.MjModel.from_xml_string(MODELS["nothing but a ball"]), SUBSTEPS, allow_cpu=True)
+    for message, kind in (("Failed to allocate 9 bytes on device 'cuda:0'", MemoryError), ("another", RuntimeError)):
+
+        def made(num_envs, message=message):
+            raise RuntimeError(message)
+
+        monkeypatch.setattr(engine, "_made", made)
+        with refuses(*(["4096", "num_envs", message] if kind is MemoryError else [message]), error=kind):
+            engine._simulation("cpu", 4096)

@@ -256,9 +256,11 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
         ({"model": MACHINE.replace('armature="1"', "")}, ("unstable", "a")),
     ],
 )
-def test_a_declaration_that_does_not_fit_the_model_is_rejected_before_training(declared, parts):
+def test_a_declaration_that_does_not_fit_the_model_is_rejected_before_training(declared, parts, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with refuses(*parts):
         make(**declared)
+    assert list(tmp_path.iterdir()) == []  # no MUJOCO_LOG.TXT
 
 
 NAMELESS = """

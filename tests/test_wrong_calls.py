@@ -150,6 +150,10 @@ def faulty(argv, console):
             RuntimeError("RESOURCE_EXHAUSTED: Out of memory"),
             "error: out of memory (RESOURCE_EXHAUSTED: Out of memory)",
         ),
+        (
+            RuntimeError("UNKNOWN: FFI callback error: MemoryError: engine warp has too little"),
+            "error: engine warp has too little",
+        ),
         (RecursionError("maximum recursion depth exceeded"), "error: the input is nested too deeply"),
         (ValueError("one\ntwo"), "error: one\nerror: two"),
     ],

@@ -197,7 +197,10 @@ class MjxEngine:
             self._data = jax.tree.map(np.asarray, mjx.make_data(model, impl="jax"))
         except NotImplementedError as error:
             what = with_names(str(error).rstrip("."), model, "geom", _geoms_in(model, str(error)))
-            raise ValueError(f"engine jax: MJX does not support this model: {what}; use engine native") from error
+            cure = "use engine native"
+            if "mjGEOM_CYLINDER" in str(error) and "mjGEOM_BOX" in str(error):
+                cure = f"list the two geoms as a <pair> and add a geom called NAME_stand_in for one of them, or {cure}"
+            raise ValueError(f"engine jax: MJX does not support this model: {what}; {cure}") from error
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         check_shapes(self._mujoco_model, physics, controls, self._variation.size)

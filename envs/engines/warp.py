@@ -203,8 +203,11 @@ class WarpEngine:
         key = (str(device), num_envs)
         made = self._simulations.pop(key, None)
         if made is None:
-            with wp.ScopedDevice(device):  # several GPUs call from one process
-                made = self._made(num_envs)
+            try:
+                with wp.ScopedDevice(device):  # several GPUs call from one process
+                    made = self._made(num_envs)
+            except RuntimeError as error:
+                raise _out_of_memory(error, num_envs) from error
         self._simulations[key] = made
         if len(self._simulations) > _KEPT:
             self._lost += self._simulations.pop(next(iter(self._simulations))).overflow()
@@ -236,6 +239,16 @@ def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: b
     if unknown := graph.unsupported(model):
         raise ValueError(f"engine warp does not support features of the model: {', '.join(unknown)}; use engine native")
     return "graph", f"MuJoCo Warp; {reason}", 0
+
+
+def _out_of_memory(error: RuntimeError, num_envs: int) -> Exception:
+    """MemoryError with a cure, or the error itself if it has another cause."""
+    if "Failed to allocate" not in str(error):
+        return error
+    return MemoryError(
+        f"engine warp has too little GPU memory for {num_envs} environments ({error}): use fewer num_envs or eval_episodes, or"
+        " leave it more than a quarter of the memory, as XLA_PYTHON_CLIENT_MEM_FRACTION=0.5 does"
+    )
 
 
 def _check_gpu() -> None:

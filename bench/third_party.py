@@ -1,0 +1,83 @@
+"""Models of others on each engine, beside a loop over `mj_step`.
+
+    python bench/third_party.py ant=ant.xml ur5e=ur5e.xml [--engines native warp jax] [--allow-cpu]
+
+Prints the largest distance of any coordinate after 20 timesteps from `mj_step`, of 4 environments under random controls. A
+model that an engine does not support has the reason instead. --allow-cpu runs warp without a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from timing import machine
+
+from mjx_dher.envs.engines import Controls, Physics, make_engine
+
+ENVS, STEPS, SUBSTEPS = 4, 2, 10
+
+
+def inputs(model: mujoco.MjModel) -> tuple[mujoco.MjData, np.ndarray]:
+    """The start, the first keyframe if there is one, and controls [ENVS, STEPS, nu] within their ranges."""
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    return data, np.random.default_rng(0).uniform(low, high, (ENVS, STEPS, model.nu)).astype(np.float32)
+
+
+def looped(model: mujoco.MjModel) -> np.ndarray:
+    """Coordinates [ENVS, nq] of a loop over `mj_step`."""
+    ends = []
+    for env in range(ENVS):
+        data, ctrl = inputs(model)
+        for row in ctrl[env]:
+            data.ctrl[:] = row
+            mujoco.mj_step(model, data, SUBSTEPS)
+        ends.append(data.qpos.copy())
+    return np.stack(ends)
+
+
+def played(model: mujoco.MjModel, engine: str, **options: bool) -> tuple[str, np.ndarray]:
+    """The engine, or the path of warp, and its coordinates [ENVS, nq]."""
+    made = make_engine(engine, model, SUBSTEPS, **options)
+    data, ctrl = inputs(model)
+    arrays = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act))
+    mocap = jnp.asarray(np.concatenate([data.mocap_pos, data.mocap_quat], axis=1), jnp.float32)
+    physics = jax.tree.map(lambda x: jnp.broadcast_to(x, (ENVS, *x.shape)), Physics(*arrays))
+    advance = jax.jit(jax.vmap(lambda state, u: made.advance(state, Controls(u, mocap))))
+    for step in range(STEPS):
+        physics = advance(physics, jnp.asarray(ctrl[:, step]))
+    qpos = np.asarray(physics.qpos)
+    made.check()
+    return getattr(made, "path", engine), qpos
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="+", help="NAME=MJCF")
+    parser.add_argument("--engines", nargs="+", default=["native", "warp", "jax"])
+    parser.add_argument("--allow-cpu", action="store_true")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print(f"\n{machine()}\n\n| model | nv | {' | '.join(args.engines)} |\n|{'---|' * (2 + len(args.engines))}", flush=True)
+    for text in args.models:
+        name, _, path = text.partition("=")
+        model = mujoco.MjModel.from_xml_path(path)
+        expected, cells = looped(model), []
+        for engine in args.engines:
+            try:
+                seen, qpos = played(model, engine, **({"allow_cpu": True} if engine == "warp" and args.allow_cpu else {}))
+                cells.append(f"{np.abs(qpos - expected).max():.0e}{', ' + seen if engine == 'warp' else ''}")
+            except ValueError as error:
+                cells.append(f"no: {error}")
+        print(f"| {name} | {model.nv} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
