@@ -1,7 +1,6 @@
 """The Shadow-hand tasks: reach with the fingertips, or turn a block, an egg or a pen in the hand.
 
-The tasks follow gymnasium-robotics 1.4.2 on mujoco 3.11.0: HandReach-v3, and version v1 of the HandManipulate tasks.
-`bench/hand_model.py` writes the models in envs/assets/hand (docs/fidelity.md).
+They follow gymnasium-robotics 1.4.2 on mujoco 3.11.0. `bench/hand_model.py` writes the models (docs/fidelity.md).
 """
 
 from __future__ import annotations
@@ -98,8 +97,7 @@ class ObjectPose(Goal):
         """Goal [7] with a unit quaternion.
 
         Raises:
-          ValueError: the shape is wrong or, outside `jit`, the quaternion's length is 0 or not finite. Inside `jit` such a
-            goal is NaN, and never reached.
+          ValueError: wrong shape or, outside `jit`, a quaternion of length 0 or not finite, which gives NaN inside `jit`.
         """
         goal = jnp.asarray(goal, jnp.float32)
         check_shape("desired_goal", goal, (self.size,))
@@ -109,7 +107,7 @@ class ObjectPose(Goal):
         return jnp.concatenate([goal[:3], jnp.where(jnp.abs(length - 1.0) < 1e-5, goal[3:], goal[3:] / length)])
 
     def turned(self, goal: Array, quat: Array) -> Array:
-        """The goal with another orientation [4]; of q and -q the one that is nearer to the goal's."""
+        """The goal with another orientation [4], in the sign (q or -q) that is nearer to the goal's."""
         return jnp.concatenate([goal[:3], jnp.where(jnp.sum(goal[3:] * quat) < 0.0, -quat, quat)])
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
@@ -235,12 +233,10 @@ class ManipulateTask(HandTask):
         """Drops the object into the hand, and again if it falls out."""
 
         def fell(drop: tuple[Array, Physics]) -> Array:
-            count, physics = drop
-            return (count < ATTEMPTS) & ~(physics.qpos[self.goal.qpos][2] > PALM_HEIGHT)
+            return (drop[0] < ATTEMPTS) & ~(drop[1].qpos[self.goal.qpos][2] > PALM_HEIGHT)
 
         def again(drop: tuple[Array, Physics]) -> tuple[Array, Physics]:
-            count, _ = drop
-            return count + 1, MujocoTask.start_physics(self, jax.random.fold_in(key, count))
+            return drop[0] + 1, MujocoTask.start_physics(self, jax.random.fold_in(key, drop[0]))
 
         none: Physics = jax.tree.map(jnp.zeros_like, jax.tree.map(jnp.asarray, self._rest))
         return jax.lax.while_loop(fell, again, (jnp.zeros((), jnp.int32), none))[1]

@@ -288,7 +288,7 @@ class MujocoTask(GoalEnv):
         return jnp.all(jnp.stack(finite)) & jnp.all(jnp.abs(physics.qvel) < self.max_speed)
 
     def _sensed(self, physics: Physics, controls: Controls | None = None) -> Physics:
-        """The physics with its sensors, under these inputs or those of the start, if the task observes any."""
+        """The physics with the sensors that the task observes, for `controls` or the start's."""
         if self._sensors is None:
             return physics
         controls = jax.tree.map(jnp.asarray, self._hold) if controls is None else controls

@@ -164,7 +164,7 @@ def _handle(address: int) -> int | None:
 
 @functools.lru_cache(maxsize=4096)  # XLA uses the same memory again
 def _words(address: int) -> Any:
-    """A window on memory, as words of 8 bytes. It may be longer than what is there: only what is there is to be read."""
+    """A window on memory, as words of 8 bytes. It may be longer than the struct: read only the struct's words."""
     return (ctypes.c_uint64 * 32).from_address(address)
 
 

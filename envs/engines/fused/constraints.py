@@ -1,7 +1,7 @@
 """Rows of constraints of a substep: welds, connected bodies, joint limits, contacts.
 
-A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' qvel for equalities), as far as its weight
-D = imp / ((1 - imp) times its inverse inertia) has it: https://mujoco.readthedocs.io/en/3.17.0/computation/index.html.
+A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' qvel for equalities). Its weight is D = imp /
+((1 - imp) times its inverse inertia): https://mujoco.readthedocs.io/en/3.17.0/computation/index.html.
 """
 
 from mjx_dher.envs.engines.fused.contacts import tangent, tangent_of
@@ -262,7 +262,7 @@ def touch(
 
 @wp.func
 def press(dofs: Dofs, contacts: Contacts, memory: Memory, most: int, thread: int, threads: int):
-    """Sets weights and reference accelerations of the rows of contacts, of which each has at most `most`."""
+    """Sets weights and reference accelerations of the contacts' rows, at most `most` rows per contact."""
     nv = dofs.number
     for at in range(thread, most * memory.counts[0], threads):
         s = memory.touching[at // most]

@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type"
-"""Cylinder against box by Minkowski portal refinement, the algorithm that MuJoCo C uses where `nativeccd` is disabled.
+"""Cylinder against box by Minkowski portal refinement, MuJoCo C's algorithm if `nativeccd` is disabled.
 
-The Minkowski difference of two convex shapes holds the origin if they overlap. A ray from a point inside it (the difference of
-the two centres) through the origin leaves it somewhere; the algorithm looks for a triangle of points of its surface that the
-ray goes through, the portal, and pushes it outwards until it lies on the surface. It finds one contact, not several. Source:
-G. Snethen, XenoCollide, Game Programming Gems 7 (2008); MuJoCo C takes it from libccd.
+The Minkowski difference of two convex shapes contains the origin if they overlap. A ray from a point inside it (the difference
+of the two centres) through the origin leaves it somewhere. The algorithm looks for a triangle of surface points around the
+ray, the portal, and pushes it outwards until it lies on the surface. It finds one contact, not several. Source: G. Snethen,
+XenoCollide, Game Programming Gems 7 (2008); MuJoCo C takes it from libccd.
 
 All is in double precision, as in C: a puck sinks 0.02 mm into the table, and in single precision the normals of so thin an
 overlap are noise.

@@ -1,10 +1,10 @@
 """Contacts of ellipsoids with planes, spheres, capsules and boxes.
 
-A sphere is a point with a radius, a capsule a segment with a radius, and a box is a box without one: of each, the point that is
-deepest in the ellipsoid, or nearest to it, makes the contact. The signed distance from a convex shape is a convex function, so
-Newton's method, kept within the lengths of the segment or box, finds that point. MuJoCo C runs its general convex solver (GJK
-and EPA) here, which finds the same contact as long as the point is not deep inside. Source of the method: D. Bertsekas,
-Projected Newton methods for optimization problems with simple constraints (1982).
+A sphere is a point with a radius, a capsule a segment with a radius, and a box a box with radius 0. The contact is at the
+point, on the segment or in the box, that is deepest in the ellipsoid, or nearest to it. The signed distance from a convex
+shape is a convex function, so Newton's method, kept within the segment or box, finds that point. MuJoCo C runs its general
+convex solver (GJK and EPA) here, which finds the same contact as long as the point is not deep inside. Source of the method:
+D. Bertsekas, Projected Newton methods for optimization problems with simple constraints (1982).
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="empty-body,valid-type"
-"""Linear equations of one environment: its rows of constraints added up, Cholesky's factors, and the solution.
+"""Linear equations of one environment: sum of its constraint rows, Cholesky factorization, and solution.
 
-On a GPU each thread has whole rows of the matrix in its registers, and threads exchange numbers by shuffles: a factorization
-in shared memory would wait for it at every step. L threads have R rows each, N = L R at least as many as there are.
+On a GPU each thread has whole rows of the matrix in its registers, and threads exchange numbers by shuffles. In shared memory,
+a factorization would wait at every step. L threads have R rows each, and N = L R is at least the number of rows.
 """
 
 from mjx_dher.system.warp_setup import wp

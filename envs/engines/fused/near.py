@@ -1,8 +1,8 @@
 """Pairs of geoms that are near one another, for models with many pairs.
 
-Most pairs of a hand are far apart in any one state. Memory for the contacts of all pairs at once would take the place of other
-environments, so each substep lists the pairs whose bounding boxes meet, finds their contacts in memory that the rows of
-constraints take later, and keeps those that touch. All lists are in the order of the pairs, whatever the threads do.
+Most pairs of a hand are far apart in any one state. Memory for the contacts of all pairs at once would leave less for other
+environments. So each substep lists the pairs whose bounding boxes meet, finds their contacts in memory that is later used for
+the rows of constraints, and keeps those that touch. All lists are in the order of the pairs for any schedule of the threads.
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 

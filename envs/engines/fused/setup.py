@@ -238,7 +238,7 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
 
 
 def _halves(model: mujoco.MjModel) -> np.ndarray:
-    """Half lengths [ngeom, 3] of boxes around geoms; those of planes do not matter."""
+    """Half lengths [ngeom, 3] of boxes around geoms. The values of planes are not used."""
     radius, half, _ = model.geom_size.T
     round_ones = {
         "SPHERE": (radius, radius, radius),

@@ -113,8 +113,8 @@ def most_rows(model: mujoco.MjModel) -> int:
 def rows_for(model: mujoco.MjModel, shared: int | None) -> int:
     """Constraint rows to have memory for: all that can occur, if a block's shared memory suffices for them.
 
-    For large models it must suffice for the most warps. Else memory is for half as many again as random controls cause,
-    and for as many more as fit beside as many environments.
+    For large models it must suffice for half of the most warps. Otherwise there is memory for 1.5 times the rows that random
+    controls cause, and for all further rows that fit without reducing the number of environments.
     """
     most, threads = most_rows(model), threads_for(model)
     a_warp = lambda rows: 4 * _structs(model, rows)[-1].size * (32 // threads)  # noqa: E731

@@ -1,8 +1,8 @@
-"""The accelerations that constraints allow: Newton's method with an exact line search, and the implicit Euler step.
+"""Accelerations under constraints: Newton's method with an exact line search, and the implicit Euler step.
 
-Minimized is 1/2 (a - a0)' M (a - a0) + 1/2 sum of D min(J a - aref, 0)^2 (without the min for equalities), where M a0 are all
-other forces: convex and quadratic in pieces, so that Newton's step from a point in the right piece ends at the minimum.
-E. Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops on its own.
+It minimizes 1/2 (a - a0)' M (a - a0) + 1/2 sum of D min(J a - aref, 0)^2 (without the min for equalities), where M a0 are all
+other forces. This is convex and piecewise quadratic, so Newton's step from a point in the right piece ends at the minimum. E.
+Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops individually.
 """
 
 from mjx_dher.envs.engines.fused.dynamics import damping

@@ -1,4 +1,4 @@
-"""What the fused kernel leaves out: every field of a model is read by the kernel, without effect, or at its default."""
+"""Support of models by the fused kernel: it reads a field, the field has no effect, or it must have its default."""
 
 import re
 from collections.abc import Iterator
@@ -66,7 +66,7 @@ def has_default(name: str) -> bool:
 
 
 def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
-    """What the kernel leaves out of fields that it reads."""
+    """Unsupported values of fields that the kernel reads."""
     scalar = np.isin(model.jnt_type, (_HINGE, _SLIDE))
     on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.jnt_type[np.where(on_joint, model.actuator_trnid[:, 0], 0)] if model.njnt else on_joint

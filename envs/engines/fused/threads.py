@@ -1,7 +1,7 @@
 # mypy: disable-error-code="empty-body"
 """The GPU threads, neighbours in one warp, that share the work on one environment.
 
-`threads` is their number, a power of 2 up to 32, and 1 on a CPU; `thread` is the index of one. Each part of a substep is a
+`threads` is their number, a power of 2 up to 32, and 1 on a CPU. `thread` is the index of one. Each part of a substep is a
 loop that begins at `thread` and advances by `threads`.
 """
 
@@ -29,7 +29,7 @@ def sync(threads: int):  # type: ignore[no-untyped-def]
 def gather(warps: int):  # type: ignore[no-untyped-def]
     """Waits for the other warps of the block.
 
-    Correctness does not need it. But the kernel's instructions do not fit into the instruction cache, and the warps of a
+    It is not needed for correctness. But the kernel's instructions do not fit into the instruction cache, and the warps of a
     multiprocessor get them two to four times as fast if all need the same ones at the same time.
     """
     ...
