@@ -86,8 +86,8 @@ class ObjectPose(Goal):
         if self.ignores_z:
             quat = _from_euler(jnp.concatenate([_euler(quat)[..., :2], _euler(other)[..., 2:]], axis=-1))
         # Of unit quaternions half the angle apart; exact for small angles, unlike an arc cosine.
-        angle = 4.0 * jnp.arctan2(_norm(quat - other), _norm(quat + other))
-        return (_norm(achieved[..., :3] - desired[..., :3]) if self.positions else jnp.zeros_like(angle)), angle
+        angle = 4.0 * jnp.arctan2(euclidean(quat, other), euclidean(quat, -other))
+        return (euclidean(achieved[..., :3], desired[..., :3]) if self.positions else jnp.zeros_like(angle)), angle
 
     def distance(self, achieved: Array, desired: Array) -> Array:
         apart, angle = self.distances(achieved, desired)
