@@ -44,7 +44,7 @@ class TrainArgs:
     """Train a policy with an off-policy learner and Hindsight Experience Replay.
 
     Other commands: `resume RUN` resumes a run, `eval RUN` evaluates runs, `view RUN` shows one in the browser, `demo` shows a
-    bundled policy, `render RUN` draws episodes, `transfer RUN` plays a run in the original Fetch task, `export RUN` writes its
+    bundled policy, `render RUN` draws episodes, `transfer RUN` plays a run in the original task, `export RUN` writes its
     policy for other programs, `sweep` trains and compares many runs, `plot DIR` draws curves, `report DIR` writes a report of
     a run or a sweep, `list` lists all tasks and components, `check` tests custom components, `engines ENV` shows the engines
     for a task, `doctor` tests this machine, `completion SHELL` prints a shell's completion, `--version` prints the version.
