@@ -12,7 +12,6 @@ _NATIVE = "use engine native"
 # Fixes in the MJCF, by words of the reason.
 _CURES = {
     "integrator": 'integrator="Euler"',
-    "elliptic": 'cone="pyramidal"',
     "noslip": 'noslip_iterations="0"',
     "solver": 'solver="Newton"',
     "without nativeccd": '<flag nativeccd="disable"/>',

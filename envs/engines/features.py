@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 
 _WORDS = {
-    "opt.cone": "elliptic friction cones",
     "opt.solver": "a solver other than Newton's",
     "opt.enableflags": "options enabled",
     "opt.density": "a medium",

@@ -52,6 +52,7 @@ class Pairs(NamedTuple):
     friction: np.ndarray  # [n, 5]
     solref: np.ndarray
     solimp: np.ndarray
+    solreffriction: np.ndarray
 
 
 def all_pairs(model: mujoco.MjModel) -> Pairs:
@@ -80,6 +81,7 @@ def all_pairs(model: mujoco.MjModel) -> Pairs:
         np.maximum(friction[:, [0, 0, 1, 2, 2]], _LEAST_FRICTION),
         np.where(leads.any(axis=1, keepdims=True), led, blend),
         (share * model.geom_solimp[others]).sum(axis=1),
+        np.zeros_like(blend),
     )
     return Pairs(*(np.concatenate(both) for both in zip(listed, mixed)))
 

@@ -143,14 +143,23 @@ def connect(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: in
 
 
 @wp.func
-def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: wp.array(dtype=int), thread: int, threads: int):
+def number(
+    world: World,
+    dofs: Dofs,
+    contacts: Contacts,
+    memory: Memory,
+    lost: wp.array(dtype=int),
+    elliptic: bool,
+    thread: int,
+    threads: int,
+):
     """Gives a row to each joint at its limit, and a number of rows to each contact within its margin.
 
     Contacts that do not fit are left out and counted in `lost`.
     """
     for s in range(thread, contacts.slots, threads):
         pair = contacts.pair[s]
-        memory.touching[s] = wp.where(memory.distance[s] < contacts.margin[pair], _edges(contacts.dim[pair]), 0)
+        memory.touching[s] = wp.where(memory.distance[s] < contacts.margin[pair], contacts.edges[pair], 0)
     sync(threads)
     if thread == 0:
         rows = int(world.equalities)
@@ -159,6 +168,8 @@ def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: w
             if _past_limit(dofs, memory, k) < 0.0:
                 memory.limited[k] = rows
                 rows += 1
+        if elliptic:
+            memory.counts[1] = rows
         touching = int(0)
         for s in range(contacts.slots):
             edges = memory.touching[s]
@@ -170,14 +181,8 @@ def number(world: World, dofs: Dofs, contacts: Contacts, memory: Memory, lost: w
                 touching += 1
                 rows += edges
         memory.counts[0] = touching
-        memory.counts[1] = rows
+        memory.counts[wp.where(elliptic, 2, 1)] = rows
     sync(threads)
-
-
-@wp.func
-def _edges(dim: int) -> int:
-    """Number of edges of a contact's friction pyramid."""
-    return wp.where(dim == 1, 1, 2 * dim - 2)
 
 
 @wp.func
@@ -210,11 +215,20 @@ def limit(
 
 @wp.func
 def touch(
-    bodies: Bodies, dofs: Dofs, contacts: Contacts, memory: Memory, capsules: bool, rolling: bool, thread: int, threads: int
+    bodies: Bodies,
+    dofs: Dofs,
+    contacts: Contacts,
+    memory: Memory,
+    elliptic: bool,
+    capsules: bool,
+    rolling: bool,
+    thread: int,
+    threads: int,
 ):
     """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent.
 
     Args:
+      elliptic: whether rows are those of elliptic cones instead, mu times the normal, and friction times tangent.
       capsules: whether there may be some on planes.
       rolling: whether there may be rolling friction.
     """
@@ -244,17 +258,19 @@ def touch(
             motion = sign * memory.motion[i]
             velocity = _at(motion, memory.place[s] - memory.pos[bodies.root[dofs.body[i]]])
             along = wp.dot(velocity, normal)
-            if dim == 1:
+            if elliptic:
+                along *= contacts.mu[pair]
+            if elliptic or dim == 1:
                 memory.jacobian[row * nv + i] = along
-            else:
-                for k in range(dim - 1):
-                    aside = wp.dot(wp.spatial_top(motion), turning)
-                    if k == 0:
-                        aside = wp.dot(velocity, first)
-                    elif k == 1:
-                        aside = wp.dot(velocity, second)
-                    elif rolling and k > 2:
-                        aside = wp.dot(wp.spatial_top(motion), wp.where(k == 3, roll1, roll2))
+            for k in range(dim - 1):
+                aside = wp.dot(wp.spatial_top(motion), turning)
+                if k < 2:
+                    aside = wp.dot(velocity, wp.where(k == 0, first, second))
+                elif rolling and k > 2:
+                    aside = wp.dot(wp.spatial_top(motion), wp.where(k == 3, roll1, roll2))
+                if elliptic:
+                    memory.jacobian[(row + k + 1) * nv + i] = aside
+                else:
                     memory.jacobian[(row + 2 * k) * nv + i] = along + aside
                     memory.jacobian[(row + 2 * k + 1) * nv + i] = along - aside
     sync(threads)
@@ -268,7 +284,7 @@ def press(dofs: Dofs, contacts: Contacts, memory: Memory, most: int, thread: int
         s = memory.touching[at // most]
         pair = contacts.pair[s]
         row = memory.slot[at // most] + at % most
-        if at % most < _edges(contacts.dim[pair]):
+        if at % most < contacts.edges[pair]:
             depth = memory.distance[s] - contacts.margin[pair]
             velocity = float(0.0)
             for i in range(nv):

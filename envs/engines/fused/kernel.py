@@ -1,8 +1,9 @@
 """The kernel: all substeps of an environment step, for every environment."""
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
+from mjx_dher.envs.engines.fused.cone import press_cones
 from mjx_dher.envs.engines.fused.constraints import connect, limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
@@ -96,6 +97,7 @@ def _go_on(
     memory: Memory,
     given: wp.array(dtype=float),  # type: ignore[valid-type]
     has_sparse: bool,
+    elliptic: bool,
     nv: int,
     warps: int,
     thread: int,
@@ -106,11 +108,21 @@ def _go_on(
         gather(warps)
         ask_sparse(sparse, memory, thread, threads)
     gather(warps)
-    solve(world, sparse, memory, has_sparse, nv, thread, threads)
+    solve(world, sparse, memory, has_sparse, elliptic, nv, thread, threads)
     gather(warps)
-    accelerate(world, bodies, dofs, sparse, memory, given, has_sparse, nv, thread, threads)
+    accelerate(world, bodies, dofs, sparse, memory, given, has_sparse, elliptic, nv, thread, threads)
     gather(warps)
     integrate(world, bodies, memory, thread, threads)
+
+
+class Traits(NamedTuple):
+    """What the kernel's code depends on in a model."""
+
+    kinds: tuple[int, ...]  # kinds of geom pairs; code for other kinds is left out
+    edges: int  # most rows that a contact has
+    few: bool  # whether there is memory for the contacts of all pairs at once; else those that are near are looked for
+    has_sparse: bool  # whether there are rows of `Sparse`
+    elliptic: bool  # whether friction cones are elliptic
 
 
 def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
@@ -158,9 +170,10 @@ def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
     return collide
 
 
-def _constraining(kinds: tuple[int, ...], edges: int, few: bool, warps: int) -> Any:
+def _constraining(traits: Traits, warps: int) -> Any:
     """Returns the function that finds contacts and computes the rows of constraints. See `make`."""
-    capsules, collide = PLANE_CAPSULE in kinds, _collision(kinds, few, warps)
+    capsules, collide = PLANE_CAPSULE in traits.kinds, _collision(traits.kinds, traits.few, warps)
+    elliptic, edges, rolling = traits.elliptic, traits.edges, traits.elliptic or traits.edges > 6
 
     @wp.func
     def constrain(
@@ -177,36 +190,33 @@ def _constraining(kinds: tuple[int, ...], edges: int, few: bool, warps: int) -> 
     ):
         held = collide(contacts, memory, layout, spare, lost, thread, threads)
         gather(wp.static(warps))
-        number(world, dofs, held, memory, lost, thread, threads)
+        number(world, dofs, held, memory, lost, wp.static(elliptic), thread, threads)
         gather(wp.static(warps))
         weld(world, bodies, dofs, memory, thread, threads)
         connect(world, bodies, dofs, memory, thread, threads)
         gather(wp.static(warps))
         limit(dofs, held, memory, thread, threads)
         gather(wp.static(warps))
-        touch(bodies, dofs, held, memory, wp.static(capsules), wp.static(edges > 6), thread, threads)
+        touch(bodies, dofs, held, memory, wp.static(elliptic), wp.static(capsules), wp.static(rolling), thread, threads)
         gather(wp.static(warps))
-        press(dofs, held, memory, wp.static(edges), thread, threads)
+        if wp.static(elliptic):
+            press_cones(dofs, held, memory, thread, threads)
+        else:
+            press(dofs, held, memory, wp.static(edges), thread, threads)
 
     return constrain
 
 
 @functools.cache
-def make(
-    floats: int, threads_per_env: int, warps: int, nv: int, kinds: tuple[int, ...], edges: int, few: bool, has_sparse: bool
-) -> Any:
+def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits) -> Any:
     """Returns the kernel for `nv` degrees of freedom.
 
     Args:
       floats: memory of an environment; unused on a CPU.
       threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
-      kinds: kinds of geom pairs in the model; code for other kinds is left out.
-      edges: most edges that a contact's friction pyramid has.
-      few: whether there is memory for the contacts of all pairs at once; else those that are near are looked for.
-      has_sparse: whether the model has rows of `Sparse`.
     """
     shared = warps * (32 // threads_per_env) * floats
-    constrain = _constraining(kinds, edges, few, warps)
+    constrain = _constraining(traits, warps)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -241,8 +251,10 @@ def make(
         for _substep in range(substeps):
             _forces(world, bodies, dofs, memory, inputs[env], wp.static(warps), thread, threads)
             constrain(world, bodies, dofs, contacts, memory, layout, own, lost, thread, threads)
-            has = wp.static(has_sparse)
-            _go_on(world, bodies, dofs, sparse, memory, inputs[env], has, wp.static(nv), wp.static(warps), thread, threads)
+            has, cones = wp.static(traits.has_sparse), wp.static(traits.elliptic)
+            _go_on(
+                world, bodies, dofs, sparse, memory, inputs[env], has, cones, wp.static(nv), wp.static(warps), thread, threads
+            )
         _end(memory, qpos[env], qvel[env], guess[env], thread, threads)
 
     return advance

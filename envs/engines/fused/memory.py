@@ -26,7 +26,8 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, spars
         **dict.fromkeys(("distance", "place", "normal"), contacts.slots),
         **dict.fromkeys(("touching", "slot"), contacts.slots),
         "limited": dofs.limits,
-        "counts": 2,
+        "counts": 3 if contacts.elliptic else 2,
+        "cone": contacts.slots if contacts.elliptic else 0,
         "jacobian": rows * nv,
         **dict.fromkeys(("weight", "residual", "change"), rows),
         **{f"sparse_{name}": sparse.rows for name in ("weight", "residual", "change", "slope")},
@@ -90,15 +91,16 @@ def carve(layout: Layout, spare: wp.array(dtype=float), threads: int) -> Memory:
     memory.qpos = floats(spare, size, begin[23], length[23], threads)
     memory.qvel = floats(spare, size, begin[24], length[24], threads)
     memory.counts = ints(spare, size, begin[25], length[25], threads)
-    memory.weight = floats(spare, size, begin[26], length[26], threads)
-    memory.residual = floats(spare, size, begin[27], length[27], threads)
-    memory.change = floats(spare, size, begin[28], length[28], threads)
-    memory.sparse_weight = floats(spare, size, begin[29], length[29], threads)
-    memory.sparse_residual = floats(spare, size, begin[30], length[30], threads)
-    memory.sparse_change = floats(spare, size, begin[31], length[31], threads)
-    memory.sparse_slope = floats(spare, size, begin[32], length[32], threads)
-    memory.factor = floats(spare, size, begin[33], length[33], threads)
-    memory.jacobian = floats(spare, size, begin[34], length[34], threads)
+    memory.cone = ints(spare, size, begin[26], length[26], threads)
+    memory.weight = floats(spare, size, begin[27], length[27], threads)
+    memory.residual = floats(spare, size, begin[28], length[28], threads)
+    memory.change = floats(spare, size, begin[29], length[29], threads)
+    memory.sparse_weight = floats(spare, size, begin[30], length[30], threads)
+    memory.sparse_residual = floats(spare, size, begin[31], length[31], threads)
+    memory.sparse_change = floats(spare, size, begin[32], length[32], threads)
+    memory.sparse_slope = floats(spare, size, begin[33], length[33], threads)
+    memory.factor = floats(spare, size, begin[34], length[34], threads)
+    memory.jacobian = floats(spare, size, begin[35], length[35], threads)
     return memory
 
 

@@ -85,11 +85,15 @@ class Contacts:
     most: _ints  # slots
     margin: _floats
     dim: _ints
+    edges: _ints  # rows of a contact
     friction: _vec3s  # along both tangents, and about the normal
     rolling: wp.array(dtype=wp.vec2)  # friction about both tangents
     soft: _soft
-    weight: _floats  # inverse inertia, as a pyramid's rows have it
+    weight: _floats  # inverse inertia, as the rows have it
+    mu: _floats  # friction of an elliptic cone
+    slip: _floats  # damping of its friction
     slots: int
+    elliptic: int  # 1 if friction cones are elliptic
     pair: _ints  # pair of each slot
     rounds: int  # 2, in which contacts of a cylinder and a box are looked for
     near: int  # pairs that may be near at once, of all of which contacts are found; 0 if there is memory for all
@@ -184,7 +188,8 @@ class Memory:
     step: _floats  # [nv] mass matrix times search
     qpos: _floats  # [nq]
     qvel: _floats  # [nv]
-    counts: _ints  # [2] how many contacts, how many rows
+    counts: _ints  # [2] how many contacts, how many rows; with elliptic cones [3], rows without and with those of contacts
+    cone: _ints  # [nslot] first row of an elliptic cone, and 2^16 times the number of its rows
     weight: _floats  # [rows] D, the inverse of a row's softness
     residual: _floats  # [rows] aref, and from the solver on J qacc - aref
     change: _floats  # [rows] J search

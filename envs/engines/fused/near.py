@@ -126,6 +126,9 @@ def keep(
     held.kind = contacts.kind
     held.margin = contacts.margin
     held.dim = contacts.dim
+    held.edges = contacts.edges
+    held.mu = contacts.mu
+    held.slip = contacts.slip
     held.friction = contacts.friction
     held.rolling = contacts.rolling
     held.soft = contacts.soft

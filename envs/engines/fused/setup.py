@@ -207,7 +207,9 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
     kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
     slide, slots = pairs.friction[:, 0], int(most.sum())
-    few, all_fit = slots <= FEW, rows >= int((most * edges_of(pairs.dim)).sum())
+    elliptic, edges = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, edges_of(model, pairs.dim)
+    few, all_fit, alone = slots <= FEW, rows >= int((most * edges).sum()), elliptic | (pairs.dim == 1)
+    slips = np.where(pairs.solreffriction.any(axis=1, keepdims=True), pairs.solreffriction, pairs.solref)
     weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
     return fill(
         Contacts,
@@ -225,11 +227,15 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
         most=most,
         margin=pairs.margin,
         dim=pairs.dim,
+        edges=edges,
         friction=pairs.friction[:, :3],
         rolling=pairs.friction[:, 3:],
         soft=[softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
-        weight=weight * np.where(pairs.dim == 1, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
+        weight=weight * np.where(alone, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
         slots=slots if few or all_fit else min(slots, max(1, rows // 3)),
+        mu=np.where(pairs.dim == 1, 1, slide / np.sqrt(model.opt.impratio)),
+        slip=[softness(model, *soft)[1] for soft in zip(slips, pairs.solimp)],
+        elliptic=int(elliptic),
         pair=np.repeat(np.arange(len(kind)), most),
         rounds=2,
         near=0 if few else len(kind) if all_fit else min(len(kind), _NEAR),
@@ -252,9 +258,10 @@ def _halves(model: mujoco.MjModel) -> np.ndarray:
     return halves
 
 
-def edges_of(dims: np.ndarray) -> np.ndarray:
-    """Edges of the friction pyramids of contacts, by their condim."""
-    return np.where(dims == 1, 1, 2 * dims - 2)
+def edges_of(model: mujoco.MjModel, dims: np.ndarray) -> np.ndarray:
+    """Rows of contacts, by their condim: the edges of a pyramid, or the directions of an elliptic cone."""
+    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    return np.where((dims == 1) | elliptic, dims, 2 * dims - 2)
 
 
 def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]:
@@ -294,7 +301,7 @@ def _equalities_of(model: mujoco.MjModel, links: _Links) -> dict[str, Any]:
 def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     """Returns `World` of a model, with room for up to `most_rows` rows of constraints."""
     links = links_of(model)
-    edges = edges_of(contacts.dim.numpy()[contacts.pair.numpy()])
+    edges = contacts.edges.numpy()[contacts.pair.numpy()]
     contact_rows = int(np.sort(edges)[len(edges) - contacts.slots :].sum())
     return fill(
         World,

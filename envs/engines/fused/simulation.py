@@ -37,9 +37,9 @@ class Simulation:
         warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block, self._threads)
         self._block = max(1, 32 * warps)
         kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
-        edges = int(max([6, *setup.edges_of(contacts.dim.numpy())]))
-        traits = kinds, edges, contacts.near == 0, sparse.rows > 0
-        self._kernel = kernel.make(size if warps else 0, self._threads, warps, model.nv, *traits)
+        edges = int(max([6, *contacts.edges.numpy()]))
+        traits = kernel.Traits(kinds, edges, contacts.near == 0, sparse.rows > 0, bool(contacts.elliptic))
+        self._kernel = kernel.make(size if warps else 0, self._threads, warps, model.nv, traits)
         memory = wp.zeros((num_envs, size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (*structs, memory)
         self._lost = wp.zeros(1, dtype=int)

@@ -5,8 +5,10 @@ other forces. This is convex and piecewise quadratic, so Newton's step from a po
 Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops individually.
 """
 
+from mjx_dher.envs.engines.fused.cone import add_cones, begin_cones, change_cones, slopes_cones, take_cones
 from mjx_dher.envs.engines.fused.dynamics import damping
 from mjx_dher.envs.engines.fused.linear import direction
+from mjx_dher.envs.engines.fused.memory import copy
 from mjx_dher.envs.engines.fused.model import FREE, Bodies, Dofs, Memory, Sparse, World
 from mjx_dher.envs.engines.fused.sparse import add_sparse, begin_sparse, change_sparse, slopes_sparse, take_sparse
 from mjx_dher.envs.engines.fused.threads import sync, total
@@ -51,6 +53,7 @@ def _slopes(
     sparse: Sparse,
     memory: Memory,
     has_sparse: bool,
+    elliptic: bool,
     rows: int,
     at: float,
     slope: float,
@@ -71,6 +74,10 @@ def _slopes(
         more = slopes_sparse(sparse, memory, at, thread, threads)
         d1 += more[0]
         d2 += more[1]
+    if elliptic:
+        cones = slopes_cones(memory, at, thread, threads)
+        d1 += cones[0]
+        d2 += cones[1]
     return wp.vec2(total(d1, threads) + slope + at * curve, total(d2, threads) + curve)
 
 
@@ -80,6 +87,7 @@ def _how_far(
     sparse: Sparse,
     memory: Memory,
     has_sparse: bool,
+    elliptic: bool,
     rows: int,
     slope: float,
     curve: float,
@@ -98,7 +106,7 @@ def _how_far(
     high = float(-1.0)
     step = float(1.0)
     for _ in range(attempts):
-        d = _slopes(world, sparse, memory, has_sparse, rows, step, slope, curve, thread, threads)
+        d = _slopes(world, sparse, memory, has_sparse, elliptic, rows, step, slope, curve, thread, threads)
         if wp.abs(d[0]) <= _SLOPE * gain:
             break
         if d[0] < 0.0:
@@ -117,6 +125,7 @@ def _take(
     sparse: Sparse,
     memory: Memory,
     has_sparse: bool,
+    elliptic: bool,
     far: float,
     rows: int,
     size: int,
@@ -136,6 +145,8 @@ def _take(
             changed += 1.0
     if has_sparse:
         changed += take_sparse(sparse, memory, far, thread, threads)
+    if elliptic:
+        changed += take_cones(memory, far, thread, threads)
     changed = total(changed, threads)
     sync(threads)
     return changed
@@ -143,7 +154,15 @@ def _take(
 
 @wp.func
 def _begin(
-    world: World, sparse: Sparse, memory: Memory, has_sparse: bool, rows: int, nv: int, thread: int, threads: int
+    world: World,
+    sparse: Sparse,
+    memory: Memory,
+    has_sparse: bool,
+    elliptic: bool,
+    rows: int,
+    nv: int,
+    thread: int,
+    threads: int,
 ) -> float:
     """Initializes the solver at the first guess. Returns the energy that single precision leaves uncertain.
 
@@ -161,16 +180,18 @@ def _begin(
         unsure += _pull(world, row, residual, memory.weight[row]) * size * size
     if has_sparse:
         unsure += begin_sparse(sparse, memory, thread, threads)
+    if elliptic:
+        unsure += begin_cones(memory, nv, thread, threads)
     unsure = total(unsure, threads)
     sync(threads)
     return _UNSURE * unsure
 
 
 @wp.func
-def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: int, thread: int, threads: int):
-    """Computes `qacc`, starting from its present value. `has_sparse` says whether the model has rows of `sparse`."""
+def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, elliptic: bool, nv: int, thread: int, threads: int):
+    """Computes `qacc` from its present value. Flags say whether there are rows of `sparse`, and elliptic cones."""
     rows = memory.counts[1]
-    unsure = _begin(world, sparse, memory, has_sparse, rows, nv, thread, threads)
+    unsure = _begin(world, sparse, memory, has_sparse, elliptic, rows, nv, thread, threads)
     for _ in range(world.iterations):
         energy = float(0.0)
         for i in range(thread, nv, threads):
@@ -180,7 +201,11 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
         least = wp.max(wp.max(world.tolerance / world.scale, unsure), _ROUNDING * total(energy, threads))
         if has_sparse:
             add_sparse(sparse, memory, nv, 1, thread, threads)
+        elif elliptic:
+            copy(memory.mass, memory.factor, thread, threads)
         sync(threads)
+        if elliptic:
+            add_cones(memory, nv, 1, thread, threads)
         gain = direction(
             memory.mass,
             memory.jacobian,
@@ -192,7 +217,7 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
             rows,
             world.equalities,
             1,
-            wp.where(has_sparse, 1, 0),
+            wp.where(has_sparse or elliptic, 1, 0),
             thread,
             threads,
         )  # the cost's decrease if all of it were one piece, twice
@@ -209,10 +234,14 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, nv: in
             memory.change[row] = _dot(memory.jacobian, row, memory.search, nv)
         if has_sparse:
             change_sparse(sparse, memory, thread, threads)
+        if elliptic:
+            change_cones(memory, nv, thread, threads)
         slope = total(slope, threads)
         curve = total(curve, threads)
-        far = _how_far(world, sparse, memory, has_sparse, rows, slope, curve, gain, world.ls_iterations, thread, threads)
-        changed = _take(world, sparse, memory, has_sparse, far, rows, nv, thread, threads)
+        far = _how_far(
+            world, sparse, memory, has_sparse, elliptic, rows, slope, curve, gain, world.ls_iterations, thread, threads
+        )
+        changed = _take(world, sparse, memory, has_sparse, elliptic, far, rows, nv, thread, threads)
         if changed == 0.0 and wp.abs(far - 1.0) < _WHOLE:
             break
         if far * far * gain <= least:  # rounding lets the search go no further
@@ -228,6 +257,7 @@ def accelerate(
     memory: Memory,
     inputs: wp.array(dtype=float),
     has_sparse: bool,
+    elliptic: bool,
     nv: int,
     thread: int,
     threads: int,
@@ -241,6 +271,8 @@ def accelerate(
     if has_sparse:
         add_sparse(sparse, memory, nv, 0, thread, threads)
     sync(threads)
+    if elliptic:
+        add_cones(memory, nv, 0, thread, threads)
     direction(
         memory.mass,
         memory.jacobian,

@@ -20,8 +20,8 @@ _READ = re.compile(
             r"geom_(bodyid|conaffinity|condim|contype|friction|margin|pos|priority|quat|rbound|size|solimp|solmix|solref|type)",
             r"nbody|neq|nq|ntendon|nu|nv|qpos0|qpos_spring|wrap_(objid|prm|type)",
             r"jnt_(actfrclimited|actfrcrange|axis|dofadr|limited|margin|pos|qposadr|range|solimp|solref|stiffness|type)",
-            r"opt\.(disableflags|gravity|impratio|integrator|iterations|ls_iterations|timestep|tolerance)",
-            r"pair_(dim|friction|geom1|geom2|margin|solimp|solref)",
+            r"opt\.(cone|disableflags|gravity|impratio|integrator|iterations|ls_iterations|timestep|tolerance)",
+            r"pair_(dim|friction|geom1|geom2|margin|solimp|solref|solreffriction)",
             r"tendon_(adr|frictionloss|invweight0|limited|margin|num|range|solimp_fri|solimp_lim|solref_fri|solref_lim)",
         ]
     )
@@ -40,7 +40,7 @@ _WITHOUT_EFFECT = re.compile(
             r"body_(bvh\w+|conaffinity|contype|dofadr|dofnum|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
             r"geom_(aabb|sameframe|dataid)|actuator_(acc0|ctrladr|ctrlnum|ctrlspec|outadr|outnum|length0|lengthrange|historyadr)",
             # What belongs to a feature that is left out.
-            r"(geom|pair)_gap|pair_solreffriction|opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
+            r"(geom|pair)_gap|opt\.(o_\w+|noslip_tolerance|wind)|actuator_(act\w+|dynprm|history)",
             r"opt\.(jacobian|ls_tolerance|magnetic|sleep_tolerance|sdf_\w+|ccd_\w+)",
         ]
     )
