@@ -32,7 +32,16 @@ class Control:
         raise NotImplementedError
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
-        """Updates the inputs `controls` for an action [size] in the state `physics`."""
+        """Updates the engine's inputs for an action.
+
+        Args:
+          physics: state before the step.
+          action: numbers [size] in [-1, 1].
+          controls: the inputs so far.
+
+        Returns:
+          The new inputs.
+        """
         raise NotImplementedError
 
     def rest(self, ctrl: np.ndarray) -> np.ndarray:

@@ -49,7 +49,13 @@ class Goal:
     distance: Any  # (achieved [..., G], desired [..., G]) -> [...]
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
-        """Marks that show a goal [G] in a configuration `qpos` [nq]: balls, and bodies as ghosts."""
+        """Marks that show a goal: balls, and bodies as ghosts.
+
+        Args:
+          model: the compiled MJCF.
+          qpos: coordinates [nq].
+          goal: [G].
+        """
         raise NotImplementedError
 
 

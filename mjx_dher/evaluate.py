@@ -24,12 +24,32 @@ CHUNK = 500  # episodes at once
 
 
 def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
-    """Outcomes of a deterministic policy, traced. `act` maps observations with leading [num_episodes] to actions."""
+    """Plays episodes of a deterministic policy. Traceable.
+
+    Args:
+      env: the environment.
+      act: maps observations, whose leaves lead with [num_episodes], to actions [num_episodes, A].
+      key: draws the initial states.
+      num_episodes: number of parallel episodes.
+
+    Returns:
+      Outcomes [num_episodes].
+    """
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
 def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:
-    """Outcomes [num_episodes] of a policy from `load_policy`, as NumPy arrays. `seed` draws the initial states."""
+    """Plays episodes of a policy from `load_policy`.
+
+    Args:
+      env: the environment.
+      policy: the policy.
+      num_episodes: number of episodes.
+      seed: draws the initial states.
+
+    Returns:
+      Outcomes [num_episodes] as NumPy arrays.
+    """
     chunk = min(num_episodes, CHUNK)
 
     @jax.jit

@@ -198,10 +198,17 @@ def hindsight_factor(sample: Sample, batch: Batch, hparams: HParams) -> Array:
 
 
 def look_ahead(ring: ReplayState, sample: Sample, batch: Batch, context: Context, n_step: int) -> Batch:
-    """Extends a relabelled batch to returns of up to `n_step` steps. `sample` is the batch before relabelling.
+    """Extends a relabelled batch to returns of several steps.
 
     A return stops at the end of the episode, or when the goal is reached, because later actions aimed at another goal. As in
     Hessel et al. 2018, returns are not corrected for older policies.
+
+    Args:
+      ring: the replay ring.
+      sample: the batch before relabelling.
+      batch: the relabelled batch.
+      context: reward function and numbers.
+      n_step: largest number of steps.
     """
     last = sample.length if sample.ends else sample.episode_goals.shape[1] - 1
     ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]

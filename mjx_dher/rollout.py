@@ -72,7 +72,10 @@ def record_rollout(
     inputs: PyTree = None,
     goals: GoalsFn | None = None,
 ) -> tuple[Episode, Outcome, PyTree]:
-    """Plays episodes like `rollout`, and also returns `record(state)` of all states; leaves lead with [N, T+1]."""
+    """Plays episodes like `rollout`, and also returns `record(state)` of all states; leaves lead with [N, T+1].
+
+    Arguments other than `record` are as in `rollout`.
+    """
     spec = env_spec(env)
     check_size("num_envs", num_envs)
     _check_inputs(inputs, spec.episode_length)

@@ -37,6 +37,15 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def difference_interval(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> tuple[float, float]:
     """Newcombe's 95 % interval of the difference a - b of two success rates (Newcombe 1998, method 10).
 
+    Args:
+      successes_a: successful trials of a.
+      trials_a: all trials of a.
+      successes_b: successful trials of b.
+      trials_b: all trials of b.
+
+    Returns:
+      Low and high end.
+
     Raises:
       ValueError: as in `wilson_interval`.
     """

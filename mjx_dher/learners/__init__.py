@@ -46,15 +46,22 @@ class Learner(Protocol):
         """Initial state."""
 
     def act(self, state: Any, obs: GoalObs, hparams: HParams) -> Array:
-        """Deterministic policy for evaluation and export: actions [..., A] in [-1, 1].
+        """Actions [..., A] in [-1, 1] of the deterministic policy, for evaluation and export.
 
-        `obs` has observations [..., D] and goals [..., G], with any leading axes.
+        Args:
+          state: the learner's state.
+          obs: observations [..., D] and goals [..., G], with any leading axes.
+          hparams: numbers.
         """
 
     def explore(self, state: Any, obs: GoalObs, noise: Any, hparams: HParams) -> Array:
-        """Exploring policy: actions [N, A] in [-1, 1] for the N environments of a rollout.
+        """Actions [N, A] in [-1, 1] of the exploring policy, for the N environments of a rollout.
 
-        `noise` is one step of the noise from `noise`; leaves lead with [N]. By default it is one key per environment.
+        Args:
+          state: the learner's state.
+          obs: observations [N, D] and goals [N, G].
+          noise: one step of the result of `noise`; leaves lead with [N]. By default it is one key per environment.
+          hparams: numbers.
         """
 
     def update(self, state: Any, batch: Batch, hparams: HParams) -> tuple[PyTree, Metrics]:
@@ -71,15 +78,31 @@ class Learner(Protocol):
         """
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> PyTree:
-        """Draws the exploration noise of a whole rollout; leaves lead with [T, N]. One large draw is faster than many small
-        ones.
+        """Draws the exploration noise of a whole rollout, because one large draw is faster than many small ones.
+
+        Args:
+          key: random key.
+          num_steps: T.
+          num_envs: N.
+          hparams: numbers.
+
+        Returns:
+          A pytree whose leaves lead with [T, N].
         """
         return jax.random.split(key, (num_steps, num_envs))
 
     def update_normalizers(self, state: Any, observation: Array, goal: Array, hparams: HParams, valid: Array) -> PyTree:
-        """Updates input statistics with observations [N, T+1, D] and relabelled goals [B, G]. By default does nothing.
+        """Updates the statistics of the inputs. By default does nothing.
 
-        Episodes for which `valid` [N] is False may contain NaN and must be ignored.
+        Args:
+          state: the learner's state.
+          observation: [N, T+1, D] of the rollout's episodes.
+          goal: relabelled goals [B, G].
+          hparams: numbers.
+          valid: bool [N]. Episodes for which it is False may contain NaN and must be ignored.
+
+        Returns:
+          The next state.
         """
         return state
 
