@@ -23,7 +23,7 @@ from mjx_dher.envs import arms
 TASKS = ("arm_reach", "arm_push_easy", "arm_push_hard", "arm_grasp", "arm_binpick_easy")
 NAMES = {"left_finger": "finger_joint1", "right_finger": "finger_joint2"}  # of their joints
 BODY = ("pos", "quat", "mass", "ipos")
-JOINT = ("type", "axis", "pos", "limited", "damping", "armature", "stiffness", "frictionloss")
+JOINT = ("type", "axis", "pos", "limited", "damping", "stiffness", "frictionloss")  # not armature: see envs/arms.py
 WHOLE = (
     *("gainprm", "biasprm", "ctrlrange", "forcerange", "gear", "ctrllimited", "forcelimited", "biastype", "dyntype"),
     *(
@@ -64,7 +64,7 @@ def model_differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> list[str]
     for field in WHOLE:
         name = field if "_" in field else f"actuator_{field}"
         compare(name, getattr(ours, name), getattr(theirs, name))
-    for field in ("integrator", "cone", "impratio", "gravity"):
+    for field in ("cone", "impratio", "gravity"):
         compare(field, getattr(ours.opt, field), getattr(theirs.opt, field))
     if _pairs(ours) != _pairs(theirs):
         different.append("pairs")

@@ -3,6 +3,10 @@
 Numbers are from JaxGCRL 0.2.8 (https://github.com/MichalBortkiewicz/JaxGCRL, jaxgcrl/envs/manipulation), as Brax 0.14.2
 compiles its models. Brax joins bodies without a joint to their parents. The arm thereby loses its defaults: its joints have
 neither damping nor armature, and the hand has no mass. JaxGCRL simulates a free body that shows the goal; here it is drawn.
+
+JaxGCRL runs in MJX with implicit integration. There, a servo damps its joint implicitly even while its force is at its limit;
+in MuJoCo C it does not, and the arm is then several times as fast. Here an armature of timestep * damping does the same on all
+engines, with Euler's integration. Without contacts, both compute the same numbers.
 """
 
 from __future__ import annotations
@@ -47,6 +51,8 @@ _LINKS = (
 _RANGES = {2: "-1.7628 1.7628", 4: "-3.0718 -0.0698", 6: "-0.0175 3.7525"}  # of joints, rad; the others have none
 # Servos: largest torque, N m, gain and stiffness; torque = gain * target - stiffness * (angle + 0.1 s * speed).
 _SERVOS = ((87, 4500, 4500),) * 2 + ((87, 2000, 3500),) * 2 + ((12, 1000, 2000),) * 3
+_FINGER = (500, 0.09804, 500)  # the same for a finger, N
+_TIMESTEP = 0.002  # s
 _HOME = (1.571, 0.742, 0.0, -1.571, 0.0, 3.054, 1.449)  # rad, at the start
 _DRIVEN = (0, 1, 3, 5)  # joints that the action moves
 _LOW, _HIGH = np.array([[0.3491, 0.0, -3.0718, 2.3562], [2.7925, 1.48353, -0.0698, 3.7525]], np.float32)  # their targets, rad
@@ -57,16 +63,21 @@ _WALLS = ((0.0, -0.14, 0.145, 0.005), (0.0, 0.14, 0.145, 0.005), (0.14, 0.0, 0.0
 _COLOURS = {"blue": "0 .2 .8 1", "red": ".8 0 0 1"}
 
 
+def _armature(stiffness: float) -> float:
+    """Armature that stands for the implicit damping of a servo."""
+    return round(_TIMESTEP * 0.1 * stiffness, 9)
+
+
 def _arm(hand: str, link: int = 0) -> str:
     """The links from `link` on, each in the one before; the last one holds `hand`."""
     if link == len(_LINKS):
         return hand
     pos, turn, mass, centre, inertia = _LINKS[link]
-    limits = f' range="{_RANGES[link + 1]}"' if link + 1 in _RANGES else ""
+    limits = f'armature="{_armature(_SERVOS[link][2])}"' + (f' range="{_RANGES[link + 1]}"' if link + 1 in _RANGES else "")
     end = _LINKS[link + 1][0] if link + 1 < len(_LINKS) else "0 0 0.1"
     look = 'type="sphere" size="0.06"' if end == "0 0 0" else f'type="capsule" size="0.05" fromto="0 0 0 {end}"'
     return (
-        f'<body name="link{link + 1}" pos="{pos}" quat="1 {turn} 0 0"><joint name="joint{link + 1}"{limits}/>'
+        f'<body name="link{link + 1}" pos="{pos}" quat="1 {turn} 0 0"><joint name="joint{link + 1}" {limits}/>'
         f'<inertial mass="{mass}" pos="{centre}" fullinertia="{inertia}"/><geom class="look" rgba=".9 .92 .95 1" {look}/>'
         f"{_arm(hand, link + 1)}</body>"
     )
@@ -76,7 +87,8 @@ def _finger(side: str, turn: str) -> str:
     return (
         f'<body name="{side}_finger" pos="0 0 0.1654" quat="{turn}"><inertial mass="0.015" pos="0 0 0"'
         f' diaginertia="2.375e-6 2.375e-6 7.5e-7"/><joint name="{side}_finger" type="slide" axis="0 1 0" range="0 0.05"'
-        f' armature="0.1" damping="5"/><geom name="{side}_finger" type="box" size="0.015 0.005 0.04" pos="0 0.0055 0.035"'
+        f' armature="{0.1 + _armature(_FINGER[2])}" damping="5"/>'
+        f'<geom name="{side}_finger" type="box" size="0.015 0.005 0.04" pos="0 0.0055 0.035"'
         f' rgba=".25 .25 .25 1"/><site name="{side}_tip" pos="0 0.005 0.07"/></body>'
     )
 
@@ -108,7 +120,7 @@ def mjcf(areas: dict[str, tuple[float, float, float]], cube: tuple[float, float]
     qpos, movers, pairs, others = list(_HOME), ["hand"], [("table", "hand")], ""
     if cube is not None:
         hand += _finger("left", "0.923879607 0 0 -0.382683252") + _finger("right", "0.382683252 0 0 0.923879607")
-        servos += [_servo(f"{side}_finger", "0 255", 500, 0.09804, 500) for side in ("left", "right")]
+        servos += [_servo(f"{side}_finger", "0 255", *_FINGER) for side in ("left", "right")]
         qpos = [*cube, 0.07, 1.0, 0.0, 0.0, 0.0, *qpos, 0.04, 0.04]  # the cube falls onto the table
         movers = ["cube", "hand", "left_finger", "right_finger"]
         pairs = [*(("table", each) for each in movers), *(("cube", each) for each in movers[1:])]
@@ -125,7 +137,7 @@ def mjcf(areas: dict[str, tuple[float, float, float]], cube: tuple[float, float]
             pairs += [(f"{colour}{number}", each) for each in movers]
     joined = "" if cube is None else f'<equality><joint {joints} solimp=".95 .99 .001" solref=".005 1"/></equality>'
     return f"""<mujoco><compiler angle="radian"/>
-<option timestep=".002" integrator="implicitfast" impratio="{10 if bins else 1}"/>
+<option timestep="{_TIMESTEP}" impratio="{10 if bins else 1}"/>
 <default><geom contype="0" conaffinity="0"/><default class="look"><geom group="2"/></default></default>
 <worldbody><light pos="0 0 2"/><camera name="front" pos="0 1.9 1.1" xyaxes="-1 0 0 0 -.55 .83"/>
 <geom name="table" type="plane" pos="0 .2 0" size="2.8 2.4 .1" rgba=".85 .85 .85 1"/>{others}{_arm(hand)}</worldbody>

@@ -86,3 +86,12 @@ def test_the_cube_is_gripped_if_the_fingertips_are_around_it():
     np.testing.assert_allclose(
         goal.distance(jnp.stack([wanted, shifted, apart, wide]), wanted), [0.0, 0.8, 0.0, 1.5], atol=1e-6
     )
+
+
+def test_the_arm_moves_as_in_jaxgcrl():
+    """One action from the start; MJX's numbers, of JaxGCRL's model and settings (JaxGCRL 0.2.8, Brax 0.14.2, MuJoCo 3.17.0)."""
+    env = envs.make("arm_reach", engine="native")
+    state = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.array([0.5, -0.5, 0.3, 0.2]))
+    expected = [1.6079, 0.746, -0.0046, -1.503, 0.0004, 3.0013, 1.4116]
+    np.testing.assert_allclose(state.physics.qpos, expected, atol=1e-4)
+    np.testing.assert_allclose(state.physics.qvel, [1.3563, 0.1707, -0.0732, 2.627, 0.0069, -2.0323, -1.4378], atol=1e-3)
