@@ -21,7 +21,7 @@ class Component(NamedTuple):
 _BY_METRIC = ("metric",)
 _WEIGHTED = ("metric", "weight_kernel", "weight_normalization", "temperature", "weight_scale")
 _NOISE = ("noise_std", "random_noise")
-_CRITICS = ("num_critics", "policy_delay")
+_CRITICS = ("num_critics", "policy_delay", "reset_every")
 _SMOOTHING = ("target_noise", "target_noise_clip")
 _ENTROPY = ("entropy_weight", "entropy_target")
 _CONTRAST = ("energy", "contrastive_loss", "representation_size", "same_episode", "logsumexp_penalty")
@@ -174,6 +174,14 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
             (*_CRITICS, *_ENTROPY),
         ),
+        "csac": Component(
+            "mjx_dher.learners.actor_critic:csac", "sac with categorical critics", (*_CRITICS, "num_bins", *_ENTROPY)
+        ),
+        "ctd3": Component(
+            "mjx_dher.learners.actor_critic:ctd3",
+            "td3 with categorical critics",
+            (*_NOISE, *_CRITICS, "num_bins", *_SMOOTHING),
+        ),
         "redq": Component(
             "mjx_dher.learners.actor_critic:redq",
             "REDQ (Chen et al. 2021): SAC with many critics, a random subset per target",
@@ -192,13 +200,14 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "crl": Component(
             "mjx_dher.learners.crl:make",
             "contrastive RL (Eysenbach et al. 2022, JaxGCRL): InfoNCE critic without rewards, stochastic actor",
-            ("policy_delay", *_ENTROPY, *_CONTRAST),
+            ("policy_delay", "reset_every", *_ENTROPY, *_CONTRAST),
         ),
     },
     "networks": {
         "mlp": Component("mjx_dher.networks:mlp", "hidden layers with ReLU"),
         "layer_norm": Component("mjx_dher.networks:layer_norm", "mlp with layer normalization in the critics"),
         "fan_in": Component("mjx_dher.networks:fan_in", "mlp with PyTorch's initialization"),
+        "unit_norm": Component("mjx_dher.networks:unit_norm", "residual, with hidden weights projected to length 1"),
         "residual": Component("mjx_dher.networks:residual", "residual blocks with layer normalization and swish, of any depth"),
     },
 }

@@ -61,6 +61,10 @@ class Config:
     """Return quantiles per critic."""
     dropped_quantiles: Annotated[int, Number("[0, 10000]")] = 2
     """Quantiles per critic dropped from the target, starting with the largest of all critics."""
+    num_bins: Annotated[int, Number("[2, 10000]")] = 101
+    """Values into which a categorical critic classifies the return."""
+    reset_every: Annotated[int, Number("[0, 2000000000]")] = 0
+    """Updates after which actor, critics and their targets are drawn again, a multiple of updates_per_cycle. 0: never."""
     energy: Literal["norm", "l2", "dot", "cosine"] = "norm"
     """Similarity of phi(s, a) and psi(g): minus their distance, minus its square, their product, or its cosine."""
     contrastive_loss: Literal["forward", "backward", "symmetric"] = "forward"

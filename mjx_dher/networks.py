@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -135,6 +135,7 @@ class Networks(NamedTuple):
     # Module or function from an observation tree to a vector [..., D]. Actor and critic train one each.
     # Without it, observations are float vectors, or trees of float vectors, which are concatenated.
     encoder: Any = None
+    project: Callable[[PyTree], PyTree] | None = None  # of the parameters of actor or critic, after each update
 
 
 class Encoded(nn.Module):
@@ -154,7 +155,7 @@ def with_encoder(networks: Networks) -> Networks:
     if networks.encoder is None:
         return networks
     actor, critic = (Encoded(networks.encoder, network) for network in (networks.actor, networks.critic))
-    return Networks(actor, critic, networks.encoder)
+    return networks._replace(actor=actor, critic=critic)
 
 
 class Heads(NamedTuple):
@@ -208,6 +209,28 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
         raise ValueError(f"networks residual need hidden_sizes that are all equal; got {hidden_sizes}")
     style = Style(layer_norm=True, residual=True)
     return _styled(action_size, hidden_sizes, dtype, heads, style, style)
+
+
+def unit_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
+    """`residual` with the weights of each hidden unit projected to length 1 after each update, as in XQC and SimbaV2 (2025).
+
+    Layer normalization makes the outputs independent of these lengths. Kept at 1, they do not grow and lower the effective
+    step size.
+    """
+    return residual(action_size, hidden_sizes, dtype, heads)._replace(project=_to_unit_length)
+
+
+def _to_unit_length(params: PyTree) -> PyTree:
+    """Parameters with columns of length 1 in every linear layer that a layer normalization follows."""
+    if not isinstance(params, Mapping):
+        return params
+    projected = {name: _to_unit_length(value) for name, value in params.items()}
+    for name in params:
+        if name.startswith("Dense_") and name.replace("Dense", "LayerNorm") in params:
+            kernel = params[name]["kernel"]  # [..., in, out]
+            length = jnp.sqrt(jnp.sum(jnp.square(kernel), axis=-2, keepdims=True))
+            projected[name] = {**params[name], "kernel": kernel / jnp.maximum(length, 1e-8)}
+    return projected
 
 
 def _styled(

@@ -22,7 +22,7 @@ from mjx_dher.types import Batch
 from point_mass import PointMass
 from probes import BATCH, LinearActor, spec_of
 
-NAMES = ("td3", "sac", "redq", "tqc", "dtqc")
+NAMES = ("td3", "sac", "csac", "ctd3", "redq", "tqc", "dtqc")
 
 
 def at_night(*names):
@@ -142,7 +142,7 @@ def made(name, **changes):
 
 
 @pytest.mark.slow  # the soft value is the same way
-@pytest.mark.parametrize("name", ["dtqc", "td3"])
+@pytest.mark.parametrize("name", ["dtqc", "td3", "ctd3"])
 def test_critics_learn_a_known_value(name):
     """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma) = -5, whatever the action."""
     learner, _ = made(name)
@@ -195,7 +195,7 @@ def learned_value(learner):
     return value
 
 
-@pytest.mark.parametrize("name", at_night("sac", "dtqc"))
+@pytest.mark.parametrize("name", at_night("csac", "dtqc"))
 def test_the_best_action_of_a_bandit_is_found(name):
     """The reward is -|a - 0.5| / 4 for each number of the action, and the next state is worth the same as all others."""
     learner, _ = made(name)
@@ -311,6 +311,25 @@ def test_what_does_not_combine_is_refused_by_name():
         made("tqc", dropped_quantiles=5)
     with refuses("subset_critics", "num_critics", 3, 4):
         made("redq", subset_critics=4)
+    with refuses("reset_every", "updates_per_cycle", SMALL.updates_per_cycle, 30):
+        made("sac", reset_every=30)
+    with refuses("reward_range", "csac"):
+        learners.make("csac", SMALL, dataclasses.replace(SPEC, reward_range=(-np.inf, 0.0)))
+
+
+def test_resets_draw_new_networks_when_they_are_due_and_keep_the_normalizers():
+    learner = learners.make("sac", dataclasses.replace(SMALL, hidden_sizes=(4,), reset_every=40), SPEC)
+    state, obs, goal = learner.init(jax.random.key(0)), jnp.ones((3, 2, 2)), jnp.ones((5, 2))
+    kernel = lambda state: state.params.critic["params"]["Dense_0"]["kernel"]  # noqa: E731
+    reset = jax.jit(lambda state: learner.update_normalizers(state, obs, goal, HP, jnp.ones(3, bool)))
+    after = {n: reset(dataclasses.replace(state, num_updates=jnp.int32(n))) for n in (0, 20, 40, 80)}
+    assert np.array_equal(kernel(after[0]), kernel(state))
+    assert np.array_equal(kernel(after[20]), kernel(state))
+    assert not np.array_equal(kernel(after[40]), kernel(state))
+    assert not np.array_equal(kernel(after[40]), kernel(after[80]))
+    for n, later in after.items():
+        assert (float(later.goal_norm.count), int(later.num_updates)) == (5.0, n)
+        np.testing.assert_array_equal(later.target.critic["params"]["Dense_0"]["kernel"], kernel(later))
 
 
 @pytest.mark.parametrize(("delay", "period"), [(3, 2), (40, 1), (3, 4)])

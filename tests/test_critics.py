@@ -1,14 +1,20 @@
 """What is made of the values of several critics, beside numbers by hand."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from configs import LEARNS
 
+from mjx_dher import HParams, learners
 from mjx_dher.learners import critics
-from mjx_dher.learners.critics import Critics
+from mjx_dher.learners.critics import Categorical, Critics
 from mjx_dher.networks import Critic, Style
+from mjx_dher.types import Batch
+from probes import spec_of
 
 KEY = jax.random.key(0)
 TWO = jnp.array([[[-1.0], [-4.0]], [[-2.0], [-3.0]]])  # two critics, two samples
@@ -69,6 +75,19 @@ def test_quantile_huber_by_hand():
     # huber's slope is u clipped to [-1, 1]: to 0 it is -1, 1/2, 1; to 1 -1, -1/2, 1.
     slopes = [0.75 * -1 + 0.25 * 0.5 + 0.25 * 1, 0.25 * -1 + 0.25 * -0.5 + 0.75 * 1]
     np.testing.assert_allclose(gradient, [[[-slopes[0] / 6, -slopes[1] / 6]]], rtol=1e-6)
+
+
+def test_two_hot_by_hand():
+    """Five values from -4 to 0: a target of -0.5 is half of -1 and half of 0, one at the end is that end."""
+    categorical = Categorical(1, 5, critics.smallest, critics.two_hot, critics.lowest)
+    shares = np.array([0.1, 0.1, 0.2, 0.4, 0.2])
+    logits = jnp.log(shares)[None, None] + 3.0  # logits have no unit
+    np.testing.assert_allclose(categorical.returns(logits, -4.0, 0.0), [[[-4 * 0.1 - 3 * 0.1 - 2 * 0.2 - 0.4]]], rtol=1e-5)
+    for target, expected in ((-0.5, np.log([0.4, 0.2]).mean()), (0.0, np.log(0.2)), (-4.0, np.log(0.1)), (-1.0, np.log(0.4))):
+        loss = categorical.error(logits, jnp.array([[target]]), -4.0, 0.0)
+        np.testing.assert_allclose(loss, -expected, rtol=1e-5)
+    two = categorical.error(jnp.concatenate([logits, logits]), jnp.array([[-1.0, 0.0]]), -4.0, 0.0)
+    np.testing.assert_allclose(two, -2 * np.log([0.4, 0.2]).mean(), rtol=1e-5)  # summed over critics, a mean over atoms
 
 
 def plain_loss(values, atoms):
@@ -140,3 +159,19 @@ def test_layer_norm_normalizes_before_each_relu():
         x = np.maximum(x * np.asarray(layers[f"LayerNorm_{i}"]["scale"]) + np.asarray(layers[f"LayerNorm_{i}"]["bias"]), 0)
     expected = x @ np.asarray(layers["Dense_2"]["kernel"]) + np.asarray(layers["Dense_2"]["bias"])
     np.testing.assert_allclose(network.apply(params, *inputs), expected[:, 0], rtol=1e-4)
+
+
+def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1():
+    learner = learners.make(
+        "td3", dataclasses.replace(LEARNS, hidden_sizes=(4, 4), num_critics=1), spec_of(2, 2, 2), "unit_norm"
+    )
+    ones = jnp.ones((8, 2))
+    batch = Batch(ones, ones, ones, ones, -ones[:, 0], ones[:, 0], jnp.arange(8))
+    before = learner.init(jax.random.key(0)).params
+    params = jax.jit(learner.update)(learner.init(jax.random.key(0)), batch, HParams())[0].params
+    for tree, start in ((params.critic, before.critic), (params.actor, before.actor)):
+        layers, old = tree["params"], start["params"]
+        for name in ("Dense_0", "Dense_1"):
+            np.testing.assert_allclose(np.linalg.norm(layers[name]["kernel"], axis=-2), 1.0, rtol=1e-5)
+        assert not np.allclose(np.linalg.norm(old["Dense_0"]["kernel"], axis=-2), 1.0, rtol=1e-3)
+        assert np.abs(layers["Dense_2"]["kernel"] - old["Dense_2"]["kernel"]).max() < 0.01  # a step of Adam, and no more

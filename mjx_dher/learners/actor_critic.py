@@ -1,4 +1,4 @@
-"""TD3, SAC, REDQ, TQC and DTQC: one update for an actor (`actors`) and several critics (`critics`).
+"""TD3, SAC, their categorical forms, REDQ, TQC and DTQC: one update for an actor (`actors`) and several critics (`critics`).
 
     y = clip(r + discount (combine(Q'_1..C(s', a')) - cost(a')))
     critics: one Adam step on loss(Q_1..C(s, a), y)
@@ -10,6 +10,7 @@ Targets, including the entropy term, are clipped to the bounds of returns (Hirao
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,8 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common, critics
 from mjx_dher.learners.actors import ActorKind, Deterministic, Gaussian
 from mjx_dher.learners.common import ActorCriticBase, Params
-from mjx_dher.learners.critics import Critics
-from mjx_dher.networks import Heads, NetworksFn, check_heads, zeros
+from mjx_dher.learners.critics import Categorical, Critics
+from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, zeros
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
@@ -69,7 +70,12 @@ class ActorCritic(ActorCriticBase):
         inputs = *self.normalize(state, obs["observation"], obs["desired_goal"], hparams), action
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[action.ndim - 1 :]), inputs)
         judges = self.critics.judges(state.params.critic)
-        return self.critics.judge(critics.values(self.networks.critic, judges, *flat)).reshape(action.shape[:-1])
+        return self.critics.judge(self.returns(self.networks, judges, hparams, *flat)).reshape(action.shape[:-1])
+
+    def returns(self, networks: Networks, params: PyTree, hparams: HParams, *inputs: PyTree) -> Array:
+        """Estimated returns [C, B, K] by critics with `params`, of normalized observations and goals, and actions."""
+        outputs = critics.values(networks.critic, params, *inputs)
+        return self.critics.returns(outputs, *self.return_bounds(hparams))
 
     def update(
         self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool = True
@@ -78,11 +84,12 @@ class ActorCritic(ActorCriticBase):
         batch = self.normalize_batch(state, batch, hparams)
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates)
         target_key, actor_key = jax.random.split(key)
-        atoms = self.target(state, batch, hparams, target_key)
+        atoms, bounds = self.target(state, batch, hparams, target_key), self.return_bounds(hparams)
 
         def critic_loss(critic: PyTree) -> tuple[Array, Array]:
-            values = critics.values(self.learning.critic, critic, batch.observation, batch.desired_goal, batch.action)
-            return self.critics.loss(values, atoms), jnp.mean(values)
+            outputs = critics.values(self.learning.critic, critic, batch.observation, batch.desired_goal, batch.action)
+            returns = self.critics.returns(outputs, *bounds)
+            return self.critics.error(outputs, atoms, *bounds), jnp.mean(returns)
 
         critic, critic_moments, loss, q_mean = self.descend(
             critic_loss, state.params.critic, state.critic_moments, hparams.critic_lr, hparams
@@ -105,7 +112,7 @@ class ActorCritic(ActorCriticBase):
         params = state.target.actor if self.actor.has_target else state.params.actor
         inputs, normal = (batch.next_observation, batch.desired_goal), self.normal(action_key, batch.action.shape)
         action, cost = self.actor.next_action(self.learning.actor, params, *inputs, normal, hparams)
-        following = critics.values(self.learning.critic, state.target.critic, *inputs, action)
+        following = self.returns(self.learning, state.target.critic, hparams, *inputs, action)
         future = (self.critics.combine(following, combine_key) - cost[:, None]).T  # [K, B]
         return jnp.clip(batch.reward + batch.discount * future, *self.return_bounds(hparams)).T
 
@@ -116,7 +123,7 @@ class ActorCritic(ActorCriticBase):
         judges = self.critics.judges(state.params.critic)
 
         def judge(action: Array) -> Array:
-            return self.critics.judge(critics.values(self.learning.critic, judges, *inputs, action))
+            return self.critics.judge(self.returns(self.learning, judges, hparams, *inputs, action))
 
         def actor_loss(actor: PyTree) -> tuple[Array, Metrics]:
             return self.actor.loss(self.learning.actor, actor, *inputs, judge, normal, hparams)
@@ -130,9 +137,12 @@ class ActorCritic(ActorCriticBase):
 
 def _make(name: str, config: Config, spec: EnvSpec, networks: NetworksFn, actor: ActorKind, parts: Critics) -> ActorCritic:
     check_heads(networks, name)
+    if isinstance(parts, Categorical) and not all(map(math.isfinite, spec.reward_range)):
+        raise ValueError(f"reward_range must be finite for learner {name}, which classifies returns; got {spec.reward_range}")
     heads = Heads(gaussian=actor.is_gaussian, critic_size=parts.size)
     acting, learning = common.make_networks(name, config, spec, networks, heads)
-    return ActorCritic(spec, acting, learning, actor, critics=parts, policy_delay=config.policy_delay)
+    resets = common.reset_period(config)
+    return ActorCritic(spec, acting, learning, actor, reset_every=resets, critics=parts, policy_delay=config.policy_delay)
 
 
 def td3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
@@ -153,6 +163,20 @@ def sac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """
     parts = Critics(config.num_critics, 1, critics.smallest, critics.squared_error, critics.lowest)
     return _make("sac", config, spec, networks, Gaussian(), parts)
+
+
+def csac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
+    """SAC with critics that classify the return into `num_bins` values (`Categorical`)."""
+    return _make("csac", config, spec, networks, Gaussian(), _bins(config))
+
+
+def ctd3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
+    """TD3 with critics that classify the return into `num_bins` values (`Categorical`)."""
+    return _make("ctd3", config, spec, networks, Deterministic(), _bins(config))
+
+
+def _bins(config: Config) -> Critics:
+    return Categorical(config.num_critics, config.num_bins, critics.smallest, critics.two_hot, critics.lowest)
 
 
 def redq(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:

@@ -64,6 +64,7 @@ class ActorCriticBase(Learner):
     learning: Networks  # in the learner's dtype, with the same parameters; used in updates
     actor: ActorKind = dataclasses.field(default_factory=Deterministic)
     axis_name: str | None = None  # mapped axis of the devices that share the run
+    reset_every: int = 0  # updates after which networks are drawn again (`Config.reset_every`); the state then needs a `key`
 
     def normalizers(self) -> dict[str, PyTree]:
         """Empty normalizers of observations and goals, by their names in the state."""
@@ -75,11 +76,19 @@ class ActorCriticBase(Learner):
     ) -> State:
         """Adds goals [B, G], and observations [N, T+1, D] for which `valid` [N] or [N, T+1] is True, to the normalizers."""
         clip, any_valid = hparams.obs_clip, None if valid is None else jnp.any(valid)
-        return dataclasses.replace(
+        state = dataclasses.replace(
             state,
             observation_norm=normalizer.update(state.observation_norm, observation, clip, valid, self.axis_name),
             goal_norm=normalizer.update(state.goal_norm, goal, clip, any_valid, self.axis_name),
         )
+        return self._reset(state) if self.reset_every else state
+
+    def _reset(self, state: State) -> State:
+        """State with new networks and Adam moments once every `reset_every` updates (Nikishin et al. 2022)."""
+        fresh = self.init(jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates))
+        kept = {name: getattr(state, name) for name in ("observation_norm", "goal_norm", "key", "num_updates")}
+        due = (state.num_updates > 0) & (state.num_updates % self.reset_every == 0)
+        return jax.tree.map(lambda new, old: jnp.where(due, new, old), dataclasses.replace(fresh, **kept), state)
 
     def normalize(self, state: State, observation: PyTree, goal: Array, hparams: HParams) -> tuple[PyTree, Array]:
         """Inputs of the networks: normalized observations [..., D], or trees for an encoder, and goals [..., G]."""
@@ -141,7 +150,11 @@ class ActorCriticBase(Learner):
         """
         (value, more), gradient = jax.value_and_grad(loss, has_aux=True)(params)
         updates, moments = adam(rate, hparams.adam_eps).update(self.mean(gradient), moments)
-        return optax.apply_updates(params, updates), moments, value, more
+        return self.project(optax.apply_updates(params, updates)), moments, value, more
+
+    def project(self, params: Tree) -> Tree:
+        """Parameters after `Networks.project`, if there is one."""
+        return params if self.networks.project is None else self.networks.project(params)
 
     def mean(self, gradients: Tree) -> Tree:
         """Mean of the gradients over the devices that share the run."""
@@ -153,6 +166,15 @@ class ActorCriticBase(Learner):
             return jax.random.normal(key, shape, jnp.float32)
         whole = jax.random.normal(key, (shape[0] * jax.lax.axis_size(self.axis_name), *shape[1:]), jnp.float32)
         return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(self.axis_name) * shape[0], shape[0])
+
+
+def reset_period(config: Config) -> int:
+    """Updates between resets. Raises ValueError unless resets are due at the beginnings of cycles."""
+    if config.reset_every % config.updates_per_cycle:
+        raise ValueError(
+            f"reset_every must be a multiple of updates_per_cycle ({config.updates_per_cycle}), or 0; got {config.reset_every}"
+        )
+    return config.reset_every
 
 
 def make_networks(

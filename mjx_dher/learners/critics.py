@@ -40,6 +40,40 @@ class Critics:
         """Parameters of the critics that judge the actor's actions."""
         return jax.tree.map(lambda x: x[: self.num_judges], params)
 
+    def returns(self, outputs: Array, low: Array | float, high: Array | float) -> Array:
+        """Estimated returns [C, B, K] of the networks' outputs [C, B, M], for returns in [low, high]."""
+        del low, high
+        return outputs
+
+    def error(self, outputs: Array, atoms: Array, low: Array | float, high: Array | float) -> Array:
+        """Loss [] of the networks' outputs [C, B, M] for a target's atoms [B, K], for returns in [low, high]."""
+        del low, high
+        return self.loss(outputs, atoms)
+
+
+class Categorical(Critics):
+    """Critics that classify the return: M logits for M values, evenly spaced over all possible returns.
+
+    They learn by cross-entropy to the target as a mixture of its two nearest values, whose mean is the target ("two-hot",
+    Farebrother et al. 2024, "Stop Regressing"). `loss` takes logits, and atoms in [0, M - 1].
+    """
+
+    def returns(self, outputs: Array, low: Array | float, high: Array | float) -> Array:
+        """Mean returns [C, B, 1]."""
+        share = jnp.linspace(0.0, 1.0, self.size)
+        return low + (high - low) * jnp.sum(jax.nn.softmax(outputs) * share, axis=-1, keepdims=True)
+
+    def error(self, outputs: Array, atoms: Array, low: Array | float, high: Array | float) -> Array:
+        """Cross-entropy []."""
+        return self.loss(outputs, (atoms - low) / (high - low) * (self.size - 1))
+
+
+def two_hot(logits: Array, atoms: Array) -> Array:
+    """Cross-entropy of logits [C, B, M] to atoms [B, K] in [0, M - 1]; means over samples and atoms, summed over critics."""
+    distance = jnp.abs(atoms[..., None] - jnp.arange(logits.shape[-1], dtype=atoms.dtype))
+    target = jnp.mean(jnp.maximum(1.0 - distance, 0.0), axis=1)
+    return -jnp.sum(jnp.mean(jnp.sum(target * jax.nn.log_softmax(logits), axis=-1), axis=-1))
+
 
 def values(network: Any, params: PyTree, observation: Array, goal: Array, action: Array) -> Array:
     """Values [C, B, M] of C critics."""

@@ -180,4 +180,5 @@ def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> CRL:
         loss=config.contrastive_loss,
         mask=config.same_episode == "masked",
         policy_delay=config.policy_delay,
+        reset_every=common.reset_period(config),
     )
