@@ -8,7 +8,7 @@ if an episode ended with a value that is not finite, an object faster than 10 m/
 
 The contacts are as soft as the original's. In six tries of slamming from above, the original's cube sinks up to 50 mm into the
 table (47 mm here), and its puck up to 45 mm. Slide on native exits with 1: in 20,000 episodes its puck once sinks 63 mm
-(bench/README.md).
+(bench/slams.md).
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def test_physics_survives_10_000_slams(task):
 @pytest.mark.parametrize("engine", ["native", "jax", "warp"])
 def test_physics_survives_a_million_slams(task, engine, request):
     if (task, engine) == ("slide", "native"):
-        request.applymarker(pytest.mark.xfail(strict=True, reason="the puck sinks 63 mm once; see bench/README.md"))
+        request.applymarker(pytest.mark.xfail(strict=True, reason="the puck sinks 63 mm once; see bench/slams.md"))
     if engine == "warp" and jax.default_backend() == "cpu":
         pytest.skip("warp needs an NVIDIA GPU")
     survives("--tasks", task, "--engine", engine, "--actions", "1000000")

@@ -22,7 +22,7 @@ DOCUMENTS = {
         *ROOT.glob(".github/**/*.md"),
         *ROOT.glob("docs/**/*.md"),
         *ROOT.glob("mjx_dher/**/*.md"),
-        ROOT / "bench" / "README.md",
+        *ROOT.glob("bench/*.md"),
     ]
     if path.name not in ("CHANGELOG.md", "history.md")  # they tell of what there was
 }

@@ -10,7 +10,7 @@ prose = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(prose)
 
 START = [ROOT / name for name in ("README.md", "docs/index.md", "docs/start.md")]
-PAGES = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+PAGES = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")]
 
 
 def test_the_first_pages_are_easy_to_read():
