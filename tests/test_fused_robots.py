@@ -19,7 +19,18 @@ SHAPES = (
 EGG = '<geom type="ellipsoid" size="0.06 0.05 0.08"/>'
 
 
-FEATURES = ("friction", "tendon friction", "tendon limits", "joints", "tendons", "connect", "weld", "elliptic")
+FEATURES = (
+    "friction",
+    "tendon friction",
+    "tendon limits",
+    "joints",
+    "tendons",
+    "connect",
+    "weld",
+    "springs",
+    "motors",
+    "elliptic",
+)
 
 
 def few_terms(rng, names, features):
@@ -35,7 +46,9 @@ def few_terms(rng, names, features):
         terms = "".join(f'<joint joint="{name}" coef="{numbers(1)}"/>' for name in rng.permutation(names)[: 1 + number])
         friction = 'frictionloss="1.5" solreffriction="0.03 1.5"' if "tendon friction" in features and number % 2 else ""
         limits = 'range="-0.05 0.1" margin="0.01"' if "tendon limits" in features else ""
-        tendons += f'<fixed name="t{number}" {limits} {friction}>{terms}</fixed>'
+        springs = f'stiffness="{numbers(1, 0, 50)}" damping="{numbers(1, 0, 3)}" springlength="-0.02 0.05"'
+        springs = springs if "springs" in features else ""
+        tendons += f'<fixed name="t{number}" {limits} {friction} {springs}>{terms}</fixed>'
     equal = {
         "joints": f'<joint joint1="{first}" joint2="{second}" polycoef="{numbers(5, -0.1, 0.1)}" solref="0.05 1"/>'
         f'<joint joint1="{third}" polycoef="0.05 0 0 0 0"/>',
@@ -43,7 +56,11 @@ def few_terms(rng, names, features):
         "connect": '<connect body1="box1" body2="link2" anchor="0.3 0 0"/><connect body1="link3" anchor="0 0 0.1"/>',
         "weld": '<weld body1="t" body2="box0" relpose="0 0 0 1 0 0 0"/>',
     }
-    return f"<tendon>{tendons}</tendon><equality>{''.join(equal.get(feature, '') for feature in features)}</equality>"
+    motors = f'<position tendon="t1" kp="20" kv="{numbers(1, 0, 3)}" gear="{numbers(1)}"/><motor tendon="t1" gear="-2"/>'
+    motors += '<general tendon="t3" gainprm="3" biastype="affine" biasprm="0.1 -2 -1" forcerange="-1 1"/>'
+    equalities = "".join(equal.get(feature, "") for feature in features)
+    actuators = motors if "motors" in features else ""
+    return f"<tendon>{tendons}</tendon><equality>{equalities}</equality><actuator>{actuators}</actuator>"
 
 
 def robot(seed, features=()):
@@ -128,6 +145,6 @@ def test_a_timestep_of_a_random_robot_is_mujoco_c_s(seed, features, monkeypatch)
     simulation.advance(state, floats(inputs), tuple(here))
     assert simulation.overflow() == 0
     assert there[0].max() > 12
-    for name, a, b, scale in zip(("qpos", "qvel", "qacc"), here, there[:0:-1], (1e-6, 1e-4, 1e-4)):
+    for name, a, b, scale in zip(("qpos", "qvel", "qacc"), here, there[:0:-1], (2e-6, 1e-4, 1e-4)):
         error = np.quantile(np.abs(a.numpy() - b).max(axis=1), 0.8)
         assert error < scale * np.abs(b).max(), name

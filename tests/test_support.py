@@ -61,10 +61,13 @@ def test_unsupported_features_are_named_with_their_elements():
         (welded('<option><flag gravity="disable"/></option>'), ["options disabled"]),
         (welded('<option density="1.2"/>'), ["medium"]),
         (welded(SPATIAL), ["tendons that are not fixed", "'far'"]),
-        (welded('<tendon><fixed name="f" damping="1"><joint joint="j" coef="1"/></fixed></tendon>'), ["tendon_damping", "'f'"]),
+        (
+            welded('<tendon><fixed name="f" armature="1"><joint joint="j" coef="1"/></fixed></tendon>'),
+            ["tendon_armature", "'f'"],
+        ),
         (welded('<default><joint stiffness="1 2"/></default>'), ["springs", "'j'"]),
         (welded('<option noslip_iterations="3"/>'), ["noslip"]),
-        (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints"]),
+        (welded('<actuator><motor site="s"/></actuator><worldbody><site name="s"/></worldbody>'), ["not on joints or tendons"]),
         (welded(motor.format('dyntype="filter"')), ["activations", "actuators with a state", "'m'"]),
         (welded(motor.format('delay="0.006" nsample="4"')), ["delays", "'m'"]),
         (welded('<equality><weld name="c" body1="b" torquescale="2"/></equality>'), ["equality constraints other than", "'c'"]),
@@ -113,7 +116,7 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
     checked = [name for name, _ in fields(model) if has_default(name)]
     assert len(checked) > 30
     assert {
-        "tendon_stiffness",
+        "tendon_armature",
         "geom_surfacevel",
         "actuator_armature",
         "pair_adhesion",

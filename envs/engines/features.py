@@ -21,7 +21,6 @@ _WORDS = {
     "nhistory": "delays",
     "na": "activations",
     "actuator_dyntype": "actuators with a state",
-    "actuator_trntype": "actuators that are not on joints",
     "actuator_gaintype": "actuators whose gain varies",
     "actuator_delay": "delays",
     "body_gravcomp": "gravity compensation",

@@ -5,6 +5,7 @@ the bodies of a subtree: a walk along the tree would leave all threads but one i
 """
 
 from mjx_dher.envs.engines.fused.model import FREE, HINGE, MOCAP, SLIDE, STILL, Bodies, Dofs, Memory, World
+from mjx_dher.envs.engines.fused.tendons import actuation, pull
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
@@ -192,7 +193,15 @@ def rne(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, t
 
 
 @wp.func
-def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
+def smooth_forces(
+    bodies: Bodies,
+    dofs: Dofs,
+    memory: Memory,
+    inputs: wp.array(dtype=float),
+    has_tendons: bool,
+    thread: int,
+    threads: int,
+):
     """Computes `smooth`, all forces except constraint forces, and `momentum` of each degree of freedom."""
     for i in range(thread, dofs.number, threads):
         motion = memory.motion[i]
@@ -208,7 +217,11 @@ def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(d
         for a in range(dofs.actuators):
             if dofs.actuator_dof[a] == i:
                 control = inputs[dofs.first_control + a]
-                drive += _actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+                drive += actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+        if has_tendons:
+            forces = pull(dofs, memory, inputs, i)
+            smooth += forces[0]
+            drive += forces[1]
         memory.smooth[i] = smooth + wp.clamp(drive, dofs.drive[i][0], dofs.drive[i][1])
     sync(threads)
 
@@ -235,15 +248,6 @@ def _passive(dofs: Dofs, memory: Memory, i: int) -> float:
 
 
 @wp.func
-def _actuation(dofs: Dofs, a: int, control: float, length: float, velocity: float) -> float:
-    """Force of an actuator on its joint."""
-    clip = dofs.actuator_clip[a]
-    factors = dofs.actuator_force[a]
-    force = factors[0] + factors[1] * length + factors[2] * velocity + factors[3] * wp.clamp(control, clip[0], clip[1])
-    return wp.clamp(force, clip[2], clip[3])
-
-
-@wp.func
 def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> float:
     """Minus the derivative of forces by the velocity of a degree of freedom, for the integrator."""
     all_of_it = dofs.damping[i]
@@ -252,7 +256,7 @@ def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -
             if dofs.actuator_dof[a] == i:
                 clip = dofs.actuator_clip[a]
                 control = inputs[dofs.first_control + a]
-                force = _actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
+                force = actuation(dofs, a, control, memory.qpos[dofs.actuator_qpos[a]], memory.qvel[i])
                 if force > clip[2] and force < clip[3]:
                     all_of_it -= dofs.actuator_force[a][2]
     return all_of_it

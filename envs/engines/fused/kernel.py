@@ -27,6 +27,7 @@ from mjx_dher.envs.engines.fused.near import keep, memory_of, near_pairs
 from mjx_dher.envs.engines.fused.round import collide_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.sparse import ask_sparse
+from mjx_dher.envs.engines.fused.tendons import soften
 from mjx_dher.envs.engines.fused.threads import gather, sync
 from mjx_dher.system.warp_setup import wp
 
@@ -69,6 +70,7 @@ def _forces(
     dofs: Dofs,
     memory: Memory,
     given: wp.array(dtype=float),  # type: ignore[valid-type]
+    has_tendons: bool,
     warps: int,
     thread: int,
     threads: int,
@@ -83,36 +85,9 @@ def _forces(
     gather(warps)
     rne(world, bodies, dofs, memory, thread, threads)
     gather(warps)
-    smooth_forces(bodies, dofs, memory, given, thread, threads)
+    smooth_forces(bodies, dofs, memory, given, has_tendons, thread, threads)
     gather(warps)
     crb(bodies, dofs, memory, thread, threads)
-
-
-@wp.func
-def _go_on(
-    world: World,
-    bodies: Bodies,
-    dofs: Dofs,
-    sparse: Sparse,
-    memory: Memory,
-    given: wp.array(dtype=float),  # type: ignore[valid-type]
-    has_sparse: bool,
-    elliptic: bool,
-    nv: int,
-    warps: int,
-    thread: int,
-    threads: int,
-):
-    """Advances velocities and places."""
-    if has_sparse:
-        gather(warps)
-        ask_sparse(sparse, memory, thread, threads)
-    gather(warps)
-    solve(world, sparse, memory, has_sparse, elliptic, nv, thread, threads)
-    gather(warps)
-    accelerate(world, bodies, dofs, sparse, memory, given, has_sparse, elliptic, nv, thread, threads)
-    gather(warps)
-    integrate(world, bodies, memory, thread, threads)
 
 
 class Traits(NamedTuple):
@@ -122,7 +97,50 @@ class Traits(NamedTuple):
     edges: int  # most rows that a contact has
     few: bool  # whether there is memory for the contacts of all pairs at once; else those that are near are looked for
     has_sparse: bool  # whether there are rows of `Sparse`
+    has_tendons: bool  # whether there are `Tendons`
     elliptic: bool  # whether friction cones are elliptic
+
+
+def _ending(traits: Traits, nv: int, warps: int) -> Any:
+    """Returns the function that advances velocities and places."""
+    has_sparse, has_tendons, elliptic = traits.has_sparse, traits.has_tendons, traits.elliptic
+
+    @wp.func
+    def end(
+        world: World,
+        bodies: Bodies,
+        dofs: Dofs,
+        sparse: Sparse,
+        memory: Memory,
+        given: wp.array(dtype=float),  # type: ignore[valid-type]
+        thread: int,
+        threads: int,
+    ):
+        if wp.static(has_sparse):
+            gather(wp.static(warps))
+            ask_sparse(sparse, memory, thread, threads)
+        gather(wp.static(warps))
+        solve(world, sparse, memory, wp.static(has_sparse), wp.static(elliptic), wp.static(nv), thread, threads)
+        gather(wp.static(warps))
+        if wp.static(has_tendons):
+            soften(world, dofs, memory, given, thread, threads)
+        accelerate(
+            world,
+            bodies,
+            dofs,
+            sparse,
+            memory,
+            given,
+            wp.static(has_sparse),
+            wp.static(elliptic),
+            wp.static(nv),
+            thread,
+            threads,
+        )
+        gather(wp.static(warps))
+        integrate(world, bodies, memory, thread, threads)
+
+    return end
 
 
 def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
@@ -216,7 +234,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits)
       threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
     """
     shared = warps * (32 // threads_per_env) * floats
-    constrain = _constraining(traits, warps)
+    constrain, end = _constraining(traits, warps), _ending(traits, nv, warps)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def advance(
@@ -249,12 +267,9 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits)
         memory = carve(layout, own, threads)
         _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], thread, threads)
         for _substep in range(substeps):
-            _forces(world, bodies, dofs, memory, inputs[env], wp.static(warps), thread, threads)
+            _forces(world, bodies, dofs, memory, inputs[env], wp.static(traits.has_tendons), wp.static(warps), thread, threads)
             constrain(world, bodies, dofs, contacts, memory, layout, own, lost, thread, threads)
-            has, cones = wp.static(traits.has_sparse), wp.static(traits.elliptic)
-            _go_on(
-                world, bodies, dofs, sparse, memory, inputs[env], has, cones, wp.static(nv), wp.static(warps), thread, threads
-            )
+            end(world, bodies, dofs, sparse, memory, inputs[env], thread, threads)
         _end(memory, qpos[env], qvel[env], guess[env], thread, threads)
 
     return advance

@@ -41,6 +41,24 @@ class Bodies:
 
 
 @wp.struct
+class Tendons:
+    """Fixed tendons with a spring, a damper or an actuator. Each is a sum of terms, which are coefficients of joints."""
+
+    number: int
+    terms: int
+    tendon: _ints  # [terms] number of its tendon
+    begin: _ints  # [number + 1] first term of a tendon
+    dof: _ints  # [terms]
+    qpos: _ints  # [terms] index of the coordinate
+    coef: _floats  # [terms]
+    stiffness: _floats
+    damping: _floats
+    spring: wp.array(dtype=wp.vec2)  # lengths between which the spring is slack
+    drive: wp.array(dtype=wp.vec2)  # least and most force of all actuators on it
+    actuator_tendon: _ints  # [actuators] or -1
+
+
+@wp.struct
 class Dofs:
     """Degrees of freedom [nv], and the joint limits and actuators on them."""
 
@@ -61,10 +79,11 @@ class Dofs:
     limit_soft: _soft
     limit_weight: _floats  # inverse inertia
     actuators: int
-    actuator_dof: _ints
+    actuator_dof: _ints  # or -1
     actuator_qpos: _ints
     actuator_force: wp.array(dtype=wp.vec4)  # for each of: 1, length, velocity; and the control
     actuator_clip: wp.array(dtype=wp.vec4)  # least and most control; least and most force
+    tendons: Tendons
 
 
 @wp.struct

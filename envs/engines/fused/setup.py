@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
-from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, World
+from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, Tendons, World
 from mjx_dher.envs.engines.pairs import all_pairs
 from mjx_dher.system.warp_setup import wp
 
@@ -145,13 +145,41 @@ def is_sparse(model: mujoco.MjModel) -> bool:
     return bool(np.any(model.dof_frictionloss > 0) or model.ntendon or np.any(model.eq_type >= JOINT))
 
 
+def _tendons_of(model: mujoco.MjModel) -> Any:
+    """Returns `Tendons` of a model: those with a spring, a damper or an actuator."""
+    on_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    driven = model.actuator_trnid[on_tendon, 0]
+    pulls = (model.tendon_stiffness != 0) | (model.tendon_damping != 0) | np.isin(np.arange(model.ntendon), driven)
+    which = np.flatnonzero(pulls)
+    terms = [term for each in which for term in range(model.tendon_adr[each], model.tendon_adr[each] + model.tendon_num[each])]
+    joint, tendon = model.wrap_objid[terms], np.repeat(np.arange(len(which)), model.tendon_num[which])
+    actuator = np.full(model.nu, -1)
+    actuator[on_tendon] = np.searchsorted(which, driven)
+    return fill(
+        Tendons,
+        number=len(which),
+        terms=len(terms),
+        tendon=tendon,
+        begin=np.searchsorted(tendon, np.arange(len(which) + 1)),
+        dof=model.jnt_dofadr[joint],
+        qpos=model.jnt_qposadr[joint],
+        coef=model.wrap_prm[terms],
+        stiffness=model.tendon_stiffness[which],
+        damping=model.tendon_damping[which],
+        spring=model.tendon_lengthspring[which],
+        drive=np.where(model.tendon_actfrclimited[which, None], model.tendon_actfrcrange[which], [-np.inf, np.inf]),
+        actuator_tendon=actuator,
+    )
+
+
 def dofs_of(model: mujoco.MjModel) -> Any:
     """Returns `Dofs` of a model."""
     joints = model.dof_jntid
     scalar = np.isin(model.jnt_type[joints], [int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)])
     qpos = np.where(scalar, model.jnt_qposadr[joints], 0)
     limited = np.flatnonzero(model.jnt_limited if not is_sparse(model) else [])
-    driven = model.actuator_trnid[:, 0]
+    on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    driven = np.where(on_joint, model.actuator_trnid[:, 0], 0)
     gear, gain, bias = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
     everything = np.array([-np.inf, np.inf])
     links = links_of(model)
@@ -176,8 +204,9 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         limit_soft=[softness(model, *soft) for soft in zip(model.jnt_solref[limited], model.jnt_solimp[limited])],
         limit_weight=model.dof_invweight0[model.jnt_dofadr[limited]],
         actuators=model.nu,
-        actuator_dof=model.jnt_dofadr[driven],
+        actuator_dof=np.where(on_joint, model.jnt_dofadr[driven], -1),
         actuator_qpos=model.jnt_qposadr[driven],
+        tendons=_tendons_of(model),
         actuator_force=np.stack([gear * bias[:, 0], gear**2 * bias[:, 1], gear**2 * bias[:, 2], gear * gain], axis=1),
         actuator_clip=np.concatenate(
             [

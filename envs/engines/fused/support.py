@@ -14,7 +14,7 @@ from mjx_dher.envs.engines.pairs import all_pairs
 _READ = re.compile(
     "|".join(
         [
-            r"actuator_(biasprm|biastype|ctrllimited|ctrlrange|forcelimited|forcerange|gainprm|gear|trnid)",
+            r"actuator_(biasprm|biastype|ctrllimited|ctrlrange|forcelimited|forcerange|gainprm|gear|trnid|trntype)",
             r"body_(inertia|invweight0|ipos|iquat|jntadr|jntnum|mass|mocapid|parentid|pos|quat|rootid)",
             r"dof_(armature|damping|frictionloss|invweight0|jntid|solimp|solref)|eq_(data|obj1id|obj2id|objtype|solimp|solref|type)",
             r"geom_(bodyid|conaffinity|condim|contype|friction|margin|pos|priority|quat|rbound|size|solimp|solmix|solref|type)",
@@ -22,7 +22,8 @@ _READ = re.compile(
             r"jnt_(actfrclimited|actfrcrange|axis|dofadr|limited|margin|pos|qposadr|range|solimp|solref|stiffness|type)",
             r"opt\.(cone|disableflags|gravity|impratio|integrator|iterations|ls_iterations|timestep|tolerance)",
             r"pair_(dim|friction|geom1|geom2|margin|solimp|solref|solreffriction)",
-            r"tendon_(adr|frictionloss|invweight0|limited|margin|num|range|solimp_fri|solimp_lim|solref_fri|solref_lim)",
+            r"tendon_(actfrclimited|actfrcrange|adr|damping|frictionloss|invweight0|lengthspring|limited|margin)",
+            r"tendon_(num|range|sol(imp|ref)_(fri|lim)|stiffness)",
         ]
     )
 )
@@ -35,7 +36,7 @@ _WITHOUT_EFFECT = re.compile(
             r".*_(user|group|rgba|matid)|names|names_map|paths|signature|stat|vis",
             r"n(?!flex$|plugin$|history$|a$)[a-zA-Z0-9]+(_\w+)?",
             # What follows from other fields, or is empty without flexes and plugins.
-            r"(ten|flex\w*|plugin|efm0|efmC|tree)_.*|plugin|tendon_(actfrcrange|actuatorid|length0|lengthspring|tree\w+|width)",
+            r"(ten|flex\w*|plugin|efm0|efmC|tree)_.*|plugin|tendon_(actuatorid|length0|tree\w+|width)",
             r"[BDM]_\w+|map\w+|dof_(M0|Madr|bodyid|length|parentid|simplenum|treeid)|jnt_(bodyid|actuatorid)|pair_signature",
             r"body_(bvh\w+|conaffinity|contype|dofadr|dofnum|geom\w+|margin|sameframe|simple|subtreemass|treeid|weldid)",
             r"geom_(aabb|sameframe|dataid)|actuator_(acc0|ctrladr|ctrlnum|ctrlspec|outadr|outnum|length0|lengthrange|historyadr)",
@@ -70,6 +71,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     scalar = np.isin(model.jnt_type, (_HINGE, _SLIDE))
     on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = model.jnt_type[np.where(on_joint, model.actuator_trnid[:, 0], 0)] if model.njnt else on_joint
+    known = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)]
     biases = [int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)]
     features = {
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
@@ -78,6 +80,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("tendon", "tendons that are not fixed"): _not_fixed(model),
         ("jnt", "free bodies, with implicitfast, that have parts or are not centred on their mass"): _off_centre(model),
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
+        ("actuator", "actuators that are not on joints or tendons"): ~np.isin(model.actuator_trntype, known),
         ("actuator", "actuators of free or ball joints"): on_joint & ~np.isin(driven, (_HINGE, _SLIDE)),
     }
     for (kind, what), which in features.items():
