@@ -1,4 +1,4 @@
-"""`Simulator` with few states of small models, beside a plain loop over `mj_step`, on one core or more.
+"""`Simulator` with few states of small models, compared with a plain loop over `mj_step`, on one core or more.
 
     python bench/few_states.py [--states 1 2 4] [--hz 25] [--cpu-time]
 

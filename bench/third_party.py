@@ -1,4 +1,4 @@
-"""Models of others on each engine, beside a loop over `mj_step`.
+"""Third-party models on each engine, compared with a loop over `mj_step`.
 
     python bench/third_party.py ant=ant.xml ur5e=ur5e.xml [--engines native warp jax] [--allow-cpu]
 

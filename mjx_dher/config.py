@@ -72,12 +72,12 @@ class Config:
     representation_size: Annotated[int, Number("[1, 65536]")] = 64
     """Numbers in phi(s, a) and psi(g)."""
     same_episode: Literal["negatives", "masked"] = "negatives"
-    """Goals of the same episode in a batch: negative examples, or left out, because the action may lead to them, too."""
+    """Goals of the same episode in a batch: negative examples, or excluded, because the action may lead to them, too."""
     policy_delay: Annotated[int, Number("[1, 1000]")] = 1
     """Critic steps per actor step: 2 in TD3. Must divide target_period, or be a multiple of it that divides
     updates_per_cycle."""
     learner_dtype: Literal["float32", "bfloat16"] = "float32"
-    """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many runs side by side.
+    """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many parallel runs.
     Parameters, and the policy that plays, are float32 with either."""
     n_step: Annotated[int, Number("[1, 1000]")] = 1
     """Rewards in a return before it bootstraps from the critic."""

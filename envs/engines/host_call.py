@@ -136,7 +136,7 @@ def _register_target() -> Any:
     return handler
 
 
-# Where a frame has what every call reads, in words of 8 bytes: fields of ctypes structs take longer than a small simulation.
+# Offsets in a frame, in words of 8 bytes: reading fields of ctypes structs takes longer than a small simulation.
 _STAGE = _Frame.stage.offset // 8
 _ARGUMENTS, _RESULTS, _ATTRIBUTES = (
     (getattr(_Frame, name).offset + kind.items.offset) // 8
@@ -169,7 +169,7 @@ def _words(address: int) -> Any:
 
 
 def _first(items: int) -> Any:
-    """Returns the first of several structs, to each of which there is a pointer."""
+    """Returns the first of several structs that are given by pointers."""
     return _words(_words(items)[0])
 
 

@@ -39,7 +39,7 @@ class WarpEngine:
       model: compiled MJCF.
       substeps: MuJoCo timesteps per environment step.
       path: "fused", "graph", or "auto": fused if the kernel supports the model.
-      iterations: most Newton iterations of the constraint solver. Each environment stops by itself, usually after one or two.
+      iterations: most Newton iterations of the constraint solver. Environments stop individually, usually after one or two.
         Default: 50 for `fused`, the model's for `graph`.
       ls_iterations: most steps of the solver's line search. Default: 20 for `fused`, the model's for `graph`.
       constraints: memory for constraint rows per environment. Default: all that can occur, or for `graph` with large models

@@ -138,7 +138,7 @@ def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
 
 
 class _Screen:
-    """Progress of all nodes, as a line now and then."""
+    """Progress of all nodes, as occasional lines."""
 
     def __init__(self, console: Console, specs: Sequence[RunSpec]):
         self._console, self._runs = console, len(specs)

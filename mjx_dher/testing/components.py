@@ -230,7 +230,7 @@ def _check_picks(choose: ChooseFn, trial: Trial) -> None:
     same = (picked == picked[:, :1]).all()
     expect(not same, f"priority: choose must give different transitions; all {NUMBER} are one, in each of {BATCHES} batches")
     first = (picked == CANDIDATES * np.arange(NUMBER)).all()
-    expect(not first, f"priority: choose keeps the first of each {CANDIDATES} candidates, whatever they are; it must choose")
+    expect(not first, f"priority: choose keeps the first of each {CANDIDATES} candidates in every group; it must choose")
 
 
 def check_generator(

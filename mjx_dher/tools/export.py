@@ -102,7 +102,7 @@ def _compare(policy: Policy, about: dict[str, str], contents: Contents) -> float
     for name, array in policy.arrays().items():
         read = contents.arrays.get(name)
         if read is None or (read.dtype, read.shape, read.tobytes()) != (array.dtype, array.shape, array.tobytes()):
-            raise ValueError(f"nothing was written: {name} did not come back as it is in the policy")
+            raise ValueError(f"nothing was written: {name} in the file differs from the policy's")
     observation, goal = observations(policy, CHECKED)
     expected = policy({"observation": observation, "desired_goal": goal})
     difference = float(np.max(np.abs(contents.act(observation, goal) - expected)))

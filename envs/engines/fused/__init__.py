@@ -1,4 +1,4 @@
-"""A timestep of MuJoCo's in one CUDA kernel, for models without the features that it leaves out.
+"""MuJoCo's timestep in one CUDA kernel, for models with supported features only (`support`).
 
 A CUDA kernel takes as long to start as some ten thousand environments take to run in it, and MuJoCo Warp's step is 135 of
 them. Here one kernel advances all environments by all timesteps of an environment step. Threads of

@@ -91,11 +91,11 @@ def _forces(
 
 
 class Traits(NamedTuple):
-    """What the kernel's code depends on in a model."""
+    """Properties of a model that the kernel's code depends on."""
 
     kinds: tuple[int, ...]  # kinds of geom pairs; code for other kinds is left out
-    edges: int  # most rows that a contact has
-    few: bool  # whether there is memory for the contacts of all pairs at once; else those that are near are looked for
+    edges: int  # most rows of a contact
+    few: bool  # whether there is memory for the contacts of all pairs at once; else near pairs are searched for
     has_sparse: bool  # whether there are rows of `Sparse`
     has_tendons: bool  # whether there are `Tendons`
     elliptic: bool  # whether friction cones are elliptic

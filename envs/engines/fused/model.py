@@ -184,7 +184,7 @@ class Memory:
     inertia: _matrices
     force: _spatial  # that `bias` needs
     turning: _spatial  # [nv] acceleration for one unit of qvel
-    momentum: _spatial  # [nv] of the body and what is below it, for one unit of qvel
+    momentum: _spatial  # [nv] of the body and its descendants, for one unit of qvel
     # These are of no use once the rows of constraints are known: `factor` takes their place.
     pos: _vec3s  # [nbody]
     quat: _quats
@@ -195,10 +195,10 @@ class Memory:
     distance: _floats  # [nslot]
     place: _vec3s  # [nslot]
     normal: _vec3s  # [nslot] from the first geom to the second
-    touching: _ints  # [nslot] slots of the contacts that there are
+    touching: _ints  # [nslot] slots of the existing contacts
     slot: _ints  # [nslot] first row of each of those contacts
     limited: _ints  # [nlimit] row of each joint at its limit, or -1
-    # Those that stay.
+    # Kept until the end of the substep.
     mass: _floats  # [nv * (nv + 1) / 2] lower half of the mass matrix, row by row
     smooth: _floats  # [nv] forces except those of constraints
     qacc: _floats  # [nv]

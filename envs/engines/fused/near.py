@@ -23,7 +23,7 @@ from mjx_dher.system.warp_setup import wp
 PAIR_WORDS, SLOT_WORDS = 7, 7  # memory of a pair, and of a slot, in floats
 _PLANES = (PLANE_BOX, PLANE_CYLINDER, PLANE_SPHERE, PLANE_CAPSULE, PLANE_ELLIPSOID)
 _OF_PLANES = wp.constant(sum(1 << kind for kind in _PLANES))  # mask of kinds
-_SLOTS = wp.constant(1 << 16)  # one pair, as it is counted beside its slots
+_SLOTS = wp.constant(1 << 16)  # one pair, in a number that also counts its slots
 
 
 @wp.func

@@ -31,7 +31,7 @@ _READ = re.compile(
 _WITHOUT_EFFECT = re.compile(
     "|".join(
         [
-            # What is seen, named or read alone; and sizes, except those of features that are left out.
+            # Rendering, names and sensors; and sizes, except of unsupported features.
             r"(cam|light|mat|mesh|tex|text|tuple|numeric|key|skin|hfield|name|bvh|oct|sensor|site|exclude)_.*",
             r".*_(user|group|rgba|matid)|names|names_map|paths|signature|stat|vis",
             r"n(?!flex$|plugin$|history$|a$)[a-zA-Z0-9]+(_\w+)?",
