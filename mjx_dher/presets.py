@@ -47,7 +47,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
       ValueError: there is no such preset.
     """
     check_name("preset", name, PRESETS)
-    best = _LEARNERS.get((name, env), _HAND if is_hand(env) and name in ("cpu", "gpu") else _DDPG)
+    best = _LEARNERS.get((name, env), _HANDS.get(name, _DDPG) if is_hand(env) else _DDPG)
     if learner == "crl":
         best = _CRL
     elif learner not in (None, best.learner):
@@ -91,10 +91,6 @@ def _gpu(env: str) -> tuple[Config, HParams]:
     )
     if env == "reach":
         config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
-    elif is_hand(env):
-        total_steps = {"hand_reach": 2_000_000, "block_rotate_z": 8_000_000}.get(env, 20_000_000)
-        config = dataclasses.replace(config, num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
-        return config, _TUNED._replace(gamma=0.98)
     elif env in ("pick_and_place", "slide"):
         total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
         config = dataclasses.replace(
@@ -147,6 +143,35 @@ def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
     return config, hparams._replace(critic_lr=3e-3)
 
 
+def _gpu_hand(env: str) -> tuple[Config, HParams]:
+    total_steps = 4_000_000 if env == "block_rotate_z" else 8_000_000
+    config = Config(
+        num_envs=1024,
+        cycles_per_epoch=2,
+        updates_per_cycle=1000,
+        target_period=1,
+        batch_size=1024,
+        total_steps=total_steps,
+        replay_size=4_000_000,
+        hidden_sizes=(512, 512, 512),
+        renewals=5,
+    )
+    return config, _TUNED._replace(gamma=0.98, her_k=4.0)
+
+
+def _gpu_hand_reach(env: str) -> tuple[Config, HParams]:
+    config = Config(
+        num_envs=128,
+        cycles_per_epoch=8,
+        updates_per_cycle=200,
+        target_period=1,
+        batch_size=2048,
+        total_steps=3_000_000,
+        replay_size=3_000_000,
+    )
+    return config, _TUNED._replace(gamma=0.98, polyak=0.995, noise_std=0.2, her_k=4.0, priority_fraction=0.0)
+
+
 def _cpu_push(env: str) -> tuple[Config, HParams]:
     config, hparams = _small(*_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000)
     return config, hparams._replace(critic_lr=2e-3)
@@ -197,12 +222,16 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
-_HAND = _Best("tqc", "layer_norm", None)  # not tuned yet
+_HANDS = {
+    "cpu": _Best("tqc", "layer_norm", None),  # not tuned
+    "gpu": _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
+}
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
 _LEARNERS = {
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
+    ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", _frugal_push),

@@ -200,8 +200,7 @@ def test_presets_are_valid_for_hands(name):
 
     for env in HANDS:
         spec.validate(presets.preset(name, env))
-    assert presets.preset("gpu", "block_rotate_z").learner == "tqc"
-    assert presets.preset("gpu", "block_rotate_z", learner="ddpg").config.num_envs == 1024
+    assert presets.preset("gpu", "block_rotate_z").learner == "dtqc"
 
 
 @pytest.mark.parametrize(
