@@ -20,6 +20,8 @@ tests/data/hand_TASK.npz has E episodes of T steps, and every tenth state:
     goal    (E, G)
     kind    (E,)               index into KINDS
     reward  (E, T)             int8, of the sparse reward
+    starts  (R, 7), (R, 0)     the object's pose after R other resets
+    goals   (R, G)             their goals
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ BEGIN, END = "<!-- hands: begin -->", "<!-- hands: end -->"
 
 TASKS = ("block_rotate_xyz", "egg_rotate", "pen_rotate", "hand_reach")
 KINDS = ("random actions", "random postures", "small motions")
+RESETS = 200
 EPISODES = 15  # of each task, in turn of each kind
 KEPT = 10  # steps between kept states
 JOINTS = 24
@@ -149,14 +152,15 @@ def report(tasks, engines, episodes, steps):
     rows = []
     for task in tasks:
         recorded = load(task)
-        paths = {
-            engine: replay(envs.make(task, engine=engine, **OPTIONS.get(engine, {})), recorded, episodes, steps)
-            for engine in engines
-        }
+        paths = {}
+        for engine in engines:
+            env = envs.make(task, engine=engine, **OPTIONS.get(engine, {}))
+            name = f"{engine} {env.engine.path}" if engine == "warp" else engine
+            paths[name] = replay(env, recorded, episodes, steps)
         for kind, name in enumerate(KINDS):
             of = np.flatnonzero(recorded["kind"][:episodes] == kind)
             if len(of):
-                rows += [(task, name, engine, *figures(recorded, paths[engine][of], of)) for engine in engines]
+                rows += [(task, name, engine, *figures(recorded, path[of], of)) for engine, path in paths.items()]
             rows += [row for row in original if row[:2] == (task, name)]
     with contextlib.redirect_stdout(io.StringIO()) as text:
         print_table(HEAD, rows)
@@ -207,6 +211,9 @@ def record(seed=0):
             episodes.append({"action": action, "qpos": qpos, "qvel": start, "goal": obs["desired_goal"], "reward": reward})
         arrays = {name: np.array([each[name] for each in episodes]) for name in episodes[0]}
         arrays = {name: x if x.dtype == np.int8 else x.astype(np.float32) for name, x in arrays.items()}
+        resets = [(env.reset(seed=int(rng.integers(2**31)))[0], env.data.qpos[JOINTS:nq].copy())[::-1] for _ in range(RESETS)]
+        arrays["starts"] = np.float32([start for start, _ in resets])
+        arrays["goals"] = np.float32([obs["desired_goal"] for _, obs in resets])
         path = DATA / f"hand_{task}.npz"
         np.savez_compressed(path, kind=np.arange(EPISODES, dtype=np.int8) % len(KINDS), **arrays)
         print(task, path.stat().st_size, "bytes")
