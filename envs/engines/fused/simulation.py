@@ -14,6 +14,7 @@ THREADS, WARPS = 16, 8
 # Most iterations of Newton's method and of its line search: an environment takes three where contacts change, one otherwise.
 ITERATIONS, LS_ITERATIONS = 50, 20
 _FEW_ROWS = 64  # memory for fewer is not worth an overflow
+_STATIC = 2048  # bytes of a block that CUDA and the kernel itself take; 1,024 and 64 were seen
 
 
 class Simulation:
@@ -34,7 +35,7 @@ class Simulation:
         size, contacts, sparse = structs[-1].size, structs[3], structs[4]
         device = wp.get_device()
         self._threads = 1 if device.is_cpu else threads_for(model)
-        warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block, self._threads)
+        warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block - _STATIC, self._threads)
         self._block = max(1, 32 * warps)
         kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
         edges = int(max([6, *contacts.edges.numpy()]))
@@ -78,7 +79,7 @@ def _structs(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
 
 def shared_memory() -> int | None:
     """Bytes of shared memory of a block on the first GPU; None without a GPU."""
-    return wp.get_device("cuda:0").max_shared_memory_per_block if wp.is_cuda_available() else None
+    return wp.get_device("cuda:0").max_shared_memory_per_block - _STATIC if wp.is_cuda_available() else None
 
 
 def threads_for(model: mujoco.MjModel) -> int:
