@@ -52,13 +52,13 @@ def test_unsupported_features_are_named_with_their_elements():
     motor = '<actuator><general name="m" joint="j" {}/></actuator>'
     cases = [
         (mujoco.MjModel.from_xml_string(EGGS), ["contacts of ellipsoid and ellipsoid", "'g'", "'o'"]),
-        (welded(shape="ellipsoid", options='<flag nativeccd="disable"/>'), ["ellipsoids with nativeccd", "'g'", "'o'"]),
+        (welded(shape="ellipsoid", options='<flag nativeccd="disable"/>'), ["ellipsoid and box with nativeccd", "'g'", "'o'"]),
         (mujoco.MjModel.from_xml_string(OFF_CENTRE), ["free bodies", "implicitfast", "'f'"]),
         (welded(shape="cylinder", options='<flag nativeccd="disable"/>', gap=0.1), ["gaps of cylinders", "'g'"]),
         (welded(shape="cylinder"), ["nativeccd=disable", "'g'"]),
         (welded('<option integrator="RK4"/>'), ["integrator"]),
         (welded('<option solver="CG"/>'), ["solver"]),
-        (welded('<option><flag gravity="disable"/></option>'), ["options disabled"]),
+        (welded('<option><flag gravity="disable" limit="disable"/></option>'), ["options disabled (limit)"]),
         (welded('<option density="1.2"/>'), ["medium"]),
         (welded(SPATIAL), ["tendons that are not fixed", "'far'"]),
         (

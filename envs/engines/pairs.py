@@ -10,7 +10,7 @@ import numpy as np
 _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")
 # Most contacts of two geoms, in the order of MuJoCo's types. Otherwise 1 with a sphere or an ellipsoid, else 8.
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
-_MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2}
+_MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2, ("CAPSULE", "CYLINDER"): 2}
 _LEAST_FRICTION = 1e-5  # MuJoCo's
 _MANY = 50  # contacts of height fields and signed distance fields
 
@@ -57,8 +57,10 @@ class Pairs(NamedTuple):
 
 def all_pairs(model: mujoco.MjModel) -> Pairs:
     """Pairs that a model lists, and others that can touch, with parameters mixed from their geoms as in MuJoCo C."""
-    listed = [getattr(model, f"pair_{name}") for name in Pairs._fields]
-    listed[Pairs._fields.index("friction")] = np.maximum(model.pair_friction, _LEAST_FRICTION)
+    touch = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    listed = [getattr(model, f"pair_{name}")[: model.npair * touch] for name in Pairs._fields]
+    at = Pairs._fields.index("friction")
+    listed[at] = np.maximum(listed[at], _LEAST_FRICTION)
     others = meeting(model)
     if not len(others):
         return Pairs(*listed)

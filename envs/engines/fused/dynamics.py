@@ -250,7 +250,7 @@ def _passive(dofs: Dofs, memory: Memory, i: int) -> float:
 @wp.func
 def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> float:
     """Minus the derivative of forces by the velocity of a degree of freedom, for the integrator."""
-    all_of_it = dofs.damping[i]
+    all_of_it = dofs.implicit_damping[i]
     if dofs.implicit == 1:
         for a in range(dofs.actuators):
             if dofs.actuator_dof[a] == i:

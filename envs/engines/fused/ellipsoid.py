@@ -35,7 +35,7 @@ def collide_ellipsoids(contacts: Contacts, memory: Memory, thread: int, threads:
     """Computes distance, place and normal of the slots of ellipsoids."""
     for i in range(thread, contacts.pairs, threads):
         kind = contacts.kind[i]
-        if kind >= _PLANE:
+        if kind >= _PLANE and kind <= _BOX:
             geom1, geom2 = contacts.geom1[i], contacts.geom2[i]
             pos1, mat1, size1 = geom_of(contacts, memory, geom1)
             pos2, mat2, size2 = geom_of(contacts, memory, geom2)

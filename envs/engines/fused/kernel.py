@@ -11,10 +11,13 @@ from mjx_dher.envs.engines.fused.ellipsoid import collide_ellipsoids
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import (
     BOX_BOX,
+    CAPSULE_CYLINDER,
     CYLINDER_BOX,
+    ELLIPSOID_BOX,
     PLANE_CAPSULE,
     PLANE_ELLIPSOID,
     PLANE_SPHERE,
+    SPHERE_CYLINDER,
     Bodies,
     Contacts,
     Dofs,
@@ -25,6 +28,7 @@ from mjx_dher.envs.engines.fused.model import (
 )
 from mjx_dher.envs.engines.fused.near import keep, memory_of, near_pairs
 from mjx_dher.envs.engines.fused.round import collide_round
+from mjx_dher.envs.engines.fused.round_cylinder import collide_cylinders_with_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.sparse import ask_sparse
 from mjx_dher.envs.engines.fused.tendons import soften
@@ -147,7 +151,8 @@ def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
     """Returns the function that finds contacts, for kinds of geom pairs. See `make`."""
     boxes, cylinders = BOX_BOX in kinds, CYLINDER_BOX in kinds
     round_ones = any(PLANE_SPHERE <= kind < PLANE_ELLIPSOID for kind in kinds)
-    ellipsoids = any(kind >= PLANE_ELLIPSOID for kind in kinds)
+    ellipsoids = any(PLANE_ELLIPSOID <= kind <= ELLIPSOID_BOX for kind in kinds)
+    round_cylinders = SPHERE_CYLINDER in kinds or CAPSULE_CYLINDER in kinds
 
     @wp.func
     def collide(
@@ -179,6 +184,9 @@ def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
         if wp.static(ellipsoids):
             gather(wp.static(warps))
             collide_ellipsoids(near, scratch, thread, threads)
+        if wp.static(round_cylinders):
+            gather(wp.static(warps))
+            collide_cylinders_with_round(near, scratch, thread, threads)
         held = contacts
         if wp.static(not few):
             gather(wp.static(warps))

@@ -6,10 +6,10 @@ from mjx_dher.system.warp_setup import wp
 
 # How a body moves against its parent.
 STILL, HINGE, SLIDE, FREE, MOCAP = range(5)
-# Pairs of geoms; those from PLANE_SPHERE on are of spheres and capsules, and from PLANE_ELLIPSOID on of ellipsoids.
+# Pairs of geoms: with flat ones, of round ones, and of ellipsoids; at the end, of round ones with cylinders.
 PLANE_BOX, PLANE_CYLINDER, BOX_BOX, CYLINDER_BOX = range(4)
 PLANE_SPHERE, PLANE_CAPSULE, SPHERE_SPHERE, SPHERE_CAPSULE, SPHERE_BOX, CAPSULE_CAPSULE, CAPSULE_BOX = range(4, 11)
-PLANE_ELLIPSOID, SPHERE_ELLIPSOID, CAPSULE_ELLIPSOID, ELLIPSOID_BOX = range(11, 15)
+PLANE_ELLIPSOID, SPHERE_ELLIPSOID, CAPSULE_ELLIPSOID, ELLIPSOID_BOX, SPHERE_CYLINDER, CAPSULE_CYLINDER = range(11, 17)
 Polynomial = wp.types.vector(length=5, dtype=float)
 Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
 
@@ -66,6 +66,7 @@ class Dofs:
     body: _ints
     armature: _floats
     damping: _floats
+    implicit_damping: _floats  # the part that the integrator is implicit in
     implicit: int  # 1 for implicitfast: velocities are implicit in the forces of actuators, too, not in damping alone
     drive: wp.array(dtype=wp.vec2)  # least and most force of all actuators on it
     first_control: int  # index of the first control, behind the poses of mocap bodies

@@ -30,7 +30,7 @@ def collide_round(contacts: Contacts, memory: Memory, thread: int, threads: int)
     """Computes distance, place and normal of the slots of spheres and capsules."""
     for p in range(thread, contacts.pairs, threads):
         kind = contacts.kind[p]
-        if kind >= _PLANE_SPHERE:
+        if kind >= _PLANE_SPHERE and kind <= _CAPSULE_BOX:
             geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
             pos1, mat1, size1 = geom_of(contacts, memory, geom1)
             pos2, mat2, size2 = geom_of(contacts, memory, geom2)

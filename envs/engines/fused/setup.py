@@ -26,7 +26,11 @@ CONTACT_KINDS = {
     ("SPHERE", "ELLIPSOID"): (kinds.SPHERE_ELLIPSOID, 1),
     ("CAPSULE", "ELLIPSOID"): (kinds.CAPSULE_ELLIPSOID, 1),
     ("ELLIPSOID", "BOX"): (kinds.ELLIPSOID_BOX, 1),
+    ("SPHERE", "CYLINDER"): (kinds.SPHERE_CYLINDER, 1),
+    ("CAPSULE", "CYLINDER"): (kinds.CAPSULE_CYLINDER, 2),
 }  # types of two geoms -> (kind, most contacts)
+# Pairs for which MuJoCo C runs its general convex solver, unless it is the older one of `nativeccd="disable"`.
+BY_GENERAL_SOLVER = [("SPHERE", "ELLIPSOID"), ("CAPSULE", "ELLIPSOID"), ("ELLIPSOID", "BOX"), ("CAPSULE", "CYLINDER")]
 FEW = 64  # contacts of all pairs, up to which there is memory for all of them
 _NEAR, _NEAR_SLOTS = 64, 192  # pairs that may be near at once in other models, and slots for their contacts
 CONNECT, WELD, JOINT, TENDON = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT", "TENDON"))
@@ -184,6 +188,8 @@ def dofs_of(model: mujoco.MjModel) -> Any:
     everything = np.array([-np.inf, np.inf])
     links = links_of(model)
     link_of_joint = np.flatnonzero(links.joint >= 0)  # in the order of joints
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    euler_damp = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     drive = np.where(model.jnt_actfrclimited[joints, None], model.jnt_actfrcrange[joints], everything)
     return fill(
         Dofs,
@@ -191,7 +197,8 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         body=link_of_joint[joints],
         armature=model.dof_armature,
         damping=model.dof_damping,
-        implicit=int(model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+        implicit_damping=model.dof_damping * (euler_damp or implicit),
+        implicit=int(implicit),
         drive=drive,
         first_control=7 * model.nmocap,
         stiffness=np.where(scalar, model.jnt_stiffness[joints], 0),
@@ -275,15 +282,11 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
 def _halves(model: mujoco.MjModel) -> np.ndarray:
     """Half lengths [ngeom, 3] of boxes around geoms. The values of planes are not used."""
     radius, half, _ = model.geom_size.T
-    round_ones = {
-        "SPHERE": (radius, radius, radius),
-        "CAPSULE": (radius, radius, radius + half),
-        "CYLINDER": (radius, radius, half),
-    }
+    along = {"SPHERE": radius, "CAPSULE": radius + half, "CYLINDER": half}
     halves = model.geom_size.copy()
-    for name, lengths in round_ones.items():
+    for name, length in along.items():
         which = model.geom_type == int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
-        halves[which] = np.stack(lengths, axis=1)[which]
+        halves[which] = np.stack([radius, radius, length], axis=1)[which]
     return halves
 
 
@@ -332,10 +335,11 @@ def world_of(model: mujoco.MjModel, contacts: Any, most_rows: int) -> Any:
     links = links_of(model)
     edges = contacts.edges.numpy()[contacts.pair.numpy()]
     contact_rows = int(np.sort(edges)[len(edges) - contacts.slots :].sum())
+    falls = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return fill(
         World,
         timestep=model.opt.timestep,
-        gravity=wp.vec3(*model.opt.gravity),
+        gravity=wp.vec3(*(model.opt.gravity * falls)),
         **_equalities_of(model, links),
         rows=min(most_rows, other_rows(model) + contact_rows),
         tolerance=model.opt.tolerance,

@@ -47,7 +47,11 @@ _WITHOUT_EFFECT = re.compile(
     )
 )
 _OLDER_CCD = int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)  # the flag of the older algorithm for convex shapes, which this one has
-_KNOWN_FLAGS = _OLDER_CCD | int(mujoco.mjtDisableBit.mjDSBL_ISLAND)  # the solver has no islands
+# Flags that are read, or have no effect: the solver has no islands, and there is no middle phase.
+_KNOWN_FLAGS = sum(
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}"))
+    for name in ("NATIVECCD", "ISLAND", "MIDPHASE", "FILTERPARENT", "CONTACT", "GRAVITY", "EULERDAMP", "SENSOR")
+)
 _HINGE, _SLIDE, _FREE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{name}")) for name in ("HINGE", "SLIDE", "FREE"))
 
 
@@ -89,7 +93,9 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     if model.opt.integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         yield "an integrator other than Euler and implicitfast"
     if model.opt.disableflags & ~_KNOWN_FLAGS:
-        yield "options disabled"
+        unknown = model.opt.disableflags & ~_KNOWN_FLAGS
+        bits = {name.removeprefix("mjDSBL_"): int(bit) for name, bit in mujoco.mjtDisableBit.__members__.items() if "_" in name}
+        yield f"options disabled ({', '.join(name.lower() for name, bit in bits.items() if unknown & bit)})"
     if not 0 < model.nv <= 31:
         yield "no degrees of freedom, or more than 31"
     others = [eq for eq in range(model.neq) if not _is_known(model, eq)]
@@ -131,8 +137,8 @@ def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
             what = f"contacts of {kind[0].lower()} and {kind[1].lower()}"
         elif kind == ("CYLINDER", "BOX") and not model.opt.disableflags & _OLDER_CCD:
             what = "contacts of cylinders and boxes without nativeccd=disable"
-        elif "ELLIPSOID" in kind and "PLANE" not in kind and model.opt.disableflags & _OLDER_CCD:
-            what = "contacts of ellipsoids with nativeccd=disable"
+        elif model.opt.disableflags & _OLDER_CCD and kind in setup.BY_GENERAL_SOLVER:
+            what = f"contacts of {kind[0].lower()} and {kind[1].lower()} with nativeccd=disable"
         elif kind == ("CYLINDER", "BOX") and (model.pair_gap.any() or model.geom_gap[list(ends)].any()):
             what = "gaps of cylinders and boxes"
         if what:
