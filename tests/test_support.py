@@ -60,6 +60,7 @@ def test_unsupported_features_are_named_with_their_elements():
         (welded('<option solver="CG"/>'), ["solver"]),
         (welded('<option><flag gravity="disable" limit="disable"/></option>'), ["options disabled (limit)"]),
         (welded('<option density="1.2"/>'), ["medium"]),
+        (welded('<default><joint range="0 0.1" margin="0.06"/></default>'), ["limits nearer", "'j'"]),
         (welded(SPATIAL), ["tendons that are not fixed", "'far'"]),
         (
             welded('<tendon><fixed name="f" armature="1"><joint joint="j" coef="1"/></fixed></tendon>'),

@@ -115,7 +115,7 @@ def most_rows(model: mujoco.MjModel) -> int:
 def rows_for(model: mujoco.MjModel, shared: int | None) -> int:
     """Constraint rows to have memory for: all that can occur, if a block's shared memory suffices for them.
 
-    For large models it must suffice for half of the most warps. Otherwise there is memory for 1.5 times the rows that random
+    For large models it must suffice for the most warps. Otherwise there is memory for 1.5 times the rows that random
     controls cause, and for all further rows that fit without reducing the number of environments.
     """
     most, threads = most_rows(model), threads_for(model)

@@ -81,6 +81,8 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
         ("jnt", "springs of free joints"): (model.jnt_stiffness != 0) & ~scalar,
         ("jnt", "limits of free joints"): (model.jnt_limited != 0) & ~scalar,
+        ("jnt", "limits nearer to each other than twice their margin"): _narrow(model, "jnt"),
+        ("tendon", "limits nearer to each other than twice their margin"): _narrow(model, "tendon"),
         ("tendon", "tendons that are not fixed"): _not_fixed(model),
         ("jnt", "free bodies, with implicitfast, that have parts or are not centred on their mass"): _off_centre(model),
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
@@ -101,6 +103,12 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     others = [eq for eq in range(model.neq) if not _is_known(model, eq)]
     if others:
         yield with_names("equality constraints other than of joints, fixed tendons and bodies", model, "eq", others)
+
+
+def _narrow(model: mujoco.MjModel, kind: str) -> np.ndarray:
+    """Joints or tendons that can be at both limits at once: MuJoCo C has a row for each of them, and the kernel for one."""
+    limited, span, margin = (getattr(model, f"{kind}_{name}") for name in ("limited", "range", "margin"))
+    return (limited != 0) & (span[:, 1] - span[:, 0] < 2 * margin)
 
 
 def _not_fixed(model: mujoco.MjModel) -> np.ndarray:
