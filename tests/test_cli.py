@@ -108,7 +108,7 @@ BAD = [
     (["sweep", "--out", "x", "--seeds", HUGE], [f"seeds must lie in [1, 1000000]; got {HUGE}"]),
     (
         ["--env", "pusch"],
-        ["env must be one of block, block_rotate_parallel", ", or module:attribute; got 'pusch' (did you mean 'push'"],
+        ["env must be one of arm_reach, ", ", or module:attribute; got 'pusch' (did you mean 'push'"],
     ),
     (["--env", "not_there:Task"], ["env 'not_there:Task': there is no module 'not_there' in the current folder or on"]),
     (["--env", "tasks/mine.py:Task"], ["env must be module:attribute, with the module's name as in `import`; got"]),
