@@ -76,13 +76,13 @@ def test_contacts_without_memory_are_reported_by_the_graph():
 
 
 def test_the_path_of_warp_and_its_memory_follow_from_the_model(monkeypatch):
-    model = mujoco.MjModel.from_xml_string(MODELS["two mocap bodies"])
+    model = mujoco.MjModel.from_xml_string(MODELS["activations, implicitfast"])
     engine = make_engine("warp", model, SUBSTEPS, allow_cpu=True)
     assert engine.path == "graph"
-    assert "equality" in engine.note
+    assert "activations" in engine.note
     with refuses("path", "grahp", "graph"):
         make_engine("warp", model, SUBSTEPS, path="grahp", allow_cpu=True)
-    with refuses("fused", "equality"):
+    with refuses("fused", "activations"):
         make_engine("warp", model, SUBSTEPS, path="fused", allow_cpu=True)
     monkeypatch.setattr(simulation, "shared_memory", lambda: 1000)
     small = make_engine("warp", mujoco.MjModel.from_xml_string(arm()), SUBSTEPS, allow_cpu=True)
