@@ -30,6 +30,7 @@ GL_SECONDS = 60.0  # time limit of a test
 _DRAWN: set[str] = set()  # backends that have drawn in a child process
 GOAL_RADIUS = 0.03  # m; visible around an object at the goal
 GOAL_RGBA = (1.0, 0.1, 0.1, 0.6)
+GHOST_OPACITY = 0.85
 
 # Options of ffmpeg by format. GIF uses one palette and no dithering, so that constant pixels cost nothing.
 _PALETTE = "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
@@ -117,6 +118,17 @@ def goal_marks(env: Any, qpos: np.ndarray, goal: np.ndarray) -> list[tuple[int, 
     if hasattr(env, "goal_marks"):
         return env.goal_marks(qpos, goal)
     return [(-1, np.asarray(goal), np.array([1.0, 0.0, 0.0, 0.0]))] if np.shape(goal) == (3,) else []
+
+
+def geom_rgba(model: Any, geom: int) -> np.ndarray:
+    """Colour [4] of a geom: its material's if it has none."""
+    rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    return model.mat_rgba[material] if material >= 0 and np.array_equal(rgba, (0.5, 0.5, 0.5, 1.0)) else rgba
+
+
+def ghost_rgba(own: np.ndarray) -> np.ndarray:
+    """Colour [4] of a geom as a goal: translucent, and its own, so that the sides of an object can be told apart."""
+    return np.array([*own[:3], GHOST_OPACITY])
 
 
 def record_episodes(
@@ -210,7 +222,7 @@ class Painter:
             raise ValueError(f"MuJoCo cannot draw in this process with MUJOCO_GL={backend}: {error}") from error
 
     def draw(self, qpos: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Picture [height, width, 3] uint8 of a configuration [nq], with the goal [G] as a red ball or ghost."""
+        """Picture [height, width, 3] uint8 of a configuration [nq], with the goal [G] as a red ball or a translucent body."""
         import mujoco
 
         self._data.qpos[:] = qpos
@@ -220,18 +232,22 @@ class Painter:
         self._renderer.update_scene(self._data, camera=front)
         for body, pos, quat in goal_marks(self._env, np.asarray(qpos), np.asarray(goal)):
             if body < 0:
-                self._add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, np.array([GOAL_RADIUS, 0, 0]), pos, quat)
+                self._add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, np.array([GOAL_RADIUS, 0, 0]), pos, quat, GOAL_RGBA)
                 continue
             first = self._model.body_geomadr[body]
             for geom in range(first, first + self._model.body_geomnum[body]):
+                own = geom_rgba(self._model, geom)
+                if own[3] == 0 or self._model.geom_group[geom] > 2:  # not drawn in the body either
+                    continue
                 place, turn = np.zeros(3), np.zeros(4)
                 frame = self._model.geom_pos[geom], self._model.geom_quat[geom]
                 mujoco.mju_mulPose(place, turn, np.asarray(pos, float), np.asarray(quat, float), *frame)
                 mesh = 2 * int(self._model.geom_dataid[geom])  # the mesh itself; the odd number after it is its convex hull
-                self._add_geom(self._model.geom_type[geom], self._model.geom_size[geom], place, turn, mesh)
+                look = self._model.geom_type[geom], self._model.geom_size[geom]
+                self._add_geom(*look, place, turn, ghost_rgba(own), mesh)
         return self._renderer.render()
 
-    def _add_geom(self, kind: Any, size: np.ndarray, pos: np.ndarray, quat: np.ndarray, mesh: int = -1) -> None:
+    def _add_geom(self, kind: Any, size: np.ndarray, pos: np.ndarray, quat: np.ndarray, rgba: Any, mesh: int = -1) -> None:
         import mujoco
 
         scene, mat = self._renderer.scene, np.zeros(9)
@@ -239,8 +255,8 @@ class Painter:
             return
         geom = scene.geoms[scene.ngeom]
         mujoco.mju_quat2Mat(mat, quat)
-        mujoco.mjv_initGeom(geom, kind, size, np.asarray(pos, float), mat, np.array(GOAL_RGBA, np.float32))
-        geom.dataid, geom.transparent, geom.emission = max(mesh, -1), True, 0.5
+        mujoco.mjv_initGeom(geom, kind, size, np.asarray(pos, float), mat, np.array(rgba, np.float32))
+        geom.dataid, geom.transparent, geom.emission = max(mesh, -1), True, 0.5 if kind == mujoco.mjtGeom.mjGEOM_SPHERE else 0.2
         scene.ngeom += 1
 
     def close(self) -> None:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_dher.tools.render import geom_rgba, ghost_rgba
+
 _FLOOR = (0.80, 0.82, 0.85)  # colour of a plane
 _TYPES = mujoco.mjtGeom
 
@@ -34,10 +36,8 @@ def shapes(model: Any) -> list[Shape]:
     known |= {int(kind) for kind in (_TYPES.mjGEOM_CYLINDER, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
     seen = []
     for index in range(model.ngeom):
-        rgba, kind = model.geom_rgba[index], int(model.geom_type[index])
+        rgba, kind = geom_rgba(model, index), int(model.geom_type[index])
         material = int(model.geom_matid[index])
-        if material >= 0 and np.array_equal(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default means the material's
-            rgba = model.mat_rgba[material]
         if rgba[3] == 0 or model.geom_group[index] > 2:  # groups that MuJoCo's viewer hides
             continue
         if kind not in known:
@@ -64,16 +64,16 @@ class Poses:
         return self._data.xpos, self._data.xquat
 
 
-def add(scene: Any, model: Any, ghosts: Any = None, rgba: Any = None) -> dict[int, Any]:
+def add(scene: Any, model: Any, ghosts: Any = None) -> dict[int, Any]:
     """Adds a model's geoms to a viser scene. Returns the nodes of bodies with geoms, by body number.
 
-    With `ghosts`, only these bodies are added, a second time and in the colour `rgba` [4].
+    With `ghosts`, only these bodies are added, a second time and in the colours of goals.
     """
     nodes: dict[int, Any] = {}
     folder = "/bodies" if ghosts is None else "/ghosts"
     chosen = shapes(model)
     if ghosts is not None:
-        chosen = [shape._replace(rgba=np.array(rgba)) for shape in chosen if shape.body in ghosts]
+        chosen = [shape._replace(rgba=ghost_rgba(shape.rgba)) for shape in chosen if shape.body in ghosts]
     for shape in chosen:
         if shape.body not in nodes:
             nodes[shape.body] = scene.add_frame(f"{folder}/{shape.body}", show_axes=False)

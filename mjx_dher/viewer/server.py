@@ -153,7 +153,7 @@ class Viewer:
         self._held = False
         self._poses, self._nodes = Poses(env.model), add(scene, env.model)
         bodies = [body for body, _, _ in self.player.marks]
-        self._ghosts = add(scene, env.model, bodies, GOAL_RGBA)
+        self._ghosts = add(scene, env.model, bodies)
         self._handle = self._add_handle(self._taken) if any(self._moves(self._taken)) else None
         look: dict[str, Any] = {"opacity": GOAL_RGBA[3], "cast_shadow": False, "receive_shadow": False}
         self._balls = [
