@@ -56,7 +56,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, varied: Sequenc
     for option in options:
         check_name(f"option of engine {resolve_engine(name)}", option, engine_options(name))
     check_state(model)
-    return _constructor(name)(model, substeps=substeps, varied=tuple(varied), **options)
+    return _constructor(name)(model, substeps=substeps, varied=varied, **options)
 
 
 def engine_options(name: str) -> list[str]:

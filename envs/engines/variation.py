@@ -47,6 +47,8 @@ class Variation:
     """
 
     def __init__(self, model: mujoco.MjModel, names: Sequence[str]):
+        if isinstance(names, str) or not (isinstance(names, Sequence) and all(isinstance(name, str) for name in names)):
+            raise ValueError(f'varied must be a list of names such as "mass:box"; got {names!r}')
         self.names, self.size = tuple(names), len(names)
         numbers: dict[str, np.ndarray] = {}  # of the factor of each object, `size` if there is none
         for number, name in enumerate(self.names):
@@ -148,9 +150,10 @@ def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[fl
     if not isinstance(varied, Mapping) or not all(isinstance(name, str) for name in varied):
         raise ValueError(f"varied must map names to (low, high), such as {{'mass:box': (0.5, 2)}}; got {varied!r}")
     ranges = {}
-    for name, ends in varied.items():
-        if not isinstance(ends, Sequence) or isinstance(ends, str) or len(ends) != 2:
-            raise ValueError(f"varied: {name!r} must be (low, high); got {ends!r}")
+    for name, given in varied.items():
+        if np.ndim(given) != 1 or len(given) != 2:
+            raise ValueError(f"varied: {name!r} must be (low, high); got {given!r}")
+        ends = [end.item() if isinstance(end, np.generic) else end for end in given]
         above = "(0" if name.startswith("mass:") else "[0"
         check_number(f"varied {name!r}", ends[0], f"{above}, 1000]", float)
         check_number(f"varied {name!r}", ends[1], f"[{ends[0]}, 1000]", float)
@@ -167,7 +170,10 @@ def draw(ranges: Mapping[str, tuple[float, float]], key: PRNGKey) -> Array:
 def _parsed(text: str) -> dict[str, tuple[float, float]]:
     parts = [re.fullmatch(r"\s*([^=]+)=([\d.]+)-([\d.]+)\s*", part) for part in text.split(",")]
     try:
-        return {part[1]: (float(part[2]), float(part[3])) for part in parts}  # type: ignore[index]
+        ranges = [(part[1], (float(part[2]), float(part[3]))) for part in parts]  # type: ignore[index]
+        if len(dict(ranges)) < len(ranges):
+            raise ValueError("a name is there twice")
+        return dict(ranges)
     except (TypeError, ValueError):
         form = "mass:box=0.5-2,gain:*=0.9-1.1"
         raise ValueError(f'varied must be a mapping, or a text such as "{form}"; got {text!r}') from None
