@@ -15,7 +15,7 @@ from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey, PyTree
 from mjx_dher.validation import check_count, check_number
 
 Part = Callable[[Any], Array]  # state of the other environment -> vector
-_WRAPPERS = ("AutoResetWrapper", "VmapWrapper", "BraxAutoResetWrapper")  # names of subclasses end in these too
+_WRAPPERS = ("AutoResetWrapper", "VmapWrapper", "EpisodeWrapper")  # ends of names; the last one is done after some steps
 
 
 @struct.dataclass
@@ -94,7 +94,8 @@ class BraxEnv:
         return self.reached(achieved_goal, desired_goal).astype(jnp.float32) - 1.0
 
     def _state(self, inner: Any, goal: Array, failed: Array) -> BraxState:
-        observation, achieved, goal = (jnp.asarray(x, jnp.float32) for x in (self._observe(inner), self._achieved(inner), goal))
+        achieved, goal = (jnp.asarray(x, jnp.float32) for x in (self._achieved(inner), goal))
+        observation = jax.tree.map(_plain, self._observe(inner))
         obs = GoalObs(observation=observation, achieved_goal=achieved, desired_goal=goal)
         reward = self.compute_reward(achieved, goal)
         done = jnp.asarray(inner.done, bool)
@@ -102,6 +103,11 @@ class BraxEnv:
             return EndingState(inner, obs, reward, success=reward + 1.0, failed=failed, terminal=done)
         failed = failed | done
         return BraxState(inner, obs, reward, success=jnp.where(failed, 0.0, reward + 1.0), failed=failed)
+
+
+def _plain(x: Any) -> Array:
+    """Numbers as float32, except pictures."""
+    return jnp.asarray(x, jnp.uint8 if jnp.result_type(x) == jnp.uint8 else jnp.float32)
 
 
 def from_brax(
@@ -119,24 +125,24 @@ def from_brax(
     Rewards become -1 and 0, and goals that the inner environment draws after the reset are ignored.
 
     Args:
-      env: an environment of Brax, MuJoCo Playground or JaxGCRL, without wrappers that batch or reset it.
+      env: an environment of Brax, MuJoCo Playground or JaxGCRL, without wrappers that batch it, reset it or limit its steps.
       achieved: maps its state to the achieved goal [G].
       goal: maps the state after a reset to the desired goal [G].
       threshold: largest distance at which the goal is reached.
       episode_length: steps of an episode.
-      observe: maps its state to the observation [D] without the goal. Default: the state's `obs`.
+      observe: maps its state to the observation, [D] or a tree of arrays, without the goal. Default: the state's `obs`.
       distance: (achieved [..., G], desired [..., G]) -> [...]. Default: Euclidean.
       ends: meaning of `done`. True: the episode ends, and no future follows. False: the episode has failed and nothing is
         learned from it. With rewards of -1, True makes an early end attractive.
 
     Raises:
-      ValueError: a wrapper batches or resets the environment, or an argument is out of range.
+      ValueError: the environment has such a wrapper, or an argument is out of range.
     """
     layer = env
-    while layer is not None:
+    for _ in range(100):
         if (kind := type(layer).__name__).endswith(_WRAPPERS):
             raise ValueError(f"env must not be wrapped in {kind}: pass the inner environment")
-        layer = vars(layer).get("env")
+        layer = getattr(layer, "__dict__", {}).get("env")
     check_number("threshold", threshold, "(0, inf)", float)
     check_count("episode_length", episode_length)
     return BraxEnv(env, (achieved, goal, observe), threshold, episode_length, distance, bool(ends))

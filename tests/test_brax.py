@@ -100,7 +100,19 @@ class EvalWrapper:
     env: Any
 
 
+def test_an_observation_may_be_a_tree():
+    parts = {"place": lambda state: state.pipeline_state, "picture": lambda state: jnp.zeros((2, 2), jnp.uint8)}
+    spec = env_spec(make(observe=lambda state: {name: part(state) for name, part in parts.items()}))
+    assert {name: (leaf.shape, leaf.dtype) for name, leaf in spec.observation.items()} == {
+        "place": ((1,), jnp.float32),
+        "picture": ((2, 2), jnp.uint8),
+    }
+
+
 def test_bad_arguments_are_refused():
+    own = Line()
+    own.env = own
+    make(own)  # which is not followed for ever
     with refuses("AutoResetWrapper"):
         make(EvalWrapper(AutoResetWrapper(Line())))
     for options, names in (({"threshold": 0.0}, "threshold"), ({"episode_length": 1.5}, "episode_length")):
