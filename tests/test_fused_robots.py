@@ -97,8 +97,9 @@ def robot(seed, features=()):
                 ]
             )
         chain += f'<body name="link{link}" pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
+    free = '<joint type="free" frictionloss="0.3"/>' if "friction" in features else "<freejoint/>"
     boxes = "".join(
-        f'<body name="box{i}" pos="{numbers(2, -0.2, 0.2)} 0.05"><freejoint/>'
+        f'<body name="box{i}" pos="{numbers(2, -0.2, 0.2)} 0.05">{free}'
         f'{(rng.choice(SHAPES) if i or seed % 4 else EGG)[:-2]} name="o{i}"'
         f' priority="{rng.integers(2)}" friction="{numbers(1, 0.3, 1)} 0.02 0.01" condim="{rng.choice([1, 3, 4, 6])}"'
         f' solmix="{numbers(1, 0.5, 2)}" solref="{numbers(1, 0.01, 0.03)} 1" margin="0.002"/></body>'

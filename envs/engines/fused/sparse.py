@@ -19,7 +19,7 @@ from mjx_dher.system.warp_setup import wp
 class _Row(NamedTuple):
     """A row: an entry of `Sparse` in each of its fields."""
 
-    terms: list[tuple[int, float, int]]  # joint, coefficient, and whether the row's slope multiplies it
+    terms: list[tuple[int, float, int]]  # degree of freedom, coefficient, and whether the row's slope multiplies it
     rest: bool  # whether coordinates count from `qpos0`
     soft: Any
     inverse: float
@@ -34,8 +34,8 @@ def sparse_of(model: mujoco.MjModel) -> Any:
     friction, equal, limits = (list(rows(model)) if is_sparse(model) else [] for rows in (_frictions, _equalities, _limits))
     rows = [*friction, *equal, *limits]
     terms = [(row, *term) for row, each in enumerate(rows) for term in each.terms]
-    joint = np.array([term[1] for term in terms], int)
-    dof, qpos = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
+    dof = np.array([term[1] for term in terms], int)
+    qpos = model.jnt_qposadr[model.dof_jntid[dof]]
     row = np.array([term[0] for term in terms], int)
     by_dof = np.argsort(dof, kind="stable")
     rests = np.array([each.rest for each in rows], bool)
@@ -60,14 +60,13 @@ def sparse_of(model: mujoco.MjModel) -> Any:
 def _tendon(model: mujoco.MjModel, tendon: int, sloped: int) -> list[tuple[int, float, int]]:
     """Terms of a fixed tendon's length."""
     wraps = range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    return [(int(model.wrap_objid[wrap]), float(model.wrap_prm[wrap]), sloped) for wrap in wraps]
+    return [(int(model.jnt_dofadr[model.wrap_objid[wrap]]), float(model.wrap_prm[wrap]), sloped) for wrap in wraps]
 
 
 def _frictions(model: mujoco.MjModel) -> Any:
     for dof in np.flatnonzero(model.dof_frictionloss > 0):
         soft = softness(model, model.dof_solref[dof], model.dof_solimp[dof])
-        terms = [(int(model.dof_jntid[dof]), 1.0, 0)]
-        yield _Row(terms, False, soft, model.dof_invweight0[dof], model.dof_frictionloss[dof])
+        yield _Row([(int(dof), 1.0, 0)], False, soft, model.dof_invweight0[dof], model.dof_frictionloss[dof])
     for tendon in np.flatnonzero(model.tendon_frictionloss > 0):
         soft = softness(model, model.tendon_solref_fri[tendon], model.tendon_solimp_fri[tendon])
         loss = model.tendon_frictionloss[tendon]
@@ -78,8 +77,9 @@ def _equalities(model: mujoco.MjModel) -> Any:
     for eq in range(model.neq):
         objects = [int(each) for each in (model.eq_obj1id[eq], model.eq_obj2id[eq]) if each >= 0]
         if model.eq_type[eq] == JOINT:
-            parts = [[(joint, 1.0, number)] for number, joint in enumerate(objects)]
-            inverse = model.dof_invweight0[model.jnt_dofadr[objects]].sum()
+            dofs = model.jnt_dofadr[objects]
+            parts = [[(int(dof), 1.0, number)] for number, dof in enumerate(dofs)]
+            inverse = model.dof_invweight0[dofs].sum()
         elif model.eq_type[eq] == TENDON:
             parts = [_tendon(model, tendon, number) for number, tendon in enumerate(objects)]
             inverse = model.tendon_invweight0[objects].sum()
@@ -92,8 +92,8 @@ def _equalities(model: mujoco.MjModel) -> Any:
 def _limits(model: mujoco.MjModel) -> Any:
     for joint in np.flatnonzero(model.jnt_limited):
         soft = softness(model, model.jnt_solref[joint], model.jnt_solimp[joint])
-        inverse, span = model.dof_invweight0[model.jnt_dofadr[joint]], tuple(model.jnt_range[joint])
-        yield _Row([(int(joint), 1.0, 1)], False, soft, inverse, 0.0, span, model.jnt_margin[joint])
+        dof, span = int(model.jnt_dofadr[joint]), tuple(model.jnt_range[joint])
+        yield _Row([(dof, 1.0, 1)], False, soft, model.dof_invweight0[dof], 0.0, span, model.jnt_margin[joint])
     for tendon in np.flatnonzero(model.tendon_limited):
         soft = softness(model, model.tendon_solref_lim[tendon], model.tendon_solimp_lim[tendon])
         inverse, span = model.tendon_invweight0[tendon], tuple(model.tendon_range[tendon])
