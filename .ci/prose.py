@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 """Report how hard prose is to read: `python .ci/prose.py [--list] [PATH ...]`, of pages (.md) and docstrings (.py).
 
 It counts habits of wording and sentences of more than 30 words, without code, tables and addresses. A heading, a list item, an
@@ -59,7 +58,7 @@ def pieces(path: Path) -> Iterator[tuple[int, str]]:
 
 def count(paths: Iterable[Path], words: int = 0, sentences: int = 0) -> Count:
     long, habits = [], []
-    for name, line, piece in [(path, *piece) for path in paths for piece in pieces(path)]:
+    for name, line, piece in ((path, *piece) for path in paths for piece in pieces(path)):
         plain = re.sub(r"`[^`]*`", "Code", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", piece))
         words += len(re.findall(r"[A-Za-z][A-Za-z'-]*", plain))
         habits += [f"{name}:{line}: {match[0].strip()!r} is hard to read" for match in HABITS.finditer(plain)]
@@ -74,7 +73,8 @@ if __name__ == "__main__":
     parser.add_argument("paths", nargs="*", type=Path, default=[Path("README.md"), Path("docs"), Path("mjx_dher")])
     parser.add_argument("--list", action="store_true", help="print each habit and each long sentence")
     arguments = parser.parse_args()
+    if missing := [str(path) for path in arguments.paths if not path.exists()]:
+        parser.error(f"no such file or folder: {', '.join(missing)}")
     files = [path for given in arguments.paths for path in ([given] if given.is_file() else sorted(given.rglob("*")))]
-    for path in (path for path in files if path.suffix in (".md", ".py")):
-        found = count([path])
+    for path, found in ((path, count([path])) for path in files if path.suffix in (".md", ".py")):
         print(f"{path}: {found}", *(found.habits + found.long if arguments.list else []), sep="\n  ")
