@@ -34,12 +34,22 @@ ARMS = (
     *(Arm(f"tqc_{name}", "tqc", {"learner": "tqc", "sampler": sampler}, {"her_k": k}) for name, (sampler, k) in HER.items()),
 )
 SHARED: dict[str, Any] = {"cycles_per_epoch": 1, "target_period": 1, "batch_size": 512, "hidden_sizes": (256, 256)}
-SIZES: dict[str, dict[str, Any]] = {
+SIZES: dict[str, dict[str, Any]] = {  # in order of value
     "push": {"num_envs": 256, "updates_per_cycle": 512, "total_steps": 320_000},
     "pick_and_place": {"num_envs": 256, "updates_per_cycle": 512, "total_steps": 512_000},
+    "arm_push_easy": {"num_envs": 256, "updates_per_cycle": 1_000, "total_steps": 768_000},
     "slide": {"num_envs": 512, "updates_per_cycle": 1_000, "total_steps": 640_000},
+    "arm_push_hard": {"num_envs": 256, "updates_per_cycle": 1_000, "total_steps": 1_152_000},
+    "arm_grasp": {"num_envs": 256, "updates_per_cycle": 512, "total_steps": 768_000},
+    "block_rotate_z": {"num_envs": 512, "updates_per_cycle": 1_000, "total_steps": 2_048_000},
 }
-GAMMA = {"slide": 0.97}  # as in the presets; 0.95 for the other tasks
+STEPS = {
+    "arm_push_easy": 150,
+    "arm_push_hard": 150,
+    "arm_grasp": 100,
+    "block_rotate_z": 100,
+}  # of an episode; 50 for the others
+GAMMA = {"push": 0.95, "pick_and_place": 0.95, "slide": 0.97}  # as in the presets; 0.98 for the longer tasks
 # Assumed, not measured: seconds to compile a program, of a million environment steps, and of an update of ten lanes.
 COMPILE, MILLION_STEPS, UPDATE = 30.0, 0.75, {"crl": 5e-4, "sac": 7e-4, "tqc": 1e-3}
 
@@ -49,7 +59,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     del learner
     run = presets.preset("gpu", task, networks="layer_norm", priority="eventful", **arm.parts)
     sizes = {**TOY, "target_period": 1} if toy else {**SHARED, **SIZES[task], "replay_size": SIZES[task]["total_steps"]}
-    numbers = HParams(gamma=GAMMA.get(task, 0.95), polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1)
+    numbers = HParams(gamma=GAMMA.get(task, 0.98), polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1)
     config = dataclasses.replace(run.config, n_step=1, num_critics=2, policy_delay=1, **sizes)
     return dataclasses.replace(run, config=config, hparams=numbers._replace(**arm.numbers))
 
@@ -59,7 +69,7 @@ def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, 
     seconds = 0.0
     for task in tasks * len(learners):
         size = SIZES[task]
-        updates = size["total_steps"] / (50 * size["num_envs"]) * size["updates_per_cycle"]
+        updates = size["total_steps"] / (STEPS.get(task, 50) * size["num_envs"]) * size["updates_per_cycle"]
         for group in {arm.group for arm in arms}:
             lanes = seeds * sum(arm.group == group for arm in arms)
             seconds += COMPILE + lanes * (MILLION_STEPS * size["total_steps"] / 1e6 + updates * UPDATE[group] / 10)
