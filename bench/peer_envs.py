@@ -6,7 +6,8 @@ pip install brax==0.14.2 playground==0.2.0
 pip install --no-deps jaxgcrl==0.2.8  # it asks for JAX 0.4, and its environments run with later ones
 
 python train.py check --env bench.peer_envs:jaxgcrl_reacher
-python train.py --env bench.peer_envs:jaxgcrl_reacher --num-envs 64 --total-steps 300000
+python train.py --env bench.peer_envs:jaxgcrl_reacher --num-envs 64 --cycles-per-epoch 10 --batch-size 256 \\
+    --hidden-sizes 64 64 --total-steps 320000
 """
 
 import contextlib

@@ -33,6 +33,13 @@ DT = SUBSTEPS * TIMESTEP  # s; observed velocities are displacements per step
 POINTING_DOWN = np.array([1.0, 0.0, 1.0, 0.0], np.float32)  # the gripper's orientation (w, x, y, z), not normalized
 ASSETS = Path(__file__).parent / "assets"
 
+# Entries of the observation, and how many numbers each has. Velocities are displacements per step.
+_WITH_OBJECT = {
+    **{"grip_pos": 3, "object_pos": 3, "object_pos - grip_pos": 3, "finger_pos": 2, "object_euler": 3},
+    **{"object_vel - grip_vel": 3, "object_angvel": 3, "grip_vel": 3, "finger_vel": 2},
+}
+_WITHOUT_OBJECT = {name: _WITH_OBJECT[name] for name in ("grip_pos", "finger_pos", "grip_vel", "finger_vel")}
+
 
 @dataclasses.dataclass(frozen=True)
 class FetchTask:
@@ -106,7 +113,12 @@ class FetchEnv(MujocoTask):
 
     @property
     def robot_interface(self) -> dict[str, Any]:
-        return {}
+        entries = _WITH_OBJECT if self.has_object else _WITHOUT_OBJECT
+        ends = np.cumsum([0, *entries.values()]).tolist()
+        fingers = {"kind": "JointDelta", "moves": ["finger_r", "finger_l"] if self.drives_fingers else [], "scale": 1.0}
+        controls = [{"kind": "Mocap", "moves": ["gripper"], "scale": ACTION_SCALE}, fingers]
+        layout = {name: [begin, end] for name, begin, end in zip(entries, ends, ends[1:])}
+        return {"controls": controls, "layout": layout, "joints": {"finger_pos": ["finger_r", "finger_l"]}}
 
     @property
     def spec(self) -> EnvSpec:

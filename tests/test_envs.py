@@ -28,6 +28,8 @@ def test_the_interface(name, task):
     assert state.reward == env.compute_reward(state.obs["achieved_goal"], state.obs["desired_goal"])
     assert env_spec(env) == env.spec
     assert env.spec.episode_length == 50
+    *_, last = env.robot_interface["layout"].values()
+    assert last == [env.observation_size - 2, env.observation_size]
 
 
 @pytest.mark.parametrize("task", RECORDED)
