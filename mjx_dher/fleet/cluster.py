@@ -50,7 +50,7 @@ class Board:
         self._news: dict[str, News] = {}
 
     def tell(self, news: News) -> bool:
-        """Takes news of a chunk. Returns whether to stop."""
+        """Takes news of a chunk. Returns True if it should stop."""
         before = self._news.get(news.chunk)
         self._news[news.chunk] = news if before is None else news._replace(lines=(*before.lines, *news.lines)[-20:])
         return self._stop
@@ -71,7 +71,7 @@ def joined(address: str, code: Path | None) -> Iterator[Cluster]:
       code: folder with custom code, which is sent to the nodes.
 
     Raises:
-      ValueError: there is no such cluster, this machine is not part of it, or the code cannot be sent.
+      ValueError: there is no such cluster, this machine does not belong to it, or the code cannot be sent.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}

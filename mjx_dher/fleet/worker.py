@@ -44,7 +44,7 @@ class News(NamedTuple):
     lines: tuple[str, ...]  # for the user
 
 
-Tell = Callable[[News], bool]  # returns whether to stop
+Tell = Callable[[News], bool]  # returns True to stop
 
 
 def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[bytes]:
@@ -53,7 +53,7 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
     Args:
       chunk: the chunk.
       make_env: makes the environment of a run.
-      tell: reports progress. Returns whether to stop.
+      tell: reports progress, and returns True to stop the chunk.
 
     Returns:
       Each run folder as bytes from `pack`, or empty bytes if a run was stopped.
