@@ -44,6 +44,8 @@ def few_terms(rng, names, features):
     tendons, (first, second, third) = "", rng.permutation(names)[:3]
     for number in range(4):
         terms = "".join(f'<joint joint="{name}" coef="{numbers(1)}"/>' for name in rng.permutation(names)[: 1 + number])
+        if "side" in names and number == 1:
+            terms = f'<joint joint="side" coef="1"/><joint joint="{first}" coef="{numbers(1)}"/>'
         friction = 'frictionloss="1.5" solreffriction="0.03 1.5"' if "tendon friction" in features and number % 2 else ""
         limits = 'range="-0.05 0.1" margin="0.01"' if "tendon limits" in features else ""
         springs = f'stiffness="{numbers(1, 0, 50)}" damping="{numbers(1, 0, 3)}" springlength="-0.02 0.05"'
@@ -97,6 +99,10 @@ def robot(seed, features=()):
                 ]
             )
         chain += f'<body name="link{link}" pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
+    side = ""
+    if "motors" in features:  # a tendon of joints that do not move one another
+        side = '<body pos="0 0.5 0.5"><joint name="side" axis="0 1 0" armature="0.1"/><geom size="0.05" pos="0.1 0 0"/></body>'
+        names.append("side")
     free = '<joint type="free" frictionloss="0.3"/>' if "friction" in features else "<freejoint/>"
     boxes = "".join(
         f'<body name="box{i}" pos="{numbers(2, -0.2, 0.2)} 0.05">{free}'
@@ -111,7 +117,7 @@ def robot(seed, features=()):
         f' margin="{numbers(1, 0, 0.01)}" gap="{numbers(1, 0, 0.02)}" solref="-900 -40" solimp="0.8 0.9 0.01 0.4 3"/>'
         for geom1, geom2 in (("floor", "o0"), ("o1", "o0"))
     )
-    integrator = rng.choice(["Euler", "implicitfast"])
+    integrator = "implicitfast" if "motors" in features else rng.choice(["Euler", "implicitfast"])
     flags = '<flag gravity="disable" eulerdamp="disable" filterparent="disable"/>' if seed == 2 else ""
     cone = 'cone="elliptic" impratio="3"' if "elliptic" in features else ""
     return mujoco.MjModel.from_xml_string(
@@ -119,7 +125,7 @@ def robot(seed, features=()):
 <option {cone} integrator="{integrator}" tolerance="1e-12" ccd_tolerance="1e-9">{flags}</option>
 <worldbody>
 <body name="t" mocap="true"/><geom name="floor" type="plane" size="2 2 0.1"/>{boxes}
-<body pos="0 0 0.3">{chain}{"</body>" * 5}</worldbody><contact>{pairs}</contact><actuator>{motors}</actuator></mujoco>'''
+<body pos="0 0 0.3">{chain}{"</body>" * 5}{side}</worldbody><contact>{pairs}</contact><actuator>{motors}</actuator></mujoco>'''
     )
 
 

@@ -127,7 +127,7 @@ def _ending(traits: Traits, nv: int, warps: int) -> Any:
         solve(world, sparse, memory, wp.static(has_sparse), wp.static(elliptic), wp.static(nv), thread, threads)
         gather(wp.static(warps))
         if wp.static(has_tendons):
-            soften(world, dofs, memory, given, thread, threads)
+            soften(world, bodies, dofs, memory, given, thread, threads)
         accelerate(
             world,
             bodies,

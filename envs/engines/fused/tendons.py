@@ -1,6 +1,6 @@
 """Springs and dampers of fixed tendons, and actuators on them."""
 
-from mjx_dher.envs.engines.fused.model import Dofs, Memory, World
+from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Memory, World
 from mjx_dher.system.warp_setup import wp
 
 
@@ -46,8 +46,11 @@ def pull(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> w
 
 
 @wp.func
-def soften(world: World, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
-    """Makes velocities implicit in the forces of tendons, as implicitfast does: adds to the mass matrix."""
+def soften(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
+    """Makes velocities implicit in the forces of tendons, as implicitfast does: adds to the mass matrix.
+
+    As in MuJoCo C, one joint of a tendon is implicit in another's velocity only if one of them moves the other.
+    """
     tendons = dofs.tendons
     for i in range(thread, dofs.implicit * dofs.number, threads):
         for term in range(tendons.terms):
@@ -56,6 +59,6 @@ def soften(world: World, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=floa
                 slope = world.timestep * tendons.coef[term] * tension(dofs, memory, inputs, t)[2]
                 for other in range(tendons.begin[t], tendons.begin[t + 1]):
                     j = tendons.dof[other]
-                    if j <= i:
+                    if (bodies.moved_by[dofs.body[i]] >> j) & 1 == 1 and j <= i:
                         at = i * (i + 1) // 2 + j
                         memory.mass[at] = memory.mass[at] + slope * tendons.coef[other]
