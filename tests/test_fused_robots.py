@@ -100,7 +100,7 @@ def robot(seed, features=()):
             )
         chain += f'<body name="link{link}" pos="{numbers(3, -0.2, 0.2)}" quat="{numbers(4)}">{joints}{rng.choice(SHAPES)}'
     side = ""
-    if "motors" in features:  # a tendon of joints that do not move one another
+    if features == ("motors",):  # a tendon of joints that do not move one another
         side = '<body pos="0 0.5 0.5"><joint name="side" axis="0 1 0" armature="0.1"/><geom size="0.05" pos="0.1 0 0"/></body>'
         names.append("side")
     free = '<joint type="free" frictionloss="0.3"/>' if "friction" in features else "<freejoint/>"
@@ -117,7 +117,7 @@ def robot(seed, features=()):
         f' margin="{numbers(1, 0, 0.01)}" gap="{numbers(1, 0, 0.02)}" solref="-900 -40" solimp="0.8 0.9 0.01 0.4 3"/>'
         for geom1, geom2 in (("floor", "o0"), ("o1", "o0"))
     )
-    integrator = "implicitfast" if "motors" in features else rng.choice(["Euler", "implicitfast"])
+    integrator = "implicitfast" if side else rng.choice(["Euler", "implicitfast"])
     flags = '<flag gravity="disable" eulerdamp="disable" filterparent="disable"/>' if seed == 2 else ""
     cone = 'cone="elliptic" impratio="3"' if "elliptic" in features else ""
     return mujoco.MjModel.from_xml_string(
