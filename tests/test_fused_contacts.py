@@ -84,6 +84,17 @@ def in_c(model, flat, rng):
     return *(np.array(x, np.float32) for x in zip(*poses)), there
 
 
+def in_the_kernel(model, pos, mat, collide):
+    """Number [NUM] of contacts, and distance, place and normal [NUM, slots, 7]."""
+    *_, contacts, _, layout = simulation._structs(model, 10**6)
+    memory = [wp.zeros((NUM, layout.size), dtype=float), wp.zeros(1, dtype=int)]
+    found = [wp.zeros((NUM, contacts.slots), dtype=dtype) for dtype in (float, wp.vec3, wp.vec3)]
+    number = wp.zeros(NUM, dtype=int)
+    poses = [wp.array(pos, dtype=wp.vec3), wp.array(mat, dtype=wp.mat33)]
+    wp.launch(collide, dim=NUM, inputs=[contacts, layout, *memory, *poses], outputs=[number, *found])
+    return number.numpy(), np.concatenate([found[0].numpy()[..., None], *(x.numpy() for x in found[1:])], axis=2)
+
+
 @pytest.mark.parametrize(("shape1", "shape2"), PAIRS)
 @pytest.mark.parametrize("flat", [None, 0.02])
 def test_two_shapes_touch_as_in_mujoco_c(shape1, shape2, flat, collide, monkeypatch):
@@ -92,17 +103,11 @@ def test_two_shapes_touch_as_in_mujoco_c(shape1, shape2, flat, collide, monkeypa
     margin = 0.0 if flat is None else 0.002
     model = mujoco.MjModel.from_xml_string(MODEL.format(shape1, SHAPES[shape1], shape2, SHAPES[shape2], margin))
     pos, mat, there = in_c(model, flat, np.random.default_rng(0))
-    *_, contacts, _, layout = simulation._structs(model, 10**6)
-    memory = [wp.zeros((NUM, layout.size), dtype=float), wp.zeros(1, dtype=int)]
-    found = [wp.zeros((NUM, contacts.slots), dtype=dtype) for dtype in (float, wp.vec3, wp.vec3)]
-    number = wp.zeros(NUM, dtype=int)
-    poses = [wp.array(pos, dtype=wp.vec3), wp.array(mat, dtype=wp.mat33)]
-    wp.launch(collide, dim=NUM, inputs=[contacts, layout, *memory, *poses], outputs=[number, *found])
+    number, here = in_the_kernel(model, pos, mat, collide)
     lies = (shape1, shape2) == ("capsule", "cylinder")  # maybe on an end, which is a polygon in C
-    same = number.numpy() == [len(rows) for rows in there]
+    same = number == [len(rows) for rows in there]
     assert same.mean() > 0.99 if lies else same.all()
-    here = np.concatenate([found[0].numpy()[..., None], *(x.numpy() for x in found[1:])], axis=2)
-    assert max(number.numpy()) > 0
+    assert max(number) > 0
     errors = []
     for ours, theirs in zip(here[same], [rows for rows, agree in zip(there, same) if agree]):
         for row in theirs:
@@ -113,3 +118,13 @@ def test_two_shapes_touch_as_in_mujoco_c(shape1, shape2, flat, collide, monkeypa
     assert errors[:, 1:4].max() < (2e-3 if lies else 5e-6)
     assert np.quantile(errors[:, :4], 0.9) < 1e-6
     assert errors[:, 4:].max() < (0.05 if lies else 1e-4)
+
+
+@pytest.mark.parametrize("size", [".003 .03 .03", ".003 .003 .05"])
+def test_a_thin_ellipsoid_never_misses_a_box(size, collide, monkeypatch):
+    monkeypatch.setattr(setup, "FEW", 0)
+    model = mujoco.MjModel.from_xml_string(MODEL.format("ellipsoid", size, "box", SHAPES["box"], 0.0))
+    pos, mat, there = in_c(model, None, np.random.default_rng(0))
+    number, _ = in_the_kernel(model, pos, mat, collide)
+    assert number.tolist() == [len(rows) for rows in there]
+    assert sum(number) > 20

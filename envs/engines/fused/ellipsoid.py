@@ -3,8 +3,8 @@
 A sphere is a point with a radius, a capsule a segment with a radius, and a box a box with radius 0. The contact is at the
 point, on the segment or in the box, that is deepest in the ellipsoid, or nearest to it. The signed distance from a convex
 shape is a convex function, so Newton's method, kept within the segment or box, finds that point. MuJoCo C runs its general
-convex solver (GJK and EPA) here, which finds the same contact as long as the point is not deep inside. Source of the method:
-D. Bertsekas, Projected Newton methods for optimization problems with simple constraints (1982).
+convex solver (GJK and EPA) here, which finds the same contact up to a depth of about a third of the shortest half axis.
+Source: D. Bertsekas, Projected Newton methods for optimization problems with simple constraints (1982).
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
@@ -25,8 +25,9 @@ _PLANE, _SPHERE, _CAPSULE, _BOX = (
     wp.constant(kind) for kind in (PLANE_ELLIPSOID, SPHERE_ELLIPSOID, CAPSULE_ELLIPSOID, ELLIPSOID_BOX)
 )
 _plane_ellipsoid = private_api.mujoco_warp_shapes().plane_ellipsoid
-_STEPS, _HALVINGS = wp.constant(24), wp.constant(6)  # most steps of Newton's method, and halvings of a step
+_STEPS, _HALVINGS = wp.constant(60), wp.constant(12)  # most steps of Newton's method, and halvings of a step
 _FLAT = wp.constant(1.0e-5)  # slope at which the search ends
+_ROUNDING = wp.constant(3.0e-7)  # a decrease that single precision leaves unsure, relative to the longest axis
 _INSIDE = wp.constant(0.999)  # how far towards the middle of the ellipsoid distances are exact
 
 
@@ -90,7 +91,8 @@ def _shape(pos: wp.vec3, mat: wp.mat33, axes: wp.vec3, box_pos: wp.vec3, box_mat
         moved = at
         for _halving in range(_HALVINGS):
             moved = _within(at + step, half)
-            if _depth(middle + turn * moved, axes) <= depth + 1.0e-4 * wp.dot(slope, moved - at):
+            less = -wp.dot(slope, moved - at)
+            if wp.abs(less) < _ROUNDING * longest or _depth(middle + turn * moved, axes) <= depth - 1.0e-4 * less:
                 break
             step *= 0.5
         if wp.length(moved - at) < 1.0e-7 * longest:
@@ -165,8 +167,8 @@ def _curved(point: wp.vec3, axes: wp.vec3):
     normal = _outwards(point, axes)
     inverse = wp.cw_div(wp.vec3(1.0), wp.cw_mul(axes, axes) + wp.vec3(t))
     v = wp.cw_mul(point, inverse)
-    size = wp.max(wp.length(v), 1.0e-12)
+    size = wp.max(wp.length(v), 1.0e-4 / wp.max(axes))
     change = wp.cw_mul(inverse, v)
     along = v - t * change
-    bend = wp.diag(inverse) - wp.outer(change, along) / wp.max(wp.dot(along, v), 1.0e-20)
+    bend = wp.diag(inverse) - wp.outer(change, along) / wp.max(wp.dot(along, v), 1.0e-4 * size * size)
     return normal, (bend - wp.outer(normal, wp.transpose(bend) * normal)) / size
