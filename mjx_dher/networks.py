@@ -206,7 +206,7 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
       ValueError: `hidden_sizes` are not all equal.
     """
     if len(set(hidden_sizes)) != 1:
-        raise ValueError(f"networks residual need hidden_sizes that are all equal; got {hidden_sizes}")
+        raise ValueError(f"networks residual and unit_norm need equal hidden_sizes; got {hidden_sizes}")
     style = Style(layer_norm=True, residual=True)
     return _styled(action_size, hidden_sizes, dtype, heads, style, style)
 

@@ -50,10 +50,11 @@ def make_batch(size=64):
         reward=-jax.random.bernoulli(keys[4], 0.5, (size,)).astype(jnp.float32),
         discount=jnp.full(size, 0.98),
         row=jnp.arange(size),
+        hindsight_goal=jax.random.normal(keys[2], (size, 2)),
     )
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3", "redq", "tqc", "dtqc")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3", "csac", "redq", "tqc", "dtqc", "crl")]
 
 
 @pytest.mark.parametrize("name", ["ddpg", "sac", *SLOW])
