@@ -23,10 +23,17 @@ ENVS, STEPS, SUBSTEPS = 4, 2, 10
 
 
 def inputs(model: mujoco.MjModel) -> tuple[mujoco.MjData, np.ndarray]:
-    """The start, the first keyframe if there is one, and controls [ENVS, STEPS, nu] within their ranges."""
+    """The start, and controls [ENVS, STEPS, nu] within their ranges.
+
+    The start is the first keyframe, or else the default, with joints that are out of range in the middle of their range.
+    """
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
+    for joint in np.flatnonzero(model.jnt_limited & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE))):
+        at, (lowest, highest) = model.jnt_qposadr[joint], model.jnt_range[joint]
+        if not lowest <= data.qpos[at] <= highest:
+            data.qpos[at] = 0.5 * (lowest + highest)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     return data, np.random.default_rng(0).uniform(low, high, (ENVS, STEPS, model.nu)).astype(np.float32)
 

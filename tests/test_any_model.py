@@ -1,6 +1,7 @@
 """Engines on models that have nothing of a Fetch robot: an arm with joint servos, activations, several mocap bodies, none."""
 
 import dataclasses
+import importlib
 import json
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from conftest import names, refuses
+from conftest import EXAMPLES, ROOT, names, refuses
 from engine_models import BODY, MODELS, SUBSTEPS, arm, play, start
 
 from mjx_dher import cli
@@ -195,3 +196,14 @@ def test_too_little_memory_of_a_gpu_is_reported_with_a_cure(monkeypatch):
         monkeypatch.setattr(engine, "_made", made)
         with refuses(*(["4096", "num_envs", message] if kind is MemoryError else [message]), error=kind):
             engine._simulation("cpu", 4096)
+
+
+def test_the_benchmark_of_third_party_models_compares_with_mj_step(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    third_party = importlib.import_module("third_party")
+    monkeypatch.setattr("sys.argv", ["third_party.py", f"arm={EXAMPLES / 'arm.xml'}", "--engines", "native", "warp"])
+    third_party.main()
+    (row,) = [line.split("|") for line in capsys.readouterr().out.splitlines() if line.startswith("| arm")]
+    assert int(row[2]) == 12
+    assert 0 <= float(row[3]) < 1e-3
+    assert "no: engine warp needs" in row[4]
