@@ -25,9 +25,10 @@ from mjx_dher.runs.folder import results, run_folder  # noqa: E402
 from mjx_dher.spec import RunSpec  # noqa: E402
 from mjx_dher.system import files  # noqa: E402
 
-LIMIT = 5_000_000  # bytes of all policies together
+LIMIT = 9_000_000  # bytes of all policies together
 KEPT = (run_folder.CONFIG_FILE, run_folder.METRICS_FILE, run_folder.POLICY_FILE, run_folder.RESULT_FILE)
 TITLES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide", "reach": "Reach"}
+TITLES |= {"block_rotate_z": "Block, rotate z", "egg_rotate": "Egg, rotate"}
 
 
 def command(run: RunSpec) -> list[str]:

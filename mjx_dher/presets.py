@@ -144,7 +144,7 @@ def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
 
 
 def _gpu_hand(env: str) -> tuple[Config, HParams]:
-    total_steps = 4_000_000 if env == "block_rotate_z" else 8_000_000
+    total_steps = 3_000_000 if env == "block_rotate_z" else 8_000_000
     config = Config(
         num_envs=1024,
         cycles_per_epoch=2,
@@ -156,7 +156,7 @@ def _gpu_hand(env: str) -> tuple[Config, HParams]:
         hidden_sizes=(512, 512, 512),
         renewals=5,
     )
-    return config, _TUNED._replace(gamma=0.98, her_k=4.0)
+    return config, _TUNED._replace(gamma=0.98, her_k=4.0, lr_end=0.05)
 
 
 def _gpu_hand_reach(env: str) -> tuple[Config, HParams]:

@@ -20,6 +20,7 @@ from mjx_dher.tools.transfer import ORIGINALS
 
 PUBLISH = runpy.run_path(str(ROOT / "docs" / "publish_policy.py"))
 SIZES = {"push": (25, 3, 4), "pick_and_place": (25, 3, 4), "slide": (25, 3, 4), "reach": (10, 3, 4)}
+SIZES |= dict.fromkeys(("block_rotate_z", "egg_rotate"), (61, 7, 20))
 
 
 def facts_of(name):
@@ -29,7 +30,7 @@ def facts_of(name):
 def test_the_tasks_have_policies():
     assert {"push", "reach"} <= set(bundled.names()) <= set(ORIGINALS)
     files = [path for path in bundled.FOLDER.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")]
-    assert sum(path.stat().st_size for path in files) < 5_000_000
+    assert sum(path.stat().st_size for path in files) < 9_000_000
 
 
 @pytest.mark.parametrize("name", bundled.names())
