@@ -166,8 +166,8 @@ def test_a_better_policy_takes_the_place_of_the_one_before(tmp_path):
 def test_too_large_a_policy_leaves_what_is_there(tmp_path):
     run, target = bundled.FOLDER / "reach", tmp_path / "policies" / "reach"
     PUBLISH["publish"](run, target, new_facts(0.5), anyway=False)
-    (tmp_path / "policies" / "other").write_bytes(bytes(4_900_000))
-    with refuses("5,000,000"):
+    (tmp_path / "policies" / "other").write_bytes(bytes(8_900_000))
+    with refuses("9,000,000"):
         PUBLISH["publish"](run, target, new_facts(0.75), anyway=False)
     assert "**0.500**" in (target / "README.md").read_text()
 
