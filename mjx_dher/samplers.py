@@ -103,8 +103,8 @@ def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length
 
 def geometric(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """Weighs the goal t steps later by gamma^t: then a contrastive critic estimates discounted occupancy (Eysenbach 2022)."""
-    later, gamma = jnp.maximum(jnp.arange(achieved.shape[0]) - step, 0), jnp.maximum(hparams.gamma, 1e-30)
-    return future(achieved, desired, step, hparams, length) + later * jnp.log(gamma)
+    later = jnp.maximum(jnp.arange(achieved.shape[0]) - step, 0).astype(jnp.float32)
+    return future(achieved, desired, step, hparams, length) + later * jnp.log(jnp.maximum(hparams.gamma, 1e-30))
 
 
 def closest(

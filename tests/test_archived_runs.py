@@ -82,6 +82,7 @@ def test_an_ended_run_goes_on_with_more_steps(archive):
     compare(folder, archive / "expected" / folder.name)
 
 
+@pytest.mark.slow
 def test_a_sweep_resumes_and_its_tables_read(archive):
     """The folders of the trials still have the names of today's settings; two of four runs had ended."""
     folder = archive / "sweep"

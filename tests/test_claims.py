@@ -129,6 +129,7 @@ def test_a_trial_that_ended_since_it_was_listed_is_left_alone(tmp_path, monkeypa
     assert table(tmp_path / "sweep") == table(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_a_finished_trial_with_a_short_curve_is_named_and_trained_again(tmp_path):
     trials = make_grid(("future",), (0, 1), static=LONGER)
     run(tmp_path, trials)

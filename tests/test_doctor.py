@@ -18,6 +18,7 @@ from mjx_dher.system.limits import usable_cores
 from mjx_dher.tools import doctor, render
 
 ON_CPU = jax.default_backend() == "cpu"
+pytestmark = pytest.mark.slow  # most of its time is a program of its own
 
 
 @pytest.fixture(scope="module")

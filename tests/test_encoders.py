@@ -51,6 +51,7 @@ def random_tree(key, *leading):
 
 
 @pytest.mark.parametrize("name", ["ddpg", "tqc", pytest.param("sac", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_an_encoder_takes_a_tree_of_observations(name):
     """Both networks learn their own encoder; float leaves are normalized and images are not."""
     learner = learners.make(name, SMALL, IMAGES, seeing)

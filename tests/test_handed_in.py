@@ -300,6 +300,7 @@ def test_the_names_that_learners_may_not_use_are_those_of_the_log():
 # The checks themselves.
 
 
+@pytest.mark.slow
 def test_checks_take_episodes_of_one_step_and_observations_of_their_kind():
     one_step = PointMass(1)
     assert "goals of the past too" in testing.check_sampler("episode", one_step)

@@ -128,6 +128,7 @@ def candidates(desired, achieved_before, number, hindsight=True):
     return sample, Batch(before, before, desired, before, REWARD(before, desired), jnp.full(len(desired), HP.gamma), zeros)
 
 
+@pytest.mark.slow
 def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
     sample, batch = candidates([0.0, 0.05, 0.5, 0.05] * 50, [0.0] * 200, 50)
     np.testing.assert_array_equal(transitions.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
@@ -170,6 +171,7 @@ def test_weights_are_kept_in_proportion():
     assert np.sum((found[[0, 1, 3]] - expected) ** 2 / expected) < 13.8  # 99.9 % point at 2 degrees of freedom
 
 
+@pytest.mark.slow
 def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
     sample, batch = candidates([0.0, 0.0, 0.0, 1.0] * 2000, [0.5] * 8000, 2000)
     half = CONTEXT._replace(hparams=HP._replace(priority_fraction=0.5))
@@ -178,6 +180,7 @@ def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
     assert abs(float(kept.desired_goal[:, 0].mean()) - 0.5) < 0.05
 
 
+@pytest.mark.slow
 def test_the_curriculum_goes_from_diverse_to_near_goals():
     group = [0.0, 0.0, 0.0, 1.0, 1.0, 5.0, 5.0, 5.0]
     sample, batch = candidates(group, [0.0] * 8, 2)
@@ -198,6 +201,7 @@ def test_the_curriculum_s_gain_by_hand():
     assert int(transitions.pick_curriculum(jax.random.key(0), sample, batch, 1, CONTEXT)[0]) == int(np.argmax(gain))
 
 
+@pytest.mark.slow
 def test_a_2_dpp_draws_pairs_in_proportion_to_determinants():
     line = np.array([0.0, 0.3, 1.0, 1.0])
     sample, batch = candidates(line, [0.0] * 4, 1)
@@ -210,6 +214,7 @@ def test_a_2_dpp_draws_pairs_in_proportion_to_determinants():
         assert abs(np.mean((pairs == pair).all(axis=1)) - determinant / total) < 0.015, pair
 
 
+@pytest.mark.slow
 def test_groups_keep_their_own_and_take_any_number():
     for number in (1, 6):
         sample, batch = candidates(np.arange(4.0 * number), [0.0] * 4 * number, number)

@@ -53,6 +53,7 @@ def test_each_mistake_is_named_by_its_check(kind, name):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_what_is_right_passes(capsys):
     for name in (*COMPONENTS["sampler"], soon):
         check_sampler(name, ENV)
@@ -212,8 +213,12 @@ def test_shapes_are_checked_where_a_function_is_handed_in(tmp_path, kind, name, 
         ("NanObservation", {}, "all 4 episodes were discarded"),
         ("SuccessSeven", {}, "success must be 0 or 1; in 1 of the episodes it is not"),
         (None, {"sampler": "mistakes:nothing"}, "the sampler offers no hindsight goal for any transition"),
-        (None, {"sampler": "closest", "metric": "mistakes:similarity"}, "the sampler offers no hindsight goal"),
-        (None, {"sampler": "epsilon_closest", "metric": "mistakes:cosine"}, "the sampler offers no hindsight goal"),
+        *(
+            pytest.param(
+                None, {"sampler": sampler, "metric": f"mistakes:{metric}"}, "no hindsight goal", marks=pytest.mark.slow
+            )
+            for sampler, metric in (("closest", "similarity"), ("epsilon_closest", "cosine"))
+        ),
         (None, {"learner": "mistakes:breaks"}, "not finite"),
     ],
 )

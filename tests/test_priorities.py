@@ -123,6 +123,7 @@ SHARES = HUGE / HUGE.astype(np.float64).sum()
 
 
 @pytest.mark.parametrize("ends", [False, True])
+@pytest.mark.slow
 def test_episodes_are_drawn_by_weights_whose_sum_overflows(ends):
     rows = jax.tree.map(lambda x: jnp.stack([x[1]] * 5), EPISODES.filled())
     ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], rows), 5, ends), rows, HUGE)

@@ -100,6 +100,7 @@ def test_every_task_shows_its_goal_and_its_object(drawn):
 
 
 @pytest.mark.parametrize(("what", "colour"), [("goal", "red"), ("object", "blue")])
+@pytest.mark.slow
 def test_a_thing_moved_is_drawn_moved(drawn, what, colour):
     _, frames, _ = drawn
     near, far = (centre(frames[f"{what}_{where}"], colour) for where in ("near", "far"))

@@ -293,6 +293,7 @@ def test_environments_of_gym_with_many_options_are_not_all_kept():
     gym_cache._compile.cache_clear()
 
 
+@pytest.mark.slow
 def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
     sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE), num_threads=1)
     data, program = sim.make_data(), jax.jit(sim.step)

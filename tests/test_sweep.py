@@ -152,6 +152,7 @@ def test_a_lane_is_that_run_alone(tmp_path):
             np.testing.assert_array_equal(a[lane], b)
 
 
+@pytest.mark.slow
 def test_a_sweep_that_was_cut_short_trains_what_is_missing_and_ends_as_if_it_had_not_been(tmp_path):
     trials, cut, whole = make_grid(seeds=(0, 1, 2)), tmp_path / "cut", tmp_path / "whole"
     done = []

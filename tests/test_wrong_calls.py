@@ -168,6 +168,7 @@ def test_what_a_user_can_do_is_a_sentence(monkeypatch, capsys, error, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_command_line_in_a_thread(runs, tmp_path, capsys):
     folder = shutil.copytree(runs / "stopped", tmp_path / "run")
     statuses = []
