@@ -26,7 +26,7 @@ def make_ring(num_rows):
     return replay.init(jax.tree.map(lambda x: x[0], make_episodes([0])), num_rows)
 
 
-@pytest.mark.parametrize(("num_rows", "num_new"), [(rows, new) for rows in (1, 3, 8) for new in (1, 2, 3, 5) if new <= rows])
+@pytest.mark.parametrize(("num_rows", "num_new"), [(1, 1), (3, 2), (3, 3), (8, 5)])
 def test_wrap_around_never_mixes_episodes(num_rows, num_new):
     ring, added = make_ring(num_rows), 0
     add = jax.jit(replay.add)
