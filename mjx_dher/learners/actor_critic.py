@@ -10,7 +10,9 @@ Targets, including the entropy term, are clipped to the bounds of returns (Hirao
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,31 @@ class ActorCriticState:
     num_updates: Array  # [] int32
 
 
+def first_state(learner: ActorCriticBase, key: PRNGKey, init_critic: Callable[..., PyTree]) -> ActorCriticState:
+    """State with fresh networks, equal targets and empty normalizers.
+
+    Args:
+      learner: the learner.
+      key: random key.
+      init_critic: maps a key, observations, goals and actions to the critics' parameters.
+    """
+    actor_key, critic_key, update_key = jax.random.split(key, 3)
+    observation, goal, action = zeros(learner.spec, learner.networks)
+    params = Params(
+        actor=learner.actor.init(learner.networks.actor, actor_key, observation, goal),
+        critic=init_critic(critic_key, observation, goal, action),
+    )
+    return ActorCriticState(
+        params=params,
+        target=jax.tree.map(jnp.copy, learner.lagging(params)),
+        actor_moments=common.adam(0.0).init(params.actor),
+        critic_moments=common.adam(0.0).init(params.critic),
+        key=jax.random.key_data(update_key),
+        num_updates=jnp.zeros((), jnp.int32),
+        **learner.normalizers(),
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class ActorCritic(ActorCriticBase):
     """Learner with pure functions of an `ActorCriticState`. `learners.Learner` documents the methods."""
@@ -49,21 +76,7 @@ class ActorCritic(ActorCriticBase):
 
     def init(self, key: PRNGKey) -> ActorCriticState:
         """Fresh networks, equal targets and empty normalizers."""
-        actor_key, critic_key, update_key = jax.random.split(key, 3)
-        observation, goal, action = zeros(self.spec, self.networks)
-        params = Params(
-            actor=self.actor.init(self.networks.actor, actor_key, observation, goal),
-            critic=self.critics.init(self.networks.critic, critic_key, observation, goal, action),
-        )
-        return ActorCriticState(
-            params=params,
-            target=jax.tree.map(jnp.copy, self.lagging(params)),
-            actor_moments=common.adam(0.0).init(params.actor),
-            critic_moments=common.adam(0.0).init(params.critic),
-            key=jax.random.key_data(update_key),
-            num_updates=jnp.zeros((), jnp.int32),
-            **self.normalizers(),
-        )
+        return first_state(self, key, functools.partial(self.critics.init, self.networks.critic))
 
     def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
         """Value [...] of actions [..., A] by the critics."""

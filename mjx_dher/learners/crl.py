@@ -19,10 +19,10 @@ import jax.numpy as jnp
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
-from mjx_dher.learners.actor_critic import ActorCriticState
+from mjx_dher.learners.actor_critic import ActorCriticState, first_state
 from mjx_dher.learners.actors import Gaussian
 from mjx_dher.learners.common import ActorCriticBase, Params
-from mjx_dher.networks import Heads, NetworksFn, check_heads, zeros
+from mjx_dher.networks import Heads, NetworksFn, check_heads
 from mjx_dher.types import Array, Batch, EnvSpec, Metrics, PRNGKey, PyTree
 
 # energy(inner product, product of both squared lengths, squared distance), each of one shape
@@ -85,21 +85,7 @@ class CRL(ActorCriticBase):
 
     def init(self, key: PRNGKey) -> ActorCriticState:
         """Makes fresh networks and empty normalizers."""
-        actor_key, critic_key, update_key = jax.random.split(key, 3)
-        observation, goal, action = zeros(self.spec, self.networks)
-        params = Params(
-            actor=self.actor.init(self.networks.actor, actor_key, observation, goal),
-            critic=self.networks.critic.init(critic_key, observation, goal, action),
-        )
-        return ActorCriticState(
-            params=params,
-            target=self.lagging(params),
-            actor_moments=common.adam(0.0).init(params.actor),
-            critic_moments=common.adam(0.0).init(params.critic),
-            key=jax.random.key_data(update_key),
-            num_updates=jnp.zeros((), jnp.int32),
-            **self.normalizers(),
-        )
+        return first_state(self, key, self.networks.critic.init)
 
     def lagging(self, params: Params) -> Params:
         """Nothing: there are no targets."""
