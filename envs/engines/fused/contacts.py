@@ -173,6 +173,14 @@ def geom_of(contacts: Contacts, memory: Memory, geom: int):
 
 
 @wp.func
+def put(memory: Memory, slot: int, distance: float, place: wp.vec3, normal: wp.vec3):
+    """Sets a slot."""
+    memory.distance[slot] = distance
+    memory.place[slot] = place
+    memory.normal[slot] = normal
+
+
+@wp.func
 def _corners(
     memory: Memory, first: int, margin: float, plane: wp.vec3, normal: wp.vec3, pos: wp.vec3, mat: wp.mat33, size: wp.vec3
 ):

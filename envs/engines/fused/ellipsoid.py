@@ -8,7 +8,7 @@ Source: D. Bertsekas, Projected Newton methods for optimization problems with si
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
-from mjx_dher.envs.engines.fused.contacts import geom_of
+from mjx_dher.envs.engines.fused.contacts import geom_of, put
 from mjx_dher.envs.engines.fused.model import (
     CAPSULE_ELLIPSOID,
     ELLIPSOID_BOX,
@@ -45,9 +45,7 @@ def collide_ellipsoids(contacts: Contacts, memory: Memory, thread: int, threads:
             if kind == _PLANE:
                 plane = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
                 distance, place, normal = _plane_ellipsoid(plane, pos1, pos2, mat2, size2)
-                memory.distance[slot] = distance
-                memory.place[slot] = place
-                memory.normal[slot] = normal
+                put(memory, slot, distance, place, normal)
             elif wp.length(pos2 - pos1) <= contacts.geom_reach[geom1] + contacts.geom_reach[geom2] + margin:
                 if kind == _BOX:
                     distance, place, normal = _shape(pos1, mat1, size1, pos2, mat2, size2, 0.0)
@@ -55,9 +53,7 @@ def collide_ellipsoids(contacts: Contacts, memory: Memory, thread: int, threads:
                     half = wp.vec3(0.0, 0.0, wp.where(kind == _CAPSULE, size1[1], 0.0))
                     distance, place, normal = _shape(pos2, mat2, size2, pos1, mat1, half, size1[0])
                     normal = -normal
-                memory.distance[slot] = distance
-                memory.place[slot] = place
-                memory.normal[slot] = normal
+                put(memory, slot, distance, place, normal)
     sync(threads)
 
 

@@ -1,6 +1,6 @@
 """Contacts of spheres and capsules, with MuJoCo Warp's functions for them, which follow MuJoCo C."""
 
-from mjx_dher.envs.engines.fused.contacts import geom_of
+from mjx_dher.envs.engines.fused.contacts import geom_of, put
 from mjx_dher.envs.engines.fused.model import (
     CAPSULE_BOX,
     CAPSULE_CAPSULE,
@@ -60,36 +60,29 @@ def _meet(
     axis1, axis2 = _axis(mat1), _axis(mat2)
     if kind == _PLANE_SPHERE:
         distance, place = _plane_sphere(axis1, pos1, pos2, size2[0])
-        _put(memory, first, distance, place, axis1)
+        put(memory, first, distance, place, axis1)
     elif kind == _PLANE_CAPSULE:
         for i in range(2):
             end = pos2 + wp.where(i == 0, size2[1], -size2[1]) * axis2
             distance, place = _plane_sphere(axis1, pos1, end, size2[0])
-            _put(memory, first + i, distance, place, axis1)
+            put(memory, first + i, distance, place, axis1)
     elif kind == _SPHERE_SPHERE:
         distance, place, normal = _sphere_sphere(pos1, size1[0], pos2, size2[0])
-        _put(memory, first, distance, place, normal)
+        put(memory, first, distance, place, normal)
     elif kind == _SPHERE_CAPSULE:
         distance, place, normal = _sphere_capsule(pos1, size1[0], pos2, axis2, size2[0], size2[1])
-        _put(memory, first, distance, place, normal)
+        put(memory, first, distance, place, normal)
     elif kind == _SPHERE_BOX:
         distance, place, normal = _sphere_box(pos1, size1[0], pos2, mat2, size2)
-        _put(memory, first, distance, place, normal)
+        put(memory, first, distance, place, normal)
     elif kind == _CAPSULE_CAPSULE:
         distances, places, normals = _capsule_capsule(pos1, axis1, size1[0], size1[1], pos2, axis2, size2[0], size2[1], margin)
         for i in range(2):
-            _put(memory, first + i, distances[i], places[i], normals[i])
+            put(memory, first + i, distances[i], places[i], normals[i])
     elif kind == _CAPSULE_BOX:
         distances, places, normals = _capsule_box(pos1, axis1, size1[0], size1[1], pos2, mat2, size2)
         for i in range(2):
-            _put(memory, first + i, distances[i], places[i], normals[i])
-
-
-@wp.func
-def _put(memory: Memory, slot: int, distance: float, place: wp.vec3, normal: wp.vec3):
-    memory.distance[slot] = distance
-    memory.place[slot] = place
-    memory.normal[slot] = normal
+            put(memory, first + i, distances[i], places[i], normals[i])
 
 
 @wp.func

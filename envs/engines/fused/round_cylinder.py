@@ -7,7 +7,7 @@ for the circle, so its two contacts are up to a twentieth of the radius further 
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
-from mjx_dher.envs.engines.fused.contacts import geom_of
+from mjx_dher.envs.engines.fused.contacts import geom_of, put
 from mjx_dher.envs.engines.fused.model import CAPSULE_CYLINDER, SPHERE_CYLINDER, Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
@@ -55,9 +55,7 @@ def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int
 @wp.func
 def _put(memory: Memory, slot: int, point: wp.vec3, normal: wp.vec3, away: float, radius: float, pos: wp.vec3, mat: wp.mat33):
     """Sets a slot, from the axis's point, the normal and their distance in the cylinder's frame."""
-    memory.distance[slot] = away - radius
-    memory.place[slot] = pos + mat * (point - 0.5 * (away + radius) * normal)
-    memory.normal[slot] = -(mat * normal)
+    put(memory, slot, away - radius, pos + mat * (point - 0.5 * (away + radius) * normal), -(mat * normal))
 
 
 @wp.func
