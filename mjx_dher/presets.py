@@ -144,32 +144,18 @@ def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
 
 
 def _gpu_hand(env: str) -> tuple[Config, HParams]:
+    config, hparams = _gpu(env)
     total_steps = 3_000_000 if env == "block_rotate_z" else 8_000_000
-    config = Config(
-        num_envs=1024,
-        cycles_per_epoch=2,
-        updates_per_cycle=1000,
-        target_period=1,
-        batch_size=1024,
-        total_steps=total_steps,
-        replay_size=4_000_000,
-        hidden_sizes=(512, 512, 512),
-        renewals=5,
-    )
-    return config, _TUNED._replace(gamma=0.98, her_k=4.0, lr_end=0.05)
+    config = dataclasses.replace(config, num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
+    config = dataclasses.replace(config, hidden_sizes=(512, 512, 512), renewals=5)
+    return config, hparams._replace(gamma=0.98, her_k=4.0, lr_end=0.05)
 
 
 def _gpu_hand_reach(env: str) -> tuple[Config, HParams]:
-    config = Config(
-        num_envs=128,
-        cycles_per_epoch=8,
-        updates_per_cycle=200,
-        target_period=1,
-        batch_size=2048,
-        total_steps=3_000_000,
-        replay_size=3_000_000,
-    )
-    return config, _TUNED._replace(gamma=0.98, polyak=0.995, noise_std=0.2, her_k=4.0, priority_fraction=0.0)
+    config, hparams = _gpu(env)
+    config = dataclasses.replace(config, num_envs=128, cycles_per_epoch=8, updates_per_cycle=200, batch_size=2048)
+    config = dataclasses.replace(config, total_steps=3_000_000, replay_size=3_000_000)
+    return config, hparams._replace(gamma=0.98, polyak=0.995, noise_std=0.2, her_k=4.0, priority_fraction=0.0)
 
 
 def _cpu_push(env: str) -> tuple[Config, HParams]:
