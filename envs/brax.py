@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -60,9 +61,9 @@ class BraxEnv:
         if (model := getattr(env, "mj_model", None) or getattr(getattr(env, "sys", None), "mj_model", None)) is not None:
             self.model = model
 
-    @property
+    @functools.cached_property
     def spec(self) -> EnvSpec:
-        """The contract."""
+        """The contract. The reset is traced once for it."""
         obs = jax.eval_shape(self.reset, jax.random.key(0)).obs
         goal_size = obs["achieved_goal"].shape[0]
         return EnvSpec(obs["observation"], goal_size, self.action_size, self.episode_length, ends=self._ends)
