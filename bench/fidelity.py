@@ -226,11 +226,11 @@ def draw(recorded, paths):
     figure.savefig(PICTURE, dpi=100, pil_kwargs={"optimize": True})
 
 
-def put_into_document(block):
+def put_into_document(block, begin=BEGIN, end=END):
     """Replaces the text between the markers in docs/fidelity.md."""
     text = DOCUMENT.read_text()
-    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    DOCUMENT.write_text(f"{text[:start]}\n{block}\n{text[end:]}")
+    first, last = text.index(begin) + len(begin), text.index(end)
+    DOCUMENT.write_text(f"{text[:first]}\n{block}\n{text[last:]}")
 
 
 # The originals.

@@ -34,11 +34,11 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from fidelity import put_into_document, run_by
 
 ROOT = Path(__file__).parent.parent
 DATA = ROOT / "tests" / "data"
 YARDSTICK = DATA / "hand_yardstick.csv"
-DOCUMENT = ROOT / "docs" / "fidelity.md"
 BEGIN, END = "<!-- hands: begin -->", "<!-- hands: end -->"
 
 TASKS = ("block_rotate_xyz", "egg_rotate", "pen_rotate", "hand_reach")
@@ -167,18 +167,7 @@ def report(tasks, engines, episodes, steps):
     return text.getvalue().strip()
 
 
-def put_into_document(block):
-    """Replaces the text between the markers in docs/fidelity.md."""
-    text = DOCUMENT.read_text()
-    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    DOCUMENT.write_text(f"{text[:start]}\n{block}\n{text[end:]}")
-
-
 # The originals.
-
-
-def run_by(shift):
-    return f"original, moved {1e3 * shift:.1f} mm"
 
 
 def original(task):
@@ -272,7 +261,7 @@ def main() -> None:
     block = report(args.tasks, args.engines, args.episodes, args.steps)
     print(block)
     if set(args.tasks) == set(TASKS) and (args.episodes, args.steps) == (EPISODES, 100):
-        put_into_document(block)
+        put_into_document(block, BEGIN, END)
 
 
 if __name__ == "__main__":

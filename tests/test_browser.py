@@ -1,5 +1,6 @@
 """The viewer in a real browser: headless Chromium, which draws without a GPU."""
 
+import contextlib
 import math
 import shutil
 import threading
@@ -48,26 +49,33 @@ def viewer():
         thread.join()
 
 
-@pytest.fixture(scope="module")
-def browser(viewer, tmp_path_factory):
+@contextlib.contextmanager
+def chromium(folder, address):
+    """A headless browser on a page, with its data in `folder`. The page must log no error."""
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
     from selenium.webdriver.chrome.service import Service
 
     options = Options()
     options.binary_location = CHROMIUM
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+    for flag in (*FLAGS, f"--user-data-dir={folder}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(DRIVER))
     try:
         driver.set_page_load_timeout(PATIENCE)
-        driver.get(viewer.address)
-        until(lambda: "Episodes reached" in driver.page_source, "the panel")
+        driver.get(address)
         yield driver
         assert [entry["message"] for entry in driver.get_log("browser") if entry["level"] == "SEVERE"] == []
     finally:
         driver.quit()
+
+
+@pytest.fixture(scope="module")
+def browser(viewer, tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("chromium"), viewer.address) as driver:
+        until(lambda: "Episodes reached" in driver.page_source, "the panel")
+        yield driver
 
 
 def press(browser, text):

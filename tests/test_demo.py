@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import ROOT
-from test_browser import CHROMIUM, DRIVER, FLAGS, until
+from test_browser import CHROMIUM, DRIVER, chromium, until
 
 import mjx_dher
 from mjx_dher import envs
@@ -61,25 +61,14 @@ def test_an_episode_is_that_of_native(page):
 
 @pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="needs chromium and chromedriver")
 def test_it_plays_in_a_browser(page, tmp_path):
-    from selenium import webdriver
-    from selenium.webdriver.chrome.options import Options
-    from selenium.webdriver.chrome.service import Service
-
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=page)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        options = Options()
-        options.binary_location = CHROMIUM
-        for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'chromium'}"):
-            options.add_argument(flag)
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+        address = f"http://127.0.0.1:{server.server_address[1]}/index.html?episodes=10"
         try:
-            driver.get(f"http://127.0.0.1:{server.server_address[1]}/index.html?episodes=10")
-            until(lambda: driver.execute_script("return document.body.dataset.done"), "ten episodes")
-            reached, _, played = driver.find_element("id", "status").text.split()[:3]
-            assert (int(reached) >= 8, played) == (True, "10")
-            assert [entry for entry in driver.get_log("browser") if entry["level"] == "SEVERE"] == []
+            with chromium(tmp_path / "chromium", address) as driver:
+                until(lambda: driver.execute_script("return document.body.dataset.done"), "ten episodes")
+                reached, _, played = driver.find_element("id", "status").text.split()[:3]
+                assert (int(reached) >= 8, played) == (True, "10")
         finally:
-            driver.quit()
             server.shutdown()
