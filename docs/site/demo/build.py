@@ -19,7 +19,9 @@ import mujoco
 import numpy as np
 
 from mjx_dher import cli, envs
+from mjx_dher.cli.settings import check_writable
 from mjx_dher.envs import fetch
+from mjx_dher.system.files import FolderError
 
 HERE = Path(__file__).parent
 PAGE = ("index.html", "demo.mjs", "push.mjs")
@@ -66,9 +68,15 @@ def install(out: Path) -> None:
 
 def main() -> None:
     """Builds the page into the folder on the command line."""
-    if len(sys.argv) != 2:
+    if len(sys.argv) != 2 or not sys.argv[1]:
         raise SystemExit(__doc__)
     out = Path(sys.argv[1])
+    try:
+        check_writable(out)
+    except FolderError as error:
+        raise SystemExit(f"error: {error}") from None
+    if shutil.which("npm") is None:
+        raise SystemExit("error: npm is missing; the demo page needs node and npm")
     out.mkdir(parents=True, exist_ok=True)
     env = envs.make("push", engine="native", num_threads=1)
     mujoco.mj_saveLastXML(str(out / "push.xml"), env.load())
