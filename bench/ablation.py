@@ -66,7 +66,7 @@ ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of an arm, seed 0. `learner` is `gpu`: the preset's, as in the bake-off.
 
-    The priority is `eventful` in all arms, and returns have three steps in all but `one_step` and `ddpg`. The presets differ:
+    The priority is `eventful` in all arms, and returns have three steps except in `one_step` and `ddpg`. The presets differ:
     Slide's has the priority `td_error`; PickAndPlace's has smaller networks, returns of one step and `energy`.
     """
     del learner

@@ -109,8 +109,7 @@ def plan(args: argparse.Namespace, console: Console) -> None:
     if not args.toy:
         minutes = args.experiment.minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
         console.print(
-            f"about {minutes:.0f} minutes of one H200, by what sweeps of `future` took there (bench/README.md,"
-            " docs/results.md); what the arms cost beyond that has not been measured"
+            f"about {minutes:.0f} minutes of one H200 by the experiment's estimate, which was not measured for these arms"
         )
 
 

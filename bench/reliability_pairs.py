@@ -1,4 +1,4 @@
-"""Two programs on one folder: `train` with two seeds, or two sweeps, one of which may be killed.
+"""Two programs on one folder: `train` with two seeds, or two sweeps, and one sweep may be killed.
 
 They start at random offsets, or one is stopped at a random moment of its start until the other has progressed.
 """
@@ -132,7 +132,7 @@ def sweep_pair(folder, right, rng):
 
 
 def sweep_held(folder, right, rng):
-    """The same sweep twice. One is stopped after listing its runs, until the other has finished some of them."""
+    """The same sweep twice. One is stopped after listing its runs, until the other has finished some runs."""
     processes = [start(*SWEEP, "--out", folder) for _ in range(2)]
     held = rng.choice(processes)
     while (line := held.stdout.readline()) and "; writing to" not in line:

@@ -3,7 +3,7 @@
     python docs/examples/trap.py
     PYTHONPATH=docs/examples python train.py --env trap:Trap --sampler future
 
-With a reward of -1 for each step before the goal, falling would be rewarded, because no cost follows it. Hence rewards are 0
+With a reward of -1 for each step before the goal, falling would be rewarded, because no cost follows it. So rewards are 0
 and 1, or lie between 0 and 5 with `dense=True`. The `EnvSpec` declares this range, and that episodes can end.
 """
 
