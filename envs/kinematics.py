@@ -33,10 +33,8 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
-    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order.
-
-    Raises:
-      ValueError: no name matches a pattern. The message lists the names.
+    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order. Raises
+    ValueError if no name matches a pattern. The message lists the names.
     """
     chosen: set[int] = set()
     for pattern in str(patterns).split() or [""]:

@@ -16,10 +16,8 @@ KINDS = ("site", "body", "rot", "vel", "angvel", "qpos", "qvel", "sensor")
 
 
 class Entry:
-    """One entry, or a difference "A - B" of entries. Maps physics to numbers [size].
-
-    Raises:
-      ValueError: the kind, site, body or joint does not exist, or the sizes of a difference are unequal.
+    """One entry, or a difference "A - B" of entries. Maps physics to numbers [size]. Raises ValueError if the kind, site, body
+    or joint does not exist, or the sizes of a difference are unequal.
     """
 
     def __init__(self, model: mujoco.MjModel, text: str):

@@ -18,10 +18,8 @@ _BAD = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seconds: float) -> None:
-    """Simulates the start for up to `seconds`, first held by the inputs `ctrl` [nu] and then under random inputs.
-
-    Raises:
-      ValueError: the simulation diverges. The message names the joint.
+    """Simulates the start for up to `seconds`, first held by the inputs `ctrl` [nu] and then under random inputs. Raises
+    ValueError if the simulation diverges. The message names the joint.
     """
     model = copy.copy(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # which would set the numbers of warnings to 0
@@ -62,10 +60,7 @@ def _fresh(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
 def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> None:
     """Searches for poses that reach some goals, from the configuration `start` [nq], and warns if many are missed.
 
-    Goals of bodies that a free or ball joint moves are not tested.
-
-    Raises:
-      ValueError: no goal is reached.
+    Goals of bodies that a free or ball joint moves are not tested. Raises ValueError if no goal is reached.
     """
     place = goal.place
     if place is None or goal.low is None or not all(joint.kind in (HINGE, SLIDE) for joint in place.joints):

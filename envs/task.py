@@ -299,10 +299,8 @@ class MujocoTask(GoalEnv):
 
 
 def load_model(task: type, model: Any) -> mujoco.MjModel:
-    """Compiles the MJCF of a task class. A path is relative to the file of the class.
-
-    Raises:
-      ValueError: there is no such file, or MuJoCo rejects it.
+    """Compiles the MJCF of a task class. A path is relative to the file of the class. Raises ValueError if there is no such
+    file, or MuJoCo rejects it.
     """
     try:
         if isinstance(model, mujoco.MjModel):

@@ -214,10 +214,8 @@ COMPONENTS: dict[str, dict[str, Component]] = {
 
 
 def load(field: str, value: Any, *parameters: str) -> Any:
-    """Imports the component called `value`, a built-in name or module:attribute. Other values are returned as they are.
-
-    Raises:
-      ValueError: there is no such name, module or attribute, or it is not a function of `parameters`, if given.
+    """Imports the component called `value`, a built-in name or module:attribute. Other values are returned as they are. Raises
+    ValueError if there is no such name, module or attribute, or it is no function of `parameters`, if given.
     """
     if isinstance(value, str):
         table = COMPONENTS[field]

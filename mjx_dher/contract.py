@@ -17,9 +17,7 @@ FLAGS = ("failed", "done", "terminal")  # optional fields of a state, [] bool
 
 def env_spec(env: Env) -> EnvSpec:
     """Spec of an environment: its `spec`, or one derived from its attributes and arrays. The environment is traced, not run.
-
-    Raises:
-      ValueError: `env` is not an environment, or its spec disagrees with its arrays. The message names the field.
+    Raises ValueError if `env` is not an environment, or its spec disagrees with its arrays. The message names the field.
     """
     return _spec_and_shapes(env)[0]
 

@@ -77,11 +77,8 @@ def is_import_path(name: str) -> bool:
 
 
 def load_import_path(field: str, value: str) -> Any:
-    """Imports "module:attribute".
-
-    Raises:
-      ValueError: the module or attribute does not exist (the message suggests the nearest) or belongs to another library, the
-        name comes from a file that is not trusted, or the import raises an error.
+    """Imports "module:attribute". Raises ValueError if the module or attribute does not exist (the message suggests the
+    nearest) or belongs to another library, the name comes from a file that is not trusted, or the import raises an error.
     """
     _check_import_path(field, value)
     trust.check(field, value, module_file(value))

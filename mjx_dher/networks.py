@@ -200,10 +200,8 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
     """Residual networks of any depth, with layer normalization and swish, for actor and critic.
 
     Each pair of layers after the first has a skip connection around it (He et al. 2016). Deep contrastive critics need all
-    three parts (Wang et al. 2025, "1000 Layer Networks for Self-Supervised RL").
-
-    Raises:
-      ValueError: `hidden_sizes` are not all equal.
+    three parts (Wang et al. 2025, "1000 Layer Networks for Self-Supervised RL"). Raises ValueError if `hidden_sizes` are not
+    all equal.
     """
     if len(set(hidden_sizes)) != 1:
         raise ValueError(f"networks residual and unit_norm need equal hidden_sizes; got {hidden_sizes}")
@@ -244,10 +242,8 @@ def _styled(
 
 
 def make(name: str | NetworksFn) -> NetworksFn:
-    """Loads a function that makes networks: a built-in name, "module:attribute", or a function.
-
-    Raises:
-      ValueError: there are no such networks, or it is not a function of (action_size, hidden_sizes, dtype).
+    """Loads a function that makes networks: a built-in name, "module:attribute", or a function. Raises ValueError if there are
+    no such networks, or it is not a function of (action_size, hidden_sizes, dtype).
     """
     return components.load("networks", name, *_PARAMETERS)
 

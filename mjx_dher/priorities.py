@@ -55,10 +55,8 @@ def eventful(episode: Episode, context: Context) -> Array:
 
 
 def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
-    """Loads a priority: a built-in name, "module:attribute", a function, or a `Priority`.
-
-    Raises:
-      ValueError: there is no such priority, or it is neither a function of (episode, context) nor a `Priority`.
+    """Loads a priority: a built-in name, "module:attribute", a function, or a `Priority`. Raises ValueError if there is no such
+    priority, or it is neither a function of (episode, context) nor a `Priority`.
     """
     value = components.load("priority", name)
     if not isinstance(value, Priority):
@@ -82,10 +80,8 @@ def whole(priority: Priority | PriorityFn) -> Priority:
 
 
 def weights(priority: PriorityFn | Priority, episodes: Episode, context: Context) -> Array:
-    """Weights [N] of N episodes (leaves lead with [N]), float32. Any weight that is not positive and finite becomes 0.
-
-    Raises:
-      ValueError: the priority does not return a real number [].
+    """Weights [N] of N episodes (leaves lead with [N]), float32. Any weight that is not positive and finite becomes 0. Raises
+    ValueError if the priority does not return a real number [].
     """
     number, weigh = episodes.action.shape[0], whole(priority).weigh
     if weigh is None:
@@ -164,11 +160,8 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
 
 
 def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
-    """Joins priorities in one compiled program, in which the traced number `hparams.priority_choice` selects a lane's
-    priority.
-
-    Raises:
-      ValueError: `choices` is empty, or contains something other than a priority.
+    """Joins priorities in one compiled program, in which the traced number `hparams.priority_choice` selects a lane's priority.
+    Raises ValueError if `choices` is empty, or contains something other than a priority.
     """
     made = [whole(make(choice)) for choice in choices]
     if not made:

@@ -295,10 +295,8 @@ def _score(sampler: Sampler, episode: Episode, context: Context) -> Array:
 def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     """Joins samplers in one compiled program, in which the traced number `hparams.choice` selects a lane's sampler (`one_of`).
 
-    `choice` is not a field of `HParams`; `runs.program` adds it.
-
-    Raises:
-      ValueError: `choices` is empty, or contains something other than a sampler.
+    `choice` is not a field of `HParams`; `runs.program` adds it. Raises ValueError if `choices` is empty, or contains something
+    other than a sampler.
     """
     samplers = [make(choice) for choice in choices]
     if not samplers:

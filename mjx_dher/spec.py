@@ -93,9 +93,7 @@ def custom_components(spec: RunSpec) -> dict[str, str]:
 
 def to_arguments(texts: Sequence[str]) -> dict[str, Argument]:
     """Parses "NAME=VALUE" texts. A value is true, false, a number, or a string. Quote strings that look like numbers ("007").
-
-    Raises:
-      ValueError: invalid text, a number that is not finite, or a name that is repeated or has its own option.
+    Raises ValueError for an invalid text, a number that is not finite, or a name that is repeated or has its own option.
     """
     arguments: dict[str, Argument] = {}
     for text in texts:
@@ -136,10 +134,8 @@ def _to_argument(value: str) -> Argument:
 
 
 def validate_values(spec: RunSpec) -> None:
-    """Checks each value on its own, for any environment and any components.
-
-    Raises:
-      ValueError: names each invalid field, its value and the allowed values.
+    """Checks each value on its own, for any environment and any components. Raises ValueError with each invalid field, its
+    value and the allowed values.
     """
     validation.check_all(
         *((_check_text, name, getattr(spec, name)) for name in COMPONENTS),

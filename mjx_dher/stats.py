@@ -19,10 +19,8 @@ Statistic = Callable[..., Any]  # (values, axis=...) -> values without that axis
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a success rate (Wilson 1927).
-
-    Raises:
-      ValueError: `trials` is not positive, or `successes` does not lie in [0, trials].
+    """Wilson's 95 % score interval of a success rate (Wilson 1927). Raises ValueError if `trials` is not positive, or
+    `successes` does not lie in [0, trials].
     """
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"need 0 <= successes <= trials and trials > 0; got {successes} of {trials}")
@@ -59,10 +57,8 @@ def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:
     """Mean of the middle half of the scores. A quarter, rounded down, is dropped at each end.
 
     It is less sensitive to outliers than the mean and uses more data than the median (Agarwal et al. 2021, "Deep Reinforcement
-    Learning at the Edge of the Statistical Precipice"). By default it reduces all axes, which pools the tasks.
-
-    Raises:
-      ValueError: there are no scores, or some are NaN.
+    Learning at the Edge of the Statistical Precipice"). By default it reduces all axes, which pools the tasks. Raises
+    ValueError if there are no scores, or some are NaN.
     """
     from scipy.stats import trim_mean
 
@@ -141,10 +137,8 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
 
 
 def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
-    """Mean height [S] of curves [S, P] over points x [P], by the trapezoidal rule.
-
-    Raises:
-      ValueError: x is not [P], has fewer than two points or does not increase, or `curves` is not [S, P].
+    """Mean height [S] of curves [S, P] over points x [P], by the trapezoidal rule. Raises ValueError if x is not [P], has fewer
+    than two points or does not increase, or `curves` is not [S, P].
     """
     x, curves = _curves(x, curves)
     if len(x) < 2 or (np.diff(x) <= 0).any():
@@ -155,11 +149,9 @@ def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
     """Probability that a score of `a` exceeds one of `b`, averaged over tasks. Ties count half.
 
-    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). The shapes are [S]
-    or [S, K]; the numbers of seeds may differ.
-
-    Raises:
-      ValueError: there are no scores, or `a` and `b` have different numbers of tasks.
+    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). The shapes are [S] or
+    [S, K]; the numbers of seeds may differ. Raises ValueError if there are no scores, or `a` and `b` have different numbers of
+    tasks.
     """
     a, b = (np.atleast_2d(_scores(scores).T).T for scores in (a, b))
     if a.shape[1] != b.shape[1]:

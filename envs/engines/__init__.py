@@ -17,10 +17,8 @@ __all__ = ["Controls", "Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
-    """Resolves `auto`: native on a CPU, warp on a GPU if warp-lang is installed, else jax.
-
-    Raises:
-      ValueError: there is no engine `name`.
+    """Resolves `auto`: native on a CPU, warp on a GPU if warp-lang is installed, else jax. Raises ValueError if there is no
+    engine `name`.
     """
     check_name("engine", name, ENGINES)
     if name != "auto":

@@ -27,10 +27,8 @@ REJECTED = {
 
 
 def derived_fields(names: Sequence[str], state: Sequence[str]) -> tuple[str, ...]:
-    """`names` without repetitions.
-
-    Raises:
-      ValueError: a name is not a field of MjData, belongs to the `state`, or has no value that every timestep computes.
+    """`names` without repetitions. Raises ValueError if a name is not a field of MjData, belongs to the `state`, or has no
+    value that every timestep computes.
     """
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ValueError(f"derived must be a list of names; got {names!r}")

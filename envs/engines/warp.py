@@ -162,10 +162,8 @@ class WarpEngine:
         return [x[0] for x in self._call(*rows, jnp.concatenate(inputs)[None])]
 
     def check(self) -> None:
-        """Checks that no contacts were lost since the last call. Waits for the kernel to compile.
-
-        Raises:
-          ValueError: memory did not suffice. The message has a sufficient size.
+        """Checks that no contacts were lost since the last call. Waits for the kernel to compile. Raises ValueError if memory
+        did not suffice. The message has a sufficient size.
         """
         self._wait()
         with self._lock:
@@ -215,10 +213,8 @@ class WarpEngine:
 
 
 def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: bool) -> tuple[str, str, int]:
-    """Path that runs, the reason, and the constraint rows that `fused` has memory for.
-
-    Raises:
-      ValueError: the path does not support the model.
+    """Path that runs, the reason, and the constraint rows that `fused` has memory for. Raises ValueError if the path does not
+    support the model.
     """
     left_out, reason = support.unsupported(model), "as asked"
     if varied:

@@ -76,11 +76,7 @@ def settle_compiler(engine: str) -> None:
 
 
 def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
-    """Tests the custom components of runs before anything is compiled or written.
-
-    Raises:
-      ValueError: names the component and the first violation.
-    """
+    """Tests the custom components of runs before anything is compiled or written. Raises ValueError for the first violation."""
     if any(custom_components(spec) for spec in specs):
         from mjx_dher.testing import verdicts
 
@@ -89,10 +85,8 @@ def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None
 
 
 def find_run(run: Path, console: Console) -> Path:
-    """Finds a run folder or bundled policy, and prints which it is if the name could be either.
-
-    Raises:
-      FolderError: there is none.
+    """Finds a run folder or bundled policy, and prints which it is if the name could be either. Raises FolderError if there is
+    none.
     """
     from mjx_dher.policy import bundled
 
@@ -105,10 +99,8 @@ def find_run(run: Path, console: Console) -> Path:
 
 
 def read_run(path: Path, console: Console) -> RunSpec:
-    """Reads the description of the run in `path`, and prints which custom source files have changed since.
-
-    Raises:
-      FolderError: it is not a run folder, or it is damaged.
+    """Reads the description of the run in `path`, and prints which custom source files have changed since. Raises FolderError
+    if it is not a run folder, or it is damaged.
     """
     content, spec = run_folder.read_run(path)
     for text in run_folder.changed_code(content, spec):

@@ -19,9 +19,7 @@ from mjx_dher.system.files import FolderError
 
 def join(distributed: bool, described: Mapping[str, Any], console: Console) -> Console:
     """Joins this process to the others if the command is `distributed`. Returns a console that prints in the first process.
-
-    Raises:
-      ValueError: there are no other processes, or their versions or settings in `described` differ.
+    Raises ValueError if there are no other processes, or their versions or settings in `described` differ.
     """
     if not distributed:
         return console
@@ -40,10 +38,8 @@ def check_out(distributed: bool, out: Path | None) -> None:
 
 
 def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:
-    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run.
-
-    Raises:
-      FolderError: it holds something else, or the run has ended.
+    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run. Raises FolderError if it
+    holds something else, or the run has ended.
     """
     if not resumes or out is None or not (out / run_folder.CONFIG_FILE).exists():
         return stack.enter_context(run_folder.claim_new(out, spec))

@@ -77,10 +77,8 @@ def changes(before: RunSpec, now: RunSpec) -> str:
 
 
 def check_out(out: Path | None) -> None:
-    """Checks that a run folder can be made at `out`, without leaving a trace.
-
-    Raises:
-      FolderError: it exists, or its parent folder is not writable.
+    """Checks that a run folder can be made at `out`, without leaving a trace. Raises FolderError if it exists, or its parent
+    folder is not writable.
     """
     if out is None:
         return
@@ -90,11 +88,7 @@ def check_out(out: Path | None) -> None:
 
 
 def check_writable(out: Path) -> None:
-    """Checks that a folder is writable or can be made, without leaving a trace.
-
-    Raises:
-      FolderError: it cannot.
-    """
+    """Checks that a folder is writable or can be made, without leaving a trace. Raises FolderError if it cannot."""
     parent = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     try:
         os.rmdir(tempfile.mkdtemp(dir=parent))  # permissions do not suffice for root, or if the disk is full
@@ -116,10 +110,8 @@ def amount(config: Config, episode_length: int, runs: int = 1) -> str:
 
 
 def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
-    """Lines about the memory of runs of one program, without compiling it.
-
-    Raises:
-      ValueError: the components do not fit together, or one run exceeds the memory.
+    """Lines about the memory of runs of one program, without compiling it. Raises ValueError if the components do not fit
+    together, or one run exceeds the memory.
     """
     import jax
 

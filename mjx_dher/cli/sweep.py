@@ -113,10 +113,7 @@ class SweepArgs:
 def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> tuple[SweepArgs, list[RunSpec]]:
     """Parses the arguments of `sweep` and makes its trials, before JAX or MuJoCo is loaded.
 
-    `report` is called with the ignored options, which no trial reads.
-
-    Raises:
-      ValueError: invalid arguments.
+    `report` is called with the ignored options, which no trial reads. Raises ValueError for invalid arguments.
     """
     for flag in argv:
         if (name := flag.partition("=")[0].lstrip("-").replace("-", "_")) in HParams._fields and flag.startswith("--"):

@@ -223,10 +223,7 @@ def _check_ended(args: ResumeArgs, run: RunSpec, stop_at: float | None, result: 
 def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> TrainArgs:
     """Parses the arguments of `train`, and checks them before JAX, CUDA or MuJoCo is loaded.
 
-    `report` is called with the origin of the settings, if they come from a file.
-
-    Raises:
-      ValueError: invalid arguments.
+    `report` is called with the origin of the settings, if they come from a file. Raises ValueError for invalid arguments.
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # arguments that decide the defaults of the others
     early.add_argument("--preset", default="auto")

@@ -43,10 +43,8 @@ reset = Generator(_own_goals)
 
 
 def make(name: str | Generator | GenerateFn) -> Generator:
-    """Loads a generator: a built-in name, "module:attribute", or a function.
-
-    Raises:
-      ValueError: there is no such generator, or it is not a function of (key, obs, ring, context).
+    """Loads a generator: a built-in name, "module:attribute", or a function. Raises ValueError if there is no such generator,
+    or it is not a function of (key, obs, ring, context).
     """
     value = components.load("generator", name)
     generator = value if isinstance(value, Generator) else Generator(value)
@@ -56,10 +54,7 @@ def make(name: str | Generator | GenerateFn) -> Generator:
 
 def join(choices: Sequence[Generator | GenerateFn]) -> Generator:
     """Joins generators in one compiled program, in which the traced number `hparams.generator_choice` selects a lane's
-    generator.
-
-    Raises:
-      ValueError: `choices` is empty, or contains something other than a generator.
+    generator. Raises ValueError if `choices` is empty, or contains something other than a generator.
     """
     made = [make(choice) for choice in choices]
     if not made:

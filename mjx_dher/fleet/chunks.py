@@ -47,10 +47,8 @@ class Chunk(NamedTuple):
 
 
 def task_of(cpus: int | None, nodes: Sequence[Mapping[str, float]]) -> Task:
-    """Resources of a task: one GPU if the cluster has any, else `cpus` cores, by default all cores of a node.
-
-    Raises:
-      ValueError: no node has them.
+    """Resources of a task: one GPU if the cluster has any, else `cpus` cores, by default all cores of a node. Raises ValueError
+    if no node has them.
     """
     cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
     if cpus is None and any(node.get("GPU", 0) >= 1 for node in nodes):
@@ -140,10 +138,8 @@ def _files_digest() -> str:
 
 
 def custom_code(specs: Sequence[RunSpec]) -> Path | None:
-    """Folder from which custom components are imported, and which nodes need, or None if all are installed.
-
-    Raises:
-      ValueError: there is more than one folder.
+    """Folder from which custom components are imported, and which nodes need, or None if all are installed. Raises ValueError
+    if there is more than one folder.
     """
     roots: dict[Path, str] = {}
     for spec in specs:

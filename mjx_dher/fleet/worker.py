@@ -150,10 +150,8 @@ def pack(folder: Path) -> bytes:
 def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
     """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended.
 
-    An ended run that is already there stays unchanged.
-
-    Raises:
-      FolderError: another process uses the folder, it is not writable, or the bytes are not this complete trial.
+    An ended run that is already there stays unchanged. Raises FolderError if another process uses the folder, it is not
+    writable, or the bytes are not this complete trial.
     """
     try:
         files.make_folder(folder)

@@ -180,10 +180,8 @@ def reset_period(config: Config) -> int:
 def make_networks(
     learner: str, config: Config, spec: EnvSpec, networks: NetworksFn, *heads: Heads
 ) -> tuple[Networks, Networks]:
-    """Networks for acting, in float32, and for updates, in the learner's dtype.
-
-    Raises:
-      ValueError: the networks cannot take the observations of `spec`, or their outputs have wrong shapes.
+    """Networks for acting, in float32, and for updates, in the learner's dtype. Raises ValueError if the networks cannot take
+    the observations of `spec`, or their outputs have wrong shapes.
     """
     acting, learning = (
         with_encoder(networks(spec.action_size, config.hidden_sizes, dtype, *heads))

@@ -147,11 +147,7 @@ def _positives(batch: Batch) -> Array:
 
 
 def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> CRL:
-    """Makes the learner.
-
-    Raises:
-      ValueError: an n_step above 1, or networks whose outputs have wrong shapes.
-    """
+    """Makes the learner. Raises ValueError for an n_step above 1, or networks whose outputs have wrong shapes."""
     if config.n_step != 1:
         raise ValueError(f"n_step must be 1 for learner crl, which has no returns; got {config.n_step}")
     check_heads(networks, "crl")

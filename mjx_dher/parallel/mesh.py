@@ -61,11 +61,8 @@ ONE = Layout()
 
 
 def find(devices: int | str) -> tuple[Any, ...]:
-    """The first `devices` JAX devices, or "all". Empty for one, which means the default device.
-
-    Raises:
-      ValueError: it is neither a number nor "all", exceeds the available devices, or selects only some devices of several
-        processes.
+    """The first `devices` JAX devices, or "all". Empty for one, which means the default device. Raises ValueError if it is
+    neither a number nor "all", exceeds the available devices, or selects only some devices of several processes.
     """
     check_devices(devices)
     present = jax.devices()
@@ -94,10 +91,8 @@ def arrange(devices: Sequence[Any], runs: int) -> Layout:
 
 
 def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
-    """Most parallel runs: `lanes`, or by default one per CPU device, and on GPUs as many as fit into memory (None).
-
-    Raises:
-      ValueError: `lanes` is neither a multiple nor a divisor of the number of devices.
+    """Most parallel runs: `lanes`, or by default one per CPU device, and on GPUs as many as fit into memory (None). Raises
+    ValueError if `lanes` is neither a multiple nor a divisor of the number of devices.
     """
     number = max(1, len(devices))
     if lanes is None:

@@ -31,10 +31,8 @@ def connect() -> None:
     """Connects this process to the others. Call it before JAX initializes its devices.
 
     JAX detects Slurm, Open MPI and Kubernetes. Otherwise `VARIABLES` name the address of the first process, the number of
-    processes and the index of this one.
-
-    Raises:
-      ValueError: no cluster was detected, or a variable is invalid. If other processes do not answer, JAX aborts.
+    processes and the index of this one. Raises ValueError if no cluster was detected, or a variable is invalid. If other
+    processes do not answer, JAX aborts.
     """
     try:
         size, number = (int(os.environ[name]) if name in os.environ else None for name in VARIABLES[1:])
@@ -68,10 +66,8 @@ def leads() -> bool:
 
 
 def broadcast(decide: Callable[[], T]) -> T:
-    """Calls `decide` in the first process. Returns its result, converted by JSON, in all processes.
-
-    Raises:
-      ValueError: `decide` raised a ValueError or OSError. The first process raises the original error.
+    """Calls `decide` in the first process. Returns its result, converted by JSON, in all processes. Raises ValueError if
+    `decide` raised a ValueError or OSError. The first process raises the original error.
     """
     from jax.experimental import multihost_utils
 

@@ -54,10 +54,8 @@ class LearnerPolicy:
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:
-    """Makes a policy from the arrays of `LearnerPolicy.save`, for the run `spec`.
-
-    Raises:
-      ValueError: the arrays do not fit this learner.
+    """Makes a policy from the arrays of `LearnerPolicy.save`, for the run `spec`. Raises ValueError if the arrays do not fit
+    this learner.
     """
     if "env_spec" in arrays:
         env_spec = from_json(str(arrays["env_spec"]))

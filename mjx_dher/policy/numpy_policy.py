@@ -57,10 +57,8 @@ class Policy:
         return self.observation_mean.shape[0], self.goal_mean.shape[0], self.layers[-1][1].shape[0]
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Actions [..., A] for observations of one state or a batch.
-
-        Raises:
-          ValueError: a key is missing, a last axis has the wrong size, or a value is not finite.
+        """Actions [..., A] for observations of one state or a batch. Raises ValueError if a key is missing, a last axis has the
+        wrong size, or a value is not finite.
         """
         values = []
         for key, mean in (("observation", self.observation_mean), ("desired_goal", self.goal_mean)):
@@ -111,11 +109,7 @@ class Policy:
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> Policy:
-    """Makes a policy from its `Policy.arrays`.
-
-    Raises:
-      ValueError: names an array that is missing or invalid.
-    """
+    """Makes a policy from its `Policy.arrays`. Raises ValueError for an array that is missing or invalid."""
     num_layers = sum(name.endswith("_kernel") for name in arrays)
     needed = [f"layer{i}_{part}" for i in range(max(1, num_layers)) for part in ("kernel", "bias")] + [*_VECTORS, *_SCALARS]
     if missing := [name for name in needed if name not in arrays]:

@@ -78,10 +78,8 @@ def _format(name: str, value: Any) -> str:
 
 
 def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One trial per seed of a setting. Runs that differ only in settings that they do not read are equal.
-
-    Raises:
-      FolderError: two folders hold the same run, for example after a copy.
+    """One trial per seed of a setting. Runs that differ only in settings that they do not read are equal. Raises FolderError if
+    two folders hold the same run, for example after a copy.
     """
     by_seed: dict[int, dict[str, Any]] = {}
     for trial in trials:

@@ -82,11 +82,7 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
 
 
 def is_sweep(folders: Sequence[Path]) -> bool:
-    """Whether the paths are one sweep. False for one or more run folders.
-
-    Raises:
-      FolderError: they are neither.
-    """
+    """Whether the paths are one sweep. False for one or more run folders. Raises FolderError if they are neither."""
     if not folders:
         raise FolderError("pass one or more run folders, or a sweep; got none")
     for folder in folders:

@@ -23,12 +23,10 @@ _FINAL = ("success_rate", "reset_success_rate", "return_mean", "episodes")
 def read(folder: Path) -> list[dict[str, Any]]:
     """Finished trials of a sweep, each a dict.
 
-    Keys: folder, settings, seed, lanes, status, reason, curve and final. The settings include the engine used and `source`,
-    the custom source files. The curve has lists by column. The last evaluation, final, is empty if the run failed.
-
-    Raises:
-      FolderError: it is not a sweep, no run has ended, a link leads out of the folder, or a trial is invalid
-        (`results.result_problem`).
+    Keys: folder, settings, seed, lanes, status, reason, curve and final. The settings include the engine used and `source`, the
+    custom source files. The curve has lists by column. The last evaluation, final, is empty if the run failed. Raises
+    FolderError if it is not a sweep, no run has ended, a link leads out of the folder, or a trial is invalid
+    (`results.result_problem`).
     """
     cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
     paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]

@@ -11,10 +11,8 @@ from mjx_dher.system import limits, memory
 
 
 def user_cache() -> Path:
-    """Folder of this library in the user's cache. All of its files can be recreated.
-
-    Raises:
-      OSError: the user has no home folder (for example in a container, without a line in /etc/passwd).
+    """Folder of this library in the user's cache. All of its files can be recreated. Raises OSError if the user has no home
+    folder (for example in a container, without a line in /etc/passwd).
     """
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher"
@@ -39,10 +37,8 @@ def keep_compiled_programs() -> None:
 
 
 def check_platform() -> None:
-    """Starts JAX's devices, with at most as many CPU threads as this process may use.
-
-    Raises:
-      ValueError: this machine lacks the platform in JAX_PLATFORMS.
+    """Starts JAX's devices, with at most as many CPU threads as this process may use. Raises ValueError if this machine lacks
+    the platform in JAX_PLATFORMS.
     """
     import jax
 

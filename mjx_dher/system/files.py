@@ -40,10 +40,8 @@ class BusyError(FolderError):
 
 
 def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
-    """Checks early that the file `out` can be written.
-
-    Raises:
-      FolderError: `out` ends in none of `endings`, is a folder, exists (without `overwrite`), or its folder does not exist.
+    """Checks early that the file `out` can be written. Raises FolderError if `out` ends in none of `endings`, is a folder,
+    exists (without `overwrite`), or its folder does not exist.
     """
     endings = tuple(endings)
     if out.suffix.lower() not in endings:
@@ -57,11 +55,7 @@ def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
 
 
 def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
-    """Sorted paths in a folder. Links to other places are rejected.
-
-    Raises:
-      FolderError: a path is a link to elsewhere.
-    """
+    """Sorted paths in a folder. Links to other places are rejected. Raises FolderError if a path is a link to elsewhere."""
     paths, root = sorted(paths), Path(os.path.realpath(folder))
     for path in paths:
         if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
@@ -93,10 +87,8 @@ def read_json(file: Path) -> Any:
 
 
 def whole_lines(file: Path) -> list[str]:
-    """Lines of a text file, up to the first without an end within `LONGEST_LINE` bytes. Empty if there is no file.
-
-    Raises:
-      FolderError: it is a folder or a FIFO.
+    """Lines of a text file, up to the first without an end within `LONGEST_LINE` bytes. Empty if there is no file. Raises
+    FolderError if it is a folder or a FIFO.
     """
     if file.exists() and not file.is_file():
         raise FolderError(f"{file} is not a file")  # reading a FIFO would block

@@ -57,10 +57,8 @@ def expect_range(what: str, values: NDArray) -> str:
 
 
 def compiled(what: str, function: Callable[..., Any], *args: Any, tolerance: float = TOLERANCE) -> Callable[..., Any]:
-    """Compiles a pure function of arrays for arguments like `args`.
-
-    Raises:
-      ComponentError: the function raises an error, or a second trace or call gives another result for `args`.
+    """Compiles a pure function of arrays for arguments like `args`. Raises ComponentError if the function raises an error, or a
+    second trace or call gives another result for `args`.
     """
     traces = [attempt(what, jax.jit(functools.partial(function)).lower, *args) for _ in range(2)]  # two objects, two traces
     program = attempt(what, traces[0].compile)

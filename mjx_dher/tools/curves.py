@@ -44,10 +44,8 @@ class Curve(NamedTuple):
 
 
 def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
-    """Reads the curve of the run in `folder`, finished or not.
-
-    Raises:
-      FolderError: it is not a run folder, it is damaged, or no epoch has ended and `allow_empty` is False.
+    """Reads the curve of the run in `folder`, finished or not. Raises FolderError if it is not a run folder, it is damaged, or
+    no epoch has ended and `allow_empty` is False.
     """
     content, spec = run_folder.read_run(folder)
     result: dict[str, Any] = {}

@@ -32,10 +32,8 @@ class Contents(NamedTuple):
 
 
 def check(file_format: str, out: Path, overwrite: bool) -> None:
-    """Checks the arguments early.
-
-    Raises:
-      ValueError: `file_format` is unknown, its package is not installed, or `out` cannot or must not be written.
+    """Checks the arguments early. Raises ValueError if `file_format` is unknown, its package is not installed, or `out` cannot
+    or must not be written.
     """
     lookup.check_name("format", file_format, FORMATS)
     files.check_file(out, [f".{file_format}"], overwrite)

@@ -46,10 +46,8 @@ class Programs:
 
 
 def programs(name: str, options: dict[str, Any]) -> Programs:
-    """Functions shared by all instances of an environment. Arguments are as in `envs.make`.
-
-    Raises:
-      ValueError: as in `envs.make`, or an option has another name in Gymnasium.
+    """Functions shared by all instances of an environment. Arguments are as in `envs.make`. Raises ValueError as `envs.make`
+    does, or if an option has another name in Gymnasium.
     """
     if "episode_length" in options:
         raise ValueError("episode_length is called max_episode_steps in gymnasium.make and gymnasium.make_vec")

@@ -66,10 +66,8 @@ def ffmpeg() -> str:
 def choose_gl() -> str:
     """Sets MUJOCO_GL to the first backend that can draw without a screen here, and returns its name.
 
-    If the user has set MUJOCO_GL, only that backend is tested. A backend is tested once per process.
-
-    Raises:
-      ValueError: no backend works.
+    If the user has set MUJOCO_GL, only that backend is tested. A backend is tested once per process. Raises ValueError if no
+    backend works.
     """
     requested = os.environ.get("MUJOCO_GL")
     if not requested and sys.platform != "linux":
@@ -268,10 +266,8 @@ def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """Writes frames, [height, width, 3] uint8 each, in the format of the suffix of `out`.
 
     Above `MOST_FPS` frames per second, some are left out. After an error an existing file is unchanged.
-    (imageio_ffmpeg.write_frames does not report a failure of ffmpeg at the end.)
-
-    Raises:
-      ValueError: the file cannot be written. The message includes ffmpeg's.
+    (imageio_ffmpeg.write_frames does not report a failure of ffmpeg at the end.) Raises ValueError if the file cannot be
+    written. The message includes ffmpeg's.
     """
     frames = iter(frames)
     first = next(frames)

@@ -15,10 +15,8 @@ from mjx_dher.validation import check_number
 
 
 def check(host: str, port: int) -> int:
-    """Checks that the viewer can start. Returns its port, or a free one for 0.
-
-    Raises:
-      ValueError: its package is not installed, the port is taken, or the host is not an address of this machine.
+    """Checks that the viewer can start. Returns its port, or a free one for 0. Raises ValueError if its package is not
+    installed, the port is taken, or the host is not an address of this machine.
     """
     require_extra("the viewer", "viser", "view")
     check_number("port", port, "[0, 65535]")

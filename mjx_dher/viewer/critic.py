@@ -26,10 +26,8 @@ class Critic(NamedTuple):
 
 
 def load(folder: Path, run: RunSpec, env: Env) -> Critic:
-    """Critic in the newest checkpoint of a run that was trained alone.
-
-    Raises:
-      FolderError: no checkpoint is usable, or the run's learner has no `value`.
+    """Critic in the newest checkpoint of a run that was trained alone. Raises FolderError if no checkpoint is usable, or the
+    run's learner has no `value`.
     """
     run = dataclasses.replace(run, demonstrations=None)  # the checkpoint's ring holds them
     train = program.make_loop(env, run, program.choices_of([run]))

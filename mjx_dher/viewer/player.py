@@ -46,9 +46,7 @@ class Game(NamedTuple):
 
 def make_game(env: Any) -> Game:
     """Compiles an environment's functions. A goal can be moved if it has `with_goal`, and an object if it has `with_object`.
-
-    Raises:
-      ValueError: the environment cannot be drawn.
+    Raises ValueError if the environment cannot be drawn.
     """
     check_drawable(env)
     has_object = getattr(env, "has_object", True)  # all built-in tasks share their methods, even without an object

@@ -27,11 +27,7 @@ class Shape(NamedTuple):
 
 
 def shapes(model: Any) -> list[Shape]:
-    """Visible geoms of a compiled model, in its order.
-
-    Raises:
-      ValueError: a geom type is not supported.
-    """
+    """Visible geoms of a compiled model, in its order. Raises ValueError if a geom type is not supported."""
     known = {int(kind) for kind in (_TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_SPHERE, _TYPES.mjGEOM_CAPSULE, _TYPES.mjGEOM_ELLIPSOID)}
     known |= {int(kind) for kind in (_TYPES.mjGEOM_CYLINDER, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
     seen = []

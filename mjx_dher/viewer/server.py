@@ -220,10 +220,8 @@ class Viewer:
 
 
 def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:
-    """Starts viser's server. Returns it, and a dict for the panel's controls.
-
-    Raises:
-      ValueError: another process has taken the port since it was checked.
+    """Starts viser's server. Returns it, and a dict for the panel's controls. Raises ValueError if another process has taken
+    the port since it was checked.
     """
     import viser
 

@@ -69,10 +69,8 @@ def by_random(env: str, env_kwargs: Sequence[str] = ()) -> Source:
 
 
 class Cast:
-    """Policy of a source and its critic, if any, in an environment. Follows a run that is still training.
-
-    Raises:
-      ValueError: the policy cannot be read, or does not fit the environment.
+    """Policy of a source and its critic, if any, in an environment. Follows a run that is still training. Raises ValueError if
+    the policy cannot be read, or does not fit the environment.
     """
 
     def __init__(self, source: Source, env: Any):

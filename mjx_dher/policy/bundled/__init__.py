@@ -25,10 +25,8 @@ def names() -> tuple[str, ...]:
 def find(run: str | Path) -> Path:
     """Run folder or file for a path or for the name of a bundled policy.
 
-    A run folder or file of this name in the current folder takes precedence.
-
-    Raises:
-      FolderError: there is neither. The message lists the bundled policies and suggests the nearest.
+    A run folder or file of this name in the current folder takes precedence. Raises FolderError if there is neither. The
+    message lists the bundled policies and suggests the nearest.
     """
     path = Path(run)
     if path.is_file() or (path / _CONFIG).exists():

@@ -214,10 +214,8 @@ def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
     """Arrays in the order of `shapes`.
 
-    Missing HParams become 0 and additional ones are dropped, because a run takes them from its settings.
-
-    Raises:
-      CheckpointError: names the first array that does not match `shapes`.
+    Missing HParams become 0 and additional ones are dropped, because a run takes them from its settings. Raises CheckpointError
+    for the first array that does not match `shapes`.
     """
     fitted = []
     for name, leaf in shapes.items():

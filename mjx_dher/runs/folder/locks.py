@@ -24,11 +24,7 @@ class Claims:
     report: Callable[[str], None]
 
     def is_free(self, spec: RunSpec, folder: Path) -> bool:
-        """Whether to train a run, as far as known before compilation.
-
-        Raises:
-          FolderError: it is not, and this is not a sweep.
-        """
+        """Whether to train a run, as far as known before compilation. Raises FolderError if not, except in a sweep."""
         if not folder.exists():
             return True
         try:
@@ -72,11 +68,7 @@ class Claims:
         return claimed, busy
 
     def _is_due(self, spec: RunSpec, folder: Path) -> bool:
-        """Whether to train a locked run.
-
-        Raises:
-          FolderError: not, and this is not a sweep.
-        """
+        """Whether to train a locked run. Raises FolderError if not, except in a sweep."""
         if not self.sweep and (folder / run_folder.CONFIG_FILE).exists():
             run_folder.check_same(folder, spec)
         if not results.has_result(folder):

@@ -19,11 +19,7 @@ def has_result(folder: Path) -> bool:
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """Reads the result of an ended run.
-
-    Raises:
-      FolderError: it is missing, damaged or belongs to another run.
-    """
+    """Reads the result of an ended run. Raises FolderError if it is missing, damaged or belongs to another run."""
     path = folder / run_folder.RESULT_FILE
     with run_folder.checked(path):
         content = {"reason": "", **files.read_json(path)}
@@ -36,10 +32,8 @@ def read_result(folder: Path) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Reads metrics.csv, all lines of which must belong to the run in `folder`.
-
-    Raises:
-      FolderError: it is not a run folder, or a line is missing, invalid or belongs to another run.
+    """Reads metrics.csv, all lines of which must belong to the run in `folder`. Raises FolderError if it is not a run folder,
+    or a line is missing, invalid or belongs to another run.
     """
     path, content = folder / run_folder.METRICS_FILE, run_folder.read_config(folder)
     rows = loggers.read_rows(path, run_folder.digests(content))
@@ -61,10 +55,8 @@ def earlier_digests(folder: Path, digest: str) -> list[str]:
 
 
 def can_go_on(folder: Path, total_steps: int) -> bool:
-    """Whether an ended run can resume: it failed or made fewer than `total_steps`, and it has a checkpoint.
-
-    Raises:
-      FolderError: its result is damaged.
+    """Whether an ended run can resume: it failed or made fewer than `total_steps`, and it has a checkpoint. Raises FolderError
+    if its result is damaged.
     """
     result = read_result(folder)
     due = result["status"] == FAILED or result["env_steps"] < total_steps

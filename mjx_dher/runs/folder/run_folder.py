@@ -160,11 +160,7 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Reads config.json of the run in `path`.
-
-    Raises:
-      FolderError: it is not a run folder, or has another schema.
-    """
+    """Reads config.json of the run in `path`. Raises FolderError if it is not a run folder, or has another schema."""
     if not path.is_dir():
         raise FolderError(f"{path} is not a run folder: no such folder")
     try:
@@ -209,10 +205,8 @@ def read_spec(path: Path, trusted: bool = False) -> RunSpec:
 def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec]:
     """Reads config.json of the run in `path`: its content, and the run's description.
 
-    Code that it names is imported only if `trusted`, or if the user has trained with it (`trust`).
-
-    Raises:
-      FolderError: it is not a run folder, has another schema, or config.json was edited.
+    Code that it names is imported only if `trusted`, or if the user has trained with it (`trust`). Raises FolderError if it is
+    not a run folder, has another schema, or config.json was edited.
     """
     content = read_config(path)
     spec = to_spec(path, content, trusted)
@@ -323,10 +317,8 @@ def written_identity(path: Path) -> tuple[Path, dict[str, Any] | None]:
 def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSpec:
     """Description of a run from the content of its config.json, at `path` or in the folder `path`.
 
-    Names of code and of demonstrations are marked as coming from a file, unless `trusted`.
-
-    Raises:
-      FolderError: an entry is missing or invalid.
+    Names of code and of demonstrations are marked as coming from a file, unless `trusted`. Raises FolderError if an entry is
+    missing or invalid.
     """
     file = path / CONFIG_FILE if path.is_dir() else path
     with checked(file, "does not describe a run"):

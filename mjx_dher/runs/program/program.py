@@ -112,10 +112,8 @@ def compile_runs(
 ) -> Program:
     """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate.
 
-    The final evaluation may still be compiling in a thread while the runs are trained.
-
-    Raises:
-      ValueError: too little memory for one run, or sizes that the devices do not divide.
+    The final evaluation may still be compiling in a thread while the runs are trained. Raises ValueError for too little memory
+    for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
     most = min(len(specs), max_lanes or len(specs))
