@@ -16,7 +16,6 @@ class Chain:
     """Kinematic chain from the world to `body`, whose bodies each have one hinge or are fixed to their parent.
 
     Args:
-      model: compiled MJCF.
       body: name of the last body.
       site: name of a site on that body.
 

@@ -130,7 +130,6 @@ def from_brax(
       achieved: maps its state to the achieved goal [G].
       goal: maps the state after a reset to the desired goal [G].
       threshold: largest distance at which the goal is reached.
-      episode_length: steps of an episode.
       observe: maps its state to the observation, [D] or a tree of arrays, without the goal. Default: the state's `obs`.
       distance: (achieved [..., G], desired [..., G]) -> [...]. Default: Euclidean.
       ends: meaning of `done`. True: the episode ends, and no future follows. False: the episode has failed and nothing is

@@ -52,9 +52,7 @@ class Goal:
         """Marks that show a goal: balls, and bodies as ghosts.
 
         Args:
-          model: the compiled MJCF.
           qpos: coordinates [nq].
-          goal: [G].
         """
         raise NotImplementedError
 

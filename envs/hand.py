@@ -192,7 +192,6 @@ class HandTask(MujocoTask):
 
         Args:
           qpos: [24] joint angles in rad, followed by an object's [7] position in m and orientation (w, x, y, z).
-          desired_goal: [G].
           qvel: [24] rad/s, followed by an object's [6] velocity. Default: at rest.
 
         Raises:

@@ -53,7 +53,6 @@ class Place:
     """A site or body, whose pose follows from the joints between the world and it.
 
     Args:
-      model: compiled MJCF.
       name: "site:NAME" or "body:NAME". A plain NAME means a site if it exists, else a body.
 
     Raises:

@@ -50,7 +50,6 @@ class MujocoTask(GoalEnv):
     """A goal-conditioned task from a model and a few declarations. You can override every method.
 
     Args:
-      engine: "auto", "native", "jax" or "warp".
       reward_type: "sparse" (0 if the goal is reached, else -1) or "dense" (minus the distance, unbounded below).
       distance_threshold: largest distance at which the goal is reached. Default: the goal's threshold.
       episode_length: steps of an episode. Default: the class's.

@@ -18,7 +18,6 @@ def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floatin
     Args:
       what: name of the value and its symbolic shape, such as "sampler: log weights [T+1]".
       value: array, number, or nested sequence of numbers.
-      shape: expected shape.
       kind: expected kind of dtype: `jnp.floating`, `jnp.integer`, `jnp.number` or `jnp.bool_`.
 
     Raises:

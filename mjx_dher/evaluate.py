@@ -27,7 +27,6 @@ def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episod
     """Plays episodes of a deterministic policy. Traceable.
 
     Args:
-      env: the environment.
       act: maps observations, whose leaves lead with [num_episodes], to actions [num_episodes, A].
       key: draws the initial states.
       num_episodes: number of parallel episodes.
@@ -42,9 +41,6 @@ def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -
     """Plays episodes of a policy from `load_policy`.
 
     Args:
-      env: the environment.
-      policy: the policy.
-      num_episodes: number of episodes.
       seed: draws the initial states.
 
     Returns:

@@ -55,8 +55,6 @@ def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = Fa
 
     Args:
       field: setting that the message names.
-      value: name to check.
-      allowed: allowed names.
       custom: whether "module:attribute" is allowed too. The module must exist; it is not imported.
     """
     allowed = tuple(allowed)

@@ -39,7 +39,6 @@ def update(
     """Adds values to the moments, after clipping them to +- `clip`.
 
     Args:
-      state: moments so far.
       values: values to add; leaves are [..., D], with any batch axes.
       clip: bound of the magnitudes.
       valid: bool mask over leading batch axes. Other values are left out, even NaN. Default: all.
@@ -79,11 +78,7 @@ def normalize(state: PyTree, values: PyTree, eps: Array | float, clip: Array | f
     """Normalizes values: clips them to +- `input_clip`, subtracts the mean, divides by max(std, eps) and clips to +- `clip`.
 
     Args:
-      state: moments.
-      values: values; leaves are [..., D].
       eps: smallest standard deviation to divide by.
-      clip: bound of the results.
-      input_clip: bound of the values.
     """
 
     def of(values: Array, state: NormalizerState | None) -> Array:

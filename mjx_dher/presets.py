@@ -36,8 +36,6 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     rolls out the workers' episodes in parallel and takes the gradient of their joint batch.
 
     Args:
-      name: the preset.
-      env: the environment.
       learner: learner. Default: the preset's, which may bring its own numbers and priority. Other learners use the numbers of
         `ddpg`.
       networks: networks. Default: the preset's for this learner.

@@ -94,9 +94,6 @@ def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array |
     """Renews the ring's weights with `priority.renew`, if it exists.
 
     Args:
-      priority: the priority.
-      ring: the ring.
-      context: input of `renew`.
       rows: rows [R] to renew, which `renew` gets as a ring. They may repeat. Default: all.
 
     Raises:
@@ -120,12 +117,9 @@ def choose(
     if no more had been drawn.
 
     Args:
-      priority: the priority.
-      key: random key.
       sample: candidates, CANDIDATES * number of them.
       batch: the candidates after relabelling.
       number: number of transitions to keep.
-      context: input of the priority.
 
     Raises:
       ValueError: `priority.choose` does not return integers [number].

@@ -35,8 +35,6 @@ def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HP
       sample: transitions [B]. Samplers that use goals of other episodes need `sample.pool`, and samplers with a score need
         `sample.score` (see `add_choices`).
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
-      hparams: numbers that the sampler reads.
-      key: random key.
 
     Raises:
       ValueError: log weights are not floats [T+1], or `sample` lacks a field that the sampler needs.
@@ -103,7 +101,6 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
       context: reward function and numbers (her_k, gamma and those of the sampler), such as `Context(compute_reward,
         HParams())`.
-      key: random key.
 
     Raises:
       ValueError: log weights are not [T+1], or rewards are not [B].
@@ -156,7 +153,6 @@ def draw_batches(
 
     Args:
       ring: the replay ring. It must not be empty.
-      key: random key.
       shape: leading axes of the batch's leaves.
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
       context: reward function and numbers. Its `hparams.priority_fraction` is the fraction drawn by priority.
@@ -202,13 +198,6 @@ def look_ahead(ring: ReplayState, sample: Sample, batch: Batch, context: Context
 
     A return stops at the end of the episode, or when the goal is reached, because later actions aimed at another goal. As in
     Hessel et al. 2018, returns are not corrected for older policies.
-
-    Args:
-      ring: the replay ring.
-      sample: the batch before relabelling.
-      batch: the relabelled batch.
-      context: reward function and numbers.
-      n_step: largest number of steps.
     """
     last = sample.length if sample.ends else sample.episode_goals.shape[1] - 1
     ahead = sample.step + jnp.arange(1, n_step + 1)[:, None]  # [n, B]

@@ -68,7 +68,6 @@ def init(episode: Episode, num_episodes: int, ends: bool = False) -> ReplayState
 
     Args:
       episode: one unbatched episode with the shapes and dtypes to store (arrays or `jax.ShapeDtypeStruct`s).
-      num_episodes: rows E.
       ends: whether episodes can be shorter than T.
 
     Raises:
@@ -121,7 +120,6 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
     """Overwrites the oldest episodes of the ring with new ones.
 
     Args:
-      state: the ring.
       episodes: N episodes; leaves lead with [N].
       priority: weights [N] for `draw_rows`, or one number for all (see `as_priority`).
       valid: mask [N] of the episodes to write, bool. Default: all.
@@ -226,8 +224,6 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array
 
     Args:
       state: the ring. It must not be empty.
-      key: random key.
-      batch_size: number of rows B.
       fraction: probability of drawing a row by priority instead of uniformly. All draws are uniform while all priorities are
         0.
       weights: `cumulative(state)`.
@@ -268,8 +264,6 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
     Args:
       state: the ring. It must not be empty.
-      key: random key.
-      batch_size: number of transitions B.
       rows: rows [B] from which to draw a uniform step each. Default: uniform over all transitions.
 
     Raises:

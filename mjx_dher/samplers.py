@@ -260,11 +260,9 @@ def weigh(
     """Log weights [T+1] of the goals of one episode.
 
     Args:
-      sampler: the sampler.
       achieved: achieved goals [T+1, G] to choose from.
       desired: desired goal [G] of the episode.
       step: index [] of the transition.
-      hparams: numbers that the sampler reads.
       score: scores [T+1] of the goals, for a sampler with a score.
       length: index [] of the episode's last goal. Default: T. Goals after it get no weight.
 

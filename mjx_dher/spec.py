@@ -148,7 +148,6 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
     """Checks that a run is possible. Imports no component.
 
     Args:
-      spec: the run.
       episode_length: steps of an existing environment, whose name is then not checked. Default: the argument of that name or
         50, and 1 for a custom environment.
 

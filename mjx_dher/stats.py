@@ -35,12 +35,6 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def difference_interval(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> tuple[float, float]:
     """Newcombe's 95 % interval of the difference a - b of two success rates (Newcombe 1998, method 10).
 
-    Args:
-      successes_a: successful trials of a.
-      trials_a: all trials of a.
-      successes_b: successful trials of b.
-      trials_b: all trials of b.
-
     Returns:
       Low and high end.
 
@@ -78,9 +72,6 @@ def bootstrap_interval(
     Args:
       scores: scores [S] or [S, K].
       statistic: function (values, axis=...) that reduces one axis, such as np.mean. Tasks are pooled.
-      level: coverage of the interval.
-      repeats: number of resamples.
-      seed: seed of the resampling.
 
     Raises:
       ValueError: there are no scores, or `level` does not lie between 0 and 1.
@@ -100,9 +91,6 @@ def curve_interval(
 
     Args:
       curves: learning curves [S, P].
-      level: coverage of the interval.
-      repeats: number of resamples.
-      seed: seed of the resampling.
 
     Returns:
       Three arrays [P]: the mean, and the lower and upper ends of the interval.
@@ -126,7 +114,6 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
     Args:
       x: points [P].
       curves: curves [S, P].
-      threshold: the threshold.
 
     Raises:
       ValueError: x is not [P], or `curves` is not [S, P].
@@ -167,10 +154,6 @@ def improvement_interval(
 
     Args:
       a: scores [S] or [S, K].
-      b: scores to compare with.
-      level: coverage of the interval.
-      repeats: number of resamples.
-      seed: seed of the resampling.
 
     Raises:
       ValueError: as in `probability_of_improvement`, or `level` does not lie between 0 and 1.
@@ -198,9 +181,7 @@ def paired_p_value(a: ArrayLike, b: ArrayLike, repeats: int = 100_000, seed: int
 
     Args:
       a: scores [S].
-      b: paired scores [S].
       repeats: largest number of sign flips.
-      seed: seed of the flips.
 
     Raises:
       ValueError: the shapes differ or are not [S], or some scores are not finite.
@@ -250,7 +231,6 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
     Args:
       differences: paired differences [M, S] of M comparisons, NaN if a comparison lacks a seed.
       repeats: largest number of sign flips.
-      seed: seed of the flips.
 
     Returns:
       M adjusted two-sided p-values.

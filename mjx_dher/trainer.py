@@ -128,7 +128,6 @@ def make_train(
     and returns the next TrainState and scalar metrics, which docs/logs.md lists.
 
     Args:
-      env: the environment.
       config: sizes, per device if several devices share the run.
       sampler: sampler of hindsight goals, or a function like `Sampler.log_weights`. Default: `future`.
       priority: priority, for `hparams.priority_fraction` of each batch. Default: `eventful`.

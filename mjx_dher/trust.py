@@ -60,7 +60,6 @@ def record(field: str, name: str, place: Path | None, arguments: Sequence[str] =
     """Records a name that the user typed or passed. Does nothing if there is no state folder.
 
     Args:
-      field: setting of the name.
       name: the name. A `FromFile` is not recorded.
       place: file of the module or data, or None.
       arguments: arguments of the environment.

@@ -77,7 +77,6 @@ def check_number(field: str, value: Any, interval: str, kind: type = int) -> Non
 
     Args:
       field: setting that the message names.
-      value: value to check.
       interval: such as "[0, 1)".
       kind: int, or float, which also allows integers.
     """
@@ -94,7 +93,6 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
     """Checks sizes and numbers of a run.
 
     Args:
-      config: sizes.
       hparams: numbers. Arrays, one value per seed, are not checked.
       episode_length: steps of the environment's episodes.
 

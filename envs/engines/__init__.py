@@ -42,7 +42,6 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, varied: Sequenc
 
     Args:
       name: "native", "jax", "warp" or "auto".
-      model: compiled MJCF.
       substeps: MuJoCo timesteps per environment step.
       varied: numbers of the model that differ between environments, such as "mass:box" (`variation.Variation`).
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp these

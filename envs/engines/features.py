@@ -63,7 +63,6 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
     """Features of a model whose fields do not have their defaults, with their elements.
 
     Args:
-      model: compiled MJCF.
       concerns: whether to check a field of this name.
     """
     features: list[str] = []

@@ -150,7 +150,6 @@ class Simulation:
 
     Args:
       model: a model for which `unsupported` is empty.
-      num_envs: number of environments.
       substeps: timesteps per environment step.
       contacts: memory for contacts, per environment on average.
       rows: memory for constraint rows, per environment.

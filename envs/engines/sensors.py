@@ -19,7 +19,6 @@ class Sensors:
 
     Args:
       engine: "native", "jax", "warp" or "warp graph". MuJoCo Warp reads them for both paths of warp.
-      model: compiled MJCF.
       allow_cpu: as in `WarpEngine`.
       varied: as in `make_engine`.
 

@@ -37,7 +37,6 @@ class Variation:
     Numbers that MuJoCo derives from masses for the softness of constraints (`invweight0`) keep the model's values.
 
     Args:
-      model: the compiled MJCF.
       names: "KIND:NAMES" for each factor. "mass" is of bodies and includes the inertia. "friction" is of geoms, and of contact
         pairs with one of these geoms. "damping" is of joints. "gain" is of actuators and multiplies the force. Several names
         are separated by spaces and can have "*" and "?".

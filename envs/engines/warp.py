@@ -36,7 +36,6 @@ class WarpEngine:
     `note` tell which one runs, and why.
 
     Args:
-      model: compiled MJCF.
       substeps: MuJoCo timesteps per environment step.
       path: "fused", "graph", or "auto": fused if the kernel supports the model.
       iterations: most Newton iterations of the constraint solver. Environments stop individually, usually after one or two.

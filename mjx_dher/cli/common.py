@@ -152,8 +152,6 @@ class Screen:
     """Progress of runs: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s.
 
     Args:
-      console: console to print to.
-      specs: runs to train.
       success: success rates of earlier epochs, if a run resumes.
     """
 

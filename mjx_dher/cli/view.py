@@ -119,9 +119,7 @@ class Beside:
     """Viewer of a run in training, in its own process, which starts when there is a policy to show.
 
     Args:
-      folder: run folder.
       port: port of the page from `address.check`, or None for no viewer.
-      console: console to print to.
     """
 
     def __init__(self, folder: Path, port: int | None, console: Console):

@@ -40,7 +40,6 @@ def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, round
       cost: costs [N, P].
       usable: mask [P] of the columns to use. At least one must be True.
       softness: fraction of the mean cost. The smaller it is, the nearer the result is to the assignment of least cost.
-      rounds: iterations.
     """
     open_to = jnp.broadcast_to(usable[None], cost.shape)
     mean = jnp.sum(jnp.where(open_to, jnp.abs(cost), 0.0)) / jnp.sum(open_to, dtype=cost.dtype)

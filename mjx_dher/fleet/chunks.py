@@ -84,13 +84,7 @@ def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, s
 
 
 def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[RunSpec]) -> list[tuple[RunSpec, ...]]:
-    """Chunks that an earlier driver left in the storage. They stay together, because their runs share checkpoints.
-
-    Args:
-      storage: storage of the sweep.
-      specs: all runs of the sweep.
-      todo: runs that have not ended.
-    """
+    """Chunks that an earlier driver left in the storage. They stay together, because their runs share checkpoints."""
     by_name, waiting = {fingerprint.trial_name(spec): spec for spec in specs}, set(todo)
     earlier = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():

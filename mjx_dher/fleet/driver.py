@@ -55,7 +55,6 @@ def run(cluster: Any, job: Job) -> list[str]:
 
     Args:
       cluster: `cluster.Cluster`, or an object with its methods.
-      job: the sweep.
 
     Raises:
       ValueError: raised by the training of a chunk. Runs that have ended by then are written.

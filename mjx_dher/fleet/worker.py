@@ -51,8 +51,6 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
     """Trains a chunk, from its checkpoints if its folder in the storage has any.
 
     Args:
-      chunk: the chunk.
-      make_env: makes the environment of a run.
       tell: reports progress, and returns True to stop the chunk.
 
     Returns:

@@ -49,28 +49,22 @@ class Learner(Protocol):
         """Actions [..., A] in [-1, 1] of the deterministic policy, for evaluation and export.
 
         Args:
-          state: the learner's state.
           obs: observations [..., D] and goals [..., G], with any leading axes.
-          hparams: numbers.
         """
 
     def explore(self, state: Any, obs: GoalObs, noise: Any, hparams: HParams) -> Array:
         """Actions [N, A] in [-1, 1] of the exploring policy, for the N environments of a rollout.
 
         Args:
-          state: the learner's state.
           obs: observations [N, D] and goals [N, G].
           noise: one step of the result of `noise`; leaves lead with [N]. By default it is one key per environment.
-          hparams: numbers.
         """
 
     def update(self, state: Any, batch: Batch, hparams: HParams) -> tuple[PyTree, Metrics]:
         """Takes one gradient step and leaves the targets unchanged.
 
         Args:
-          state: the learner's state.
           batch: transitions [B]. `batch.discount` [B] is the factor of the next observation's value.
-          hparams: numbers.
 
         Returns:
           The next state, with the same structure, shapes and dtypes, and scalar metrics, whose names are not in `RESERVED`. An
@@ -81,10 +75,8 @@ class Learner(Protocol):
         """Draws the exploration noise of a whole rollout, because one large draw is faster than many small ones.
 
         Args:
-          key: random key.
           num_steps: T.
           num_envs: N.
-          hparams: numbers.
 
         Returns:
           A pytree whose leaves lead with [T, N].
@@ -95,10 +87,8 @@ class Learner(Protocol):
         """Updates the statistics of the inputs. By default does nothing.
 
         Args:
-          state: the learner's state.
           observation: [N, T+1, D] of the rollout's episodes.
           goal: relabelled goals [B, G].
-          hparams: numbers.
           valid: bool [N]. Episodes for which it is False may contain NaN and must be ignored.
 
         Returns:

@@ -46,8 +46,6 @@ def first_state(learner: ActorCriticBase, key: PRNGKey, init_critic: Callable[..
     """State with fresh networks, equal targets and empty normalizers.
 
     Args:
-      learner: the learner.
-      key: random key.
       init_critic: maps a key, observations, goals and actions to the critics' parameters.
     """
     actor_key, critic_key, update_key = jax.random.split(key, 3)

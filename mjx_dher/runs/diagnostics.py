@@ -17,7 +17,6 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
 
     Args:
       metrics: metrics of the epoch from `trainer.make_train`.
-      config: sizes.
       finite: whether all of the learner's floats are finite.
     """
     if not finite:

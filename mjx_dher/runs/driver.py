@@ -84,10 +84,8 @@ def train_runs(
     result has the reason.
 
     Args:
-      env: the environment of all runs.
       specs: descriptions, which must agree in `RunSpec.program`.
       folders: run folders, one per run. Missing ones are made.
-      options: evaluation, checkpoints and logs.
       lanes: most parallel runs. Default: one on a CPU, whose cores one run fills, otherwise as many as fit into memory.
       devices: number of devices, or "all". Parallel runs are distributed among them. If there are fewer runs than devices,
         several devices share a run.

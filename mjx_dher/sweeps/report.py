@@ -24,7 +24,6 @@ def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> s
     """HTML report of a run, which may still be training.
 
     Args:
-      folder: run folder.
       report: called with a line about each video that is left out.
 
     Raises:
@@ -88,7 +87,6 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
     """HTML report of all finished runs of a sweep.
 
     Args:
-      folder: folder of the sweep.
       baseline: setting to compare with, as in `comparison.compare`.
       threshold: success rate for the time to success.
       report: called with a line about each video that is left out.

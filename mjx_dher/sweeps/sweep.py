@@ -36,10 +36,7 @@ def run(
 
     Args:
       folder: folder of the sweep, made if it does not exist.
-      specs: trials, in order.
       make_env: function that makes the environment of a trial.
-      options: evaluation, checkpoints and logs.
-      lanes: most parallel runs.
       devices: number of devices, or "all", as in `train_runs`.
       should_stop: called after every epoch. True stops the sweep with a checkpoint.
       report: called with a line about each program and checkpoint.

@@ -38,7 +38,6 @@ def read(
     """Reads the arrays of an .npz file without unpickling.
 
     Args:
-      path: the file.
       names: arrays to read. Default: all.
       ratio: largest ratio of the arrays' bytes to the file's. Weights hardly compress, but gigabytes of zeros do.
       check: called with all headers before any array is read. Raises ValueError for an unwanted array.

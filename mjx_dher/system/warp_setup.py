@@ -51,7 +51,6 @@ def load(module: Any, block: int | None = None) -> None:
     """Compiles a Warp module for the current device, or loads it from the cache. Recompiles if the cached one is damaged.
 
     Args:
-      module: the module.
       block: threads per block to compile for. Default: Warp's.
     """
     block = (1 if wp.get_device().is_cpu else module.options["block_dim"]) if block is None else block

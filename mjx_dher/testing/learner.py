@@ -42,8 +42,6 @@ def check_learner(
     Args:
       learner: learner, as in `learners.make`.
       env: the environment, or a `Trial`.
-      config: sizes.
-      hparams: numbers.
       networks: networks, as in `networks.make`.
 
     Raises:

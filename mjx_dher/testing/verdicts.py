@@ -33,8 +33,6 @@ def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[s
     """Checks the custom components of runs of `env`, each once. Yields lines for the screen.
 
     Args:
-      env: environment of all runs.
-      specs: the runs.
       again: whether to check components that have passed before.
 
     Raises:

@@ -72,7 +72,6 @@ def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
     """Writes the policy to `out`, reads it back and compares. If this fails, an existing file stays unchanged.
 
     Args:
-      policy: policy of the run.
       run: settings of the run, for the metadata.
       file_format: one of FORMATS.
       out: file to write; see `check`.

@@ -138,7 +138,6 @@ def record_episodes(
       env: an environment with a MuJoCo `model` and states with `physics.qpos`.
       act: (observations [N, ...], key) -> actions [N, A].
       seed: seed of starts, goals and the keys of `act`.
-      num_episodes: number of episodes N.
 
     Returns:
       qpos [N, T+1, nq] in the layout of the model, desired goals [N, G], and success at the end [N].
@@ -178,7 +177,6 @@ def stills(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: in
     """Draws pictures of the first episode side by side, from start to end: [height, STILLS * width, 3] uint8.
 
     Args:
-      env: the environment.
       qpos: configurations [N, T+1, nq].
       goals: goals [N, G].
       width, height: size of one picture in pixels.

@@ -85,11 +85,8 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
     """Plays a run's policy in its original task, in `workers` processes of another Python.
 
     Args:
-      run: run folder.
       python: Python of the virtual environment.
-      episodes: number of episodes.
       seed: seed of the first episode. Others follow.
-      workers: number of processes.
 
     Returns:
       Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.

@@ -43,7 +43,6 @@ class Panel:
     """Buttons, counters and curves.
 
     Args:
-      gui: GUI of a viser server.
       controls: receives a test of allowed values for each control.
       labels: names of the policies. The first one plays.
       commands: queue for user commands.

@@ -109,9 +109,6 @@ class Player:
     Moving something unsets `renew`, so that a user can continue.
 
     Args:
-      game: the environment.
-      act: the policy.
-      value: the critic, or None.
       seed: seed of the first episode. Others follow.
     """
 

@@ -41,7 +41,6 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
 
     Args:
       label: name for the user.
-      folder: run folder.
       env: environment to play in. Default: the run's, with its arguments.
       env_kwargs: arguments of the environment as NAME=VALUE, which override the run's.
 

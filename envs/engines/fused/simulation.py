@@ -22,7 +22,6 @@ class Simulation:
 
     Args:
       model: a model for which `unsupported` is empty; its options limit the iterations of Newton's method and its line search.
-      num_envs: number of environments.
       substeps: timesteps an environment step.
       rows: constraint rows that fit into memory; more than can occur are not allocated.
 

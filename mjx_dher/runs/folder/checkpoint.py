@@ -72,10 +72,7 @@ def save(
     Checkpoints of later epochs are deleted too. If the disk is too full, all but the newest one are deleted first.
 
     Args:
-      folder: run folder.
       state: a TrainState, or any pytree of arrays.
-      epoch: epochs that have ended.
-      wall_seconds: seconds of training so far.
       keep: number of checkpoints to keep, at least 1.
       runs: `fingerprint.identity` of each run.
       refused: unusable checkpoints to delete.
@@ -138,7 +135,6 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
     """Restores the newest undamaged checkpoint of a run.
 
     Args:
-      folder: run folder.
       template: structure of the state (`jax.ShapeDtypeStruct`s), with shardings if there are several devices.
       lines: epochs in metrics.csv of each run. Checkpoints of later epochs are not used.
 

@@ -38,11 +38,6 @@ class Claims:
     def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
         """Makes and locks the folders of the first `lanes` runs that have not ended and that no other process trains.
 
-        Args:
-          stack: holds the locks.
-          waiting: runs, in order.
-          lanes: number of runs, at least 1.
-
         Returns:
           The claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither.
 

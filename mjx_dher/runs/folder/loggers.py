@@ -37,7 +37,6 @@ class CsvSink:
     """metrics.csv, with one line per epoch, written before the next epoch begins. The last column is the run's digest.
 
     Args:
-      path: the file.
       epochs: epochs that had ended, if the run resumes. Later lines are removed.
       digest: `fingerprint.digest` of the run.
 
@@ -76,7 +75,6 @@ class JsonlSink:
     """metrics.jsonl, with one object per epoch. Numbers that are not finite are null.
 
     Args:
-      path: the file.
       epochs: epochs that had ended, if the run resumes. Missing lines are taken from metrics.csv.
     """
 
@@ -98,7 +96,6 @@ def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str
     """Reads the lines of a metrics.csv as numbers, up to the first truncated one. The digest stays text.
 
     Args:
-      path: the file.
       digests: digests that the run has had, in order, or None if unknown.
 
     Raises:

@@ -83,8 +83,6 @@ def write_config(
     """Makes the folder and writes config.json.
 
     Args:
-      path: run folder.
-      spec: the run's description.
       engine: engine that runs (`spec.engine` may be auto).
       extra: additional entries, for the reader and for `resume`.
       earlier: digests that the run had before it resumed with other settings, in order.

@@ -73,10 +73,6 @@ def train(
     `train_runs` adds folders, checkpoints, logs and parallel runs.
 
     Args:
-      env: the environment.
-      config: sizes.
-      hparams: numbers.
-      seed: random seed.
       on_compile: called with None when compilation begins, and with its duration in seconds when it ends.
       start: point to resume from, as returned by `checkpoint.restore`.
       devices: number of devices that share the run, or "all". Each has an equal part of environments, ring and batches.
@@ -110,10 +106,6 @@ def run(
     The device works in its own thread, so signal handlers can run during an epoch.
 
     Args:
-      env: the environment.
-      config: sizes.
-      compiled: result of `compile_program`.
-      start: point to start or resume from.
       fetch: converts a tree of arrays to NumPy.
 
     Raises:
@@ -150,11 +142,7 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     """Compiles `program` for one run, or for L parallel runs if `key` and `hparams` lead with [L]. Their values do not matter.
 
     Args:
-      program: the training loop.
-      key: random key.
-      hparams: numbers.
       updates: updates per run. For many updates, a longer search by the compiler pays.
-      layout: devices.
     """
 
     def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:

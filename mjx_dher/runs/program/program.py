@@ -228,11 +228,7 @@ def evaluate(
     """Outcomes [lanes, episodes] of the final evaluation of each lane, as NumPy arrays.
 
     Args:
-      env: the environment.
-      program: the compiled program.
-      state: state of the runs.
       keys: keys of the runs. Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`.
-      episodes: episodes per lane.
       fetch: converts arrays of all devices to NumPy.
     """
 
