@@ -8,6 +8,7 @@ import tomllib
 import zipfile
 
 import pytest
+import yaml
 from conftest import ROOT
 
 import mjx_dher
@@ -99,11 +100,21 @@ def test_the_wheel_works_away_from_any_checkout(distributions, tmp_path):
 
 
 def test_the_version_is_the_same_everywhere():
-    citation, changes = (ROOT / "CITATION.cff").read_text(), (ROOT / "CHANGELOG.md").read_text()
-    assert f"\nversion: {mjx_dher.__version__}\n" in citation
-    date = re.search(r"\ndate-released: (.*)\n", citation)[1]
-    top = re.search(r"\n## (.*)\n", changes)[1]
-    assert top in ("Unreleased", f"{mjx_dher.__version__} ({date})")
-    assert f"\n## {mjx_dher.__version__} ({date})\n" in changes
+    citation, changes = yaml.safe_load((ROOT / "CITATION.cff").read_text()), (ROOT / "CHANGELOG.md").read_text()
+    version, date = citation["version"], citation["date-released"]
+    assert version == mjx_dher.__version__
+    assert re.search(r"\n## (.*)\n", changes)[1] in ("Unreleased", f"{version} ({date})")
+    assert f"\n## {version} ({date})\n" in changes
     metadata = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert metadata["authors"] == [{"name": re.search(r"\n  - name: (.*)\n", citation)[1]}]
+    assert metadata["authors"] == citation["authors"]
+    assert metadata["license"] == citation["license"]
+    assert metadata.get("urls", {}).get("Repository") == citation.get("repository-code")
+
+
+def test_a_release_uploads_nothing_until_someone_enables_it():
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())["jobs"]
+    assert [step["run"] for step in jobs["build"]["steps"] if "run" in step][-1] == "DIST=dist bash .ci/dist"
+    uploads = [name for name, job in jobs.items() if "pypi" in str(job)]
+    assert uploads == ["publish"]
+    assert "vars.PUBLISH == 'true' && startsWith(github.ref, 'refs/tags/v')" in jobs["publish"]["if"]
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}

@@ -28,7 +28,6 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ex
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
-    ".github/*.md",
     "docs/*.md",
     "docs/*.ipynb",
     "docs/api/*.md",
