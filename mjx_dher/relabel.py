@@ -29,7 +29,7 @@ class Hindsight(NamedTuple):
 
 
 def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HParams, key: PRNGKey) -> Hindsight:
-    """Draws an achieved goal for each transition.
+    """Draws an achieved goal for each transition. `relabel` has first given the sampler the environment's goal distance.
 
     Args:
       sample: transitions [B]. Samplers that use goals of other episodes need `sample.pool`, and samplers with a score need
@@ -99,8 +99,8 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
     Args:
       sample: transitions [B], with the fields that `hindsight_goals` needs.
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
-      context: reward function and numbers (her_k, gamma and those of the sampler), such as `Context(compute_reward,
-        HParams())`.
+      context: reward function, goal distance and numbers (her_k, gamma and those of the sampler), from `context.of_env` or
+        such as `Context(compute_reward, HParams())`.
 
     Raises:
       ValueError: log weights are not [T+1], or rewards are not [B].
@@ -111,6 +111,7 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
     k = jnp.asarray(hparams.her_k, jnp.float32)
     share = jnp.where(jnp.isinf(k), 1.0, k / (k + 1.0))
     relabelled = jax.random.uniform(coin_key, (batch_size,)) < share
+    sampler = samplers.of_distance(samplers.make(sampler), context.goal_distance)
     hindsight = hindsight_goals(sample, sampler, hparams, goal_key)
     desired_goal = jnp.where(relabelled[:, None], hindsight.goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]

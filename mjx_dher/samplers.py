@@ -47,6 +47,8 @@ class Sampler:
     cross_episode: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
     # Scores of each stored episode's goals, computed once per cycle and passed to `log_weights` as its last argument.
     score: ScoreFn | None = struct.field(pytree_node=False, default=None)
+    # The sampler for another goal distance. None unless it measures by the environment's (`of_distance`).
+    measure_by: Callable[[DistanceFn], Sampler] | None = struct.field(pytree_node=False, default=None)
 
 
 @struct.dataclass
@@ -180,7 +182,7 @@ def make(
     kernel: str | KernelFn = "linear",
     metric: str | MetricFn | LearnedMetric = "position",
     normalization: str | NormalizationFn = "mean",
-    goal_distance: DistanceFn = euclidean,
+    goal_distance: DistanceFn | None = None,
 ) -> Sampler:
     """Makes the sampler called `name`.
 
@@ -193,7 +195,8 @@ def make(
         desired [G]) -> distance [T+1].
       normalization: for `weighted`: mean, sum, max, minmax, none, far, "module:attribute", or a function (distance [T+1],
         candidates [T+1], scale []) -> relative distance [T+1].
-      goal_distance: distance of the environment (`Context.goal_distance`), used by the metric position.
+      goal_distance: distance between goals, for the metric position. Default: the environment's. `relabel` and `make_train`
+        put it in place (`Context.goal_distance`).
 
     Raises:
       ValueError: an argument is unknown or invalid. The message suggests the nearest name.
@@ -203,12 +206,20 @@ def make(
     sampler = components.load("sampler", name)
     kernel = components.load("weight_kernel", kernel, "relative", "temperature")
     normalization = components.load("weight_normalization", normalization, "distance", "candidates", "scale")
-    distance = make_metric(metric, goal_distance)
     if sampler is weighted:
         sampler = functools.partial(weighted, kernel=kernel, normalization=normalization)
     elif sampler not in (closest, epsilon_closest):
         return _to_sampler(sampler)
-    return _by_metric(sampler, distance)
+    made = _by_metric(sampler, make_metric(metric, goal_distance or euclidean))
+    if metric != "position" or goal_distance is not None:
+        return made
+    measure_by = lambda distance: _by_metric(sampler, make_metric("position", distance))  # noqa: E731
+    return Sampler(made.log_weights, measure_by=measure_by)
+
+
+def of_distance(sampler: Sampler, goal_distance: DistanceFn) -> Sampler:
+    """The sampler with an environment's goal distance, if it was made without one and measures distances."""
+    return sampler if sampler.measure_by is None or goal_distance is euclidean else sampler.measure_by(goal_distance)
 
 
 def make_metric(metric: Any, goal_distance: DistanceFn = euclidean) -> MetricFn | LearnedMetric:
@@ -314,6 +325,7 @@ def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
         log_weights,
         cross_episode=crosses if any(sampler.cross_episode for sampler in samplers) else False,
         score=score if any(sampler.score for sampler in samplers) else None,
+        measure_by=lambda distance: join([of_distance(sampler, distance) for sampler in samplers]),
     )
 
 

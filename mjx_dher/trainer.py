@@ -119,7 +119,7 @@ def make_train(
     sampler: Sampler | LogWeightsFn | None = None,
     priority: Priority | PriorityFn | None = None,
     generator: GoalsFn | None = None,
-    learner: Learner | None = None,
+    learner: Learner | str | None = None,
     axis_name: AxisName = None,
 ) -> Train:
     """Makes the training loop of an environment: pure functions to compile, and to vmap over seeds and HParams.
@@ -132,7 +132,7 @@ def make_train(
       sampler: sampler of hindsight goals, or a function like `Sampler.log_weights`. Default: `future`.
       priority: priority, for `hparams.priority_fraction` of each batch. Default: `eventful`.
       generator: generator of the goals of training episodes. Default: the reset's goals.
-      learner: the learner. Default: DDPG, made from `config`.
+      learner: the learner, or the name of a built-in one, made from `config`. Default: `ddpg`.
       axis_name: axis of the devices that share the run. They call `init` and `epoch` inside `jax.shard_map` over it with the
         same key, and average gradients and metrics. Each has its own environments, ring and batches.
 
@@ -143,7 +143,8 @@ def make_train(
     if not isinstance(config, Config):
         raise ValueError(f"config must be a Config; got {config!r}")
     validation.validate(config, HParams(), spec.episode_length)
-    learner = learners.make("ddpg", config, spec) if learner is None else learner
+    if learner is None or isinstance(learner, str):
+        learner = learners.make("ddpg" if learner is None else learner, config, spec)
     learners.check_methods(learner, learner)
     loop = Loop(
         env=env,

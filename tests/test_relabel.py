@@ -17,6 +17,7 @@ from probes import Clock
 HP = HParams()
 ENV = Clock(episode_length=12)
 CONTEXT = Context(ENV.compute_reward, HP)
+Numbered = collections.namedtuple("Numbered", (*HParams._fields, "choice"))
 
 
 @pytest.fixture(scope="module")
@@ -106,11 +107,31 @@ def test_weighted_prefers_goals_near_the_desired_one(ring):
     assert mean_distance("closest") < mean_distance("epsilon_closest") < mean_distance("weighted") < mean_distance("future")
 
 
+def test_a_sampler_measures_by_the_goal_distance_of_the_context():
+    """Achieved goals 0, 9, 2, 4 on a circle of 10: from goal 0, the 9 is at distance 1, where the line's nearest is 2."""
+    circle = lambda achieved, desired: jnp.minimum(d := jnp.abs(achieved - desired)[..., 0], 10 - d)  # noqa: E731
+    goals = jnp.array([[[0.0], [9.0], [2.0], [4.0]]])
+    ring = replay.init(Episode(goals[0], goals[0], jnp.zeros(1), jnp.zeros((3, 1))), 1)
+    ring = replay.add(ring, Episode(goals, goals, jnp.zeros((1, 1)), jnp.zeros((1, 3, 1))))
+    sample = replay.sample(ring, jax.random.key(0), 64)
+    on_line = Context(lambda achieved, desired: -(achieved - desired)[..., 0], HP._replace(her_k=jnp.inf))
+    first = np.asarray(sample.step) == 0
+    joined = samplers.join([samplers.make("closest"), samplers.make("final")])
+    for sampler, context, expected in [
+        (samplers.make("closest"), on_line, 2.0),
+        (samplers.make("closest"), on_line._replace(goal_distance=circle), 9.0),
+        (samplers.make("closest", goal_distance=circle), on_line, 9.0),
+        (samplers.make("closest", metric=samplers.position), on_line._replace(goal_distance=circle), 2.0),
+        (joined, on_line._replace(goal_distance=circle, hparams=Numbered(*on_line.hparams, 0)), 9.0),
+    ]:
+        chosen = relabel(sample, sampler, context, jax.random.key(1)).batch.desired_goal
+        assert set(np.asarray(chosen)[first].ravel()) == {expected}
+
+
 def test_one_of_several_samplers_draws_what_it_would_alone(ring):
     """Whichever a run is told to use by its number, to the bit; `random`, which looks elsewhere in the ring, too."""
     names = ("future", "random", "weighted", "closest", "final")
     together = samplers.join([samplers.make(name) for name in names])
-    Numbered = collections.namedtuple("Numbered", (*HParams._fields, "choice"))
     sample = replay.sample(ring, jax.random.key(0), 64)
     goals = set()
     for choice, name in enumerate(names):

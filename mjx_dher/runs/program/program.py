@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import config as config_lib
-from mjx_dher import context, learners, priorities, samplers, trainer, validation
 from mjx_dher import evaluate as evaluate_lib
+from mjx_dher import learners, priorities, samplers, trainer, validation
 from mjx_dher.config import HParams
 from mjx_dher.contract import check_steps, env_spec
 from mjx_dher.learners import Learner
@@ -74,11 +74,10 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     """Training loop of runs that share a program, with their components."""
     validation.check_parts(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
-    distance = context.of_env(env, spec.hparams).goal_distance
     train = trainer.make_train(
         env,
         config,
-        sampler=samplers.join([samplers.make(*choice, goal_distance=distance) for choice in choices.samplers]),
+        sampler=samplers.join([samplers.make(*choice) for choice in choices.samplers]),
         priority=priorities.join([priorities.make(name) for name in choices.priorities]),
         generator=_join_generators(choices.generators),
         learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
