@@ -152,13 +152,9 @@ def weighted(
         inverse   w = r^(-1/tau)
         softmax   w = exp(-(r - 1) / tau)
 
-    Around r = 1 they agree to first order. `inverse` almost always takes a candidate that lies on the goal. `linear` at tau =
-    1 makes no candidate more than twice as likely as one at the mean distance, and drops those beyond twice the mean.
-
-    The paper gives no formula. This default has no number to tune, and no candidate can crowd out the others. docs/samplers.md
-    compares it with the alternatives in `distance_normalization`.
-
-    If `linear` leaves no candidate with weight, the nearest is chosen, as in the limit of a small temperature.
+    `inverse` almost always takes a candidate that lies on the goal. `linear` at tau = 1 makes no candidate more than twice as
+    likely as one at the mean distance. If no candidate has a weight, the nearest is chosen. The paper gives no formula.
+    docs/samplers.md compares this default with the alternatives.
     """
     mask = future_mask(achieved.shape[0], step, length)
     distance = jnp.where(mask, distances(metric, achieved, desired), 0.0)
@@ -195,8 +191,7 @@ def make(
         desired [G]) -> distance [T+1].
       normalization: for `weighted`: mean, sum, max, minmax, none, far, "module:attribute", or a function (distance [T+1],
         candidates [T+1], scale []) -> relative distance [T+1].
-      goal_distance: distance between goals, for the metric position. Default: the environment's. `relabel` and `make_train`
-        put it in place (`Context.goal_distance`).
+      goal_distance: distance for the metric position. Default: the environment's (`Context.goal_distance`).
 
     Raises:
       ValueError: an argument is unknown or invalid. The message suggests the nearest name.
@@ -210,11 +205,11 @@ def make(
         sampler = functools.partial(weighted, kernel=kernel, normalization=normalization)
     elif sampler not in (closest, epsilon_closest):
         return _to_sampler(sampler)
-    made = _by_metric(sampler, make_metric(metric, goal_distance or euclidean))
+    by = functools.partial(_by_metric, sampler)
+    made = by(make_metric(metric, goal_distance or euclidean))
     if metric != "position" or goal_distance is not None:
         return made
-    measure_by = lambda distance: _by_metric(sampler, make_metric("position", distance))  # noqa: E731
-    return Sampler(made.log_weights, measure_by=measure_by)
+    return Sampler(made.log_weights, measure_by=lambda distance: by(make_metric("position", distance)))
 
 
 def of_distance(sampler: Sampler, goal_distance: DistanceFn) -> Sampler:
@@ -304,8 +299,7 @@ def _score(sampler: Sampler, episode: Episode, context: Context) -> Array:
 def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     """Joins samplers in one compiled program, in which the traced number `hparams.choice` selects a lane's sampler (`one_of`).
 
-    `choice` is not a field of `HParams`; `runs.program` adds it. Raises ValueError if `choices` is empty, or contains something
-    other than a sampler.
+    `choice` is no field of `HParams`; `runs.program` adds it. Raises ValueError if `choices` is empty or has no sampler.
     """
     samplers = [make(choice) for choice in choices]
     if not samplers:
