@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import State
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.starts import Range
-from mjx_dher.envs.task import MujocoTask, Position
+from mjx_dher.envs.simulated import Range, SimulatedTask
 from mjx_dher.types import Array, EnvSpec, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
@@ -73,15 +73,17 @@ class FetchTask:
         return bounds
 
 
-class FetchEnv(MujocoTask):
+class FetchEnv(SimulatedTask):
     """The Fetch arm and, except for Reach, an object. The goal is a position of the object (or of the gripper).
 
-    Arguments are as in `MujocoTask`, and the threshold is 0.05 m. Dense rewards must lie in [-1, 0], so distances must not
+    Arguments are as in `SimulatedTask`, and the threshold is 0.05 m. Dense rewards must lie in [-1, 0], so distances must not
     exceed 1 m.
     """
 
     task: ClassVar[FetchTask]
-    action_size = 4
+    action_size, goal_size = 4, 3
+    threshold = 0.05  # m
+    goal_distance = staticmethod(euclidean)
 
     def load(self) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(ASSETS / self.task.xml))
@@ -89,8 +91,6 @@ class FetchEnv(MujocoTask):
     def bind(self) -> None:
         """Looks up arm, fingers and object. These models need no probes."""
         has_object = self.task.object_height is not None
-        self.goal = Position("body:object" if has_object else "site:grip", *self.task.goal_bounds).bind(self.model)
-        self.goal_size, self.goal_distance = self.goal.size, self.goal.distance
         self.observation_size = 25 if has_object else 10
         self.arm = Chain(self.model, body="gripper", site="grip")
         qpos, qvel = np.zeros(self.model.nq, np.float32), np.zeros(self.model.nv, np.float32)
@@ -102,7 +102,6 @@ class FetchEnv(MujocoTask):
         if self.has_fingers:
             self._finger_qpos, self._finger_qvel = _joint_slices(self.model, "finger_r", width=2)
             qvel[self._finger_qvel] = self.task.finger_qvel
-        self._object = None
         if has_object:
             self._object_qpos, self._object_qvel = _joint_slices(self.model, "object", width=7)
             self._object = Range(self._object_qpos.start, self._object_qvel.start, *self.task.object_bounds)
@@ -110,6 +109,11 @@ class FetchEnv(MujocoTask):
             x, y, _ = self.task.initial_grip_pos
             qpos[self._object_qpos] = x, y + self.task.min_object_distance, self.task.object_height, 1.0, 0.0, 0.0, 0.0
         self._rest: Any = Physics(qpos, qvel, warmstart=np.zeros_like(qvel), act=np.zeros(0, np.float32))  # type: ignore[arg-type]
+
+    @property
+    def goal_bounds(self) -> np.ndarray:
+        """Lowest and highest coordinates [2, 3] of goals in m."""
+        return self.task.goal_bounds.astype(np.float32)
 
     @property
     def robot_interface(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +15,10 @@ from mjx_dher.envs.controls import rest_ctrl
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.goals import box
 from mjx_dher.envs.kinematics import FREE, HINGE, SLIDE, names_of
+from mjx_dher.envs.simulated import Range
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array, PRNGKey
 from mjx_dher.validation import check_number
-
-
-class Range(NamedTuple):
-    """Range of a free body's or a joint's start."""
-
-    qpos: int  # first index in qpos
-    qvel: int  # first index in qvel
-    low: np.ndarray  # [3] of a free body, [1] of a joint
-    high: np.ndarray
 
 
 class Start:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 import mujoco
@@ -43,6 +44,26 @@ class Engine(Protocol):
 
     def check(self) -> None:
         """Raises ValueError if earlier steps were wrong in a way that their results do not show."""
+
+
+class Unvaried:
+    """A `variation.Variation` of nothing."""
+
+    size = 0
+    fields = ()
+
+    def factors(self, given: Any, xp: Any) -> Any:
+        """No factors, [0]."""
+        return xp.ones(0, "float32")
+
+
+def variation_of(model: mujoco.MjModel, names: Sequence[str]) -> Any:
+    """`variation.Variation` of a model. Raises ValueError if it is invalid."""
+    if isinstance(names, (list, tuple)) and not names:
+        return Unvaried()
+    from mjx_dher.envs.engines.variation import Variation
+
+    return Variation(model, names)
 
 
 def check_state(model: mujoco.MjModel) -> None:

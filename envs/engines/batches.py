@@ -11,7 +11,6 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjx_dher.envs.engines.fields import LATE
-from mjx_dher.envs.engines.variation import Variation
 
 EXACT = ("time", "history")  # float64 between steps too, because a float32 time would stop advancing
 FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
@@ -28,7 +27,7 @@ class Rows:
       outputs: fields of the state that `read` returns.
       derived: other fields that it returns.
       exact: whether rows also have the digits of `EXACT` that float32 omits.
-      variation: numbers of the model that vary. Their factors end a row that goes in.
+      variation: numbers of the model that vary (`base.variation_of`). Their factors end a row that goes in.
     """
 
     def __init__(
@@ -38,7 +37,7 @@ class Rows:
         outputs: Sequence[str],
         derived: Sequence[str],
         exact: bool,
-        variation: Variation,
+        variation: Any,
     ):
         self.batch, self.seconds = batch, 0.0  # that a call takes
         self._inputs, self._outputs = _joined(batch, inputs), _joined(batch, outputs)

@@ -19,10 +19,9 @@ from flax import struct
 from mujoco.batch import Batch
 
 from mjx_dher.envs.engines import host_call
-from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes
+from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes, variation_of
 from mjx_dher.envs.engines.batches import EXACT, FULL, Choice, Rows, residue
 from mjx_dher.envs.engines.fields import LATE, derived_fields
-from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -76,8 +75,8 @@ class Simulator:
       derived: names of other fields of MjData, such as "xpos" or "sensordata", to return in `Data.derived`.
       substeps: calls of `mj_step` per step.
       num_threads: number of threads. Default: one per core.
-      varied: masses, friction, damping and gains that differ between simulations, such as "mass:box" (`Variation`). The state
-        has their factors.
+      varied: masses, friction, damping and gains that differ between simulations, such as "mass:box"
+        (`variation.Variation`). The state has their factors.
 
     Raises:
       ValueError: an argument is invalid, a field does not exist, or the model cannot be stepped in batches.
@@ -104,7 +103,7 @@ class Simulator:
         self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
         if "energy" in self._derived:
             self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-        self._num_threads, self._variation = num_threads or usable_cores(), Variation(model, varied)
+        self._num_threads, self._variation = num_threads or usable_cores(), variation_of(model, varied)
         self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived, *varied)}"
         batch = Batch(self._model, 1, 1)
         self._shapes = {name: batch.bind(name).shape[1:] for name in (*_STATE, *self._derived)}
