@@ -49,9 +49,9 @@ class Control:
         return np.zeros(self.size, np.float32)
 
     def describe(self) -> dict[str, Any]:
-        """Kind, names of the moved parts, scale and limits, as JSON."""
-        about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved)}
-        for name in ("scale", "turn", "low", "high"):
+        """Kind, names of the moved parts, numbers of the action, scale, gear and limits, as JSON."""
+        about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved), "size": self.size}
+        for name in ("scale", "turn", "gear", "low", "high"):
             if name in vars(self):
                 about[name] = np.round(np.asarray(vars(self)[name], float), 6).tolist()
         return about

@@ -48,6 +48,14 @@ class Goal:
 
     distance: Any  # (achieved [..., G], desired [..., G]) -> [...]
 
+    def describe(self) -> dict[str, Any]:
+        """Kind, site, body or joints, bounds and thresholds, as JSON."""
+        about: dict[str, Any] = {"kind": type(self).__name__, "threshold": float(self.threshold)}
+        if self.place is not None:
+            about["of"] = self.place.name
+        ends = {name: getattr(self, name) for name in ("low", "high")}
+        return about | {name: np.round(np.asarray(end, float), 6).tolist() for name, end in ends.items() if end is not None}
+
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
         """Marks that show a goal: balls, and bodies as ghosts.
 
@@ -124,6 +132,9 @@ class Rotation(Goal):
             quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * np.asarray(self.axis)])
         return quat_to_matrix(quat)[:, :2].T.ravel()
 
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | ({} if self.axis is None else {"axis": np.round(self.axis, 6).tolist()})
+
     def turned(self, goal: Array, quat: Array) -> Array:
         """The goal for which the body has the orientation `quat` [4] (w, x, y, z)."""
         assert self.place is not None
@@ -172,6 +183,10 @@ class Pose(Goal):
         position_key, rotation_key = jax.random.split(key)
         return jnp.concatenate([self.position.sample(position_key), self.rotation.sample(rotation_key)])
 
+    def describe(self) -> dict[str, Any]:
+        turn = self.rotation.describe()
+        return super().describe() | {"angle": turn["threshold"]} | {name: turn[name] for name in ("axis",) if name in turn}
+
     def turned(self, goal: Array, quat: Array) -> Array:
         """The goal at the same position for which the body has the orientation `quat` [4] (w, x, y, z)."""
         return jnp.concatenate([goal[:3], self.rotation.turned(goal[3:], quat)])
@@ -203,6 +218,7 @@ class Joints(Goal):
         bound = super().bind(model)
         names = [name if model.jnt_type[i] in (HINGE, SLIDE) else "" for i, name in enumerate(names_of(model, "joint"))]
         bound.joints = pick("joint of the goal", self.names, names)
+        bound.moved = [str(names[joint]) for joint in bound.joints]
         bound.qpos, bound.size = model.jnt_qposadr[bound.joints], len(bound.joints)
         limits = model.jnt_range[bound.joints].T.copy()
         unlimited = ~model.jnt_limited[bound.joints].astype(bool)
@@ -224,6 +240,9 @@ class Joints(Goal):
     def sample(self, key: PRNGKey) -> Array:
         return jax.random.uniform(key, (self.size,), jnp.float32, self.low, self.high)
 
+    def describe(self) -> dict[str, Any]:
+        return super().describe() | {"joints": self.moved}
+
     @staticmethod
     def distance(achieved: Array, desired: Array) -> Array:
         return jnp.max(jnp.abs(achieved - desired), axis=-1)
@@ -241,6 +260,7 @@ class Joints(Goal):
         return [(body, data.xpos[body].copy(), data.xquat[body].copy()) for body in sorted(moved)]
 
     joints: list[int]
+    moved: list[str]  # names of `joints`
     qpos: np.ndarray
 
 

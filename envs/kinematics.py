@@ -33,16 +33,17 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
-    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", in the columns' order. Raises
-    ValueError if no name matches a pattern. The message lists the names.
+    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", each once. They are in the order of the
+    patterns, and those of one pattern in the columns' order. Raises ValueError if no name matches a pattern. The message lists
+    the names.
     """
-    chosen: set[int] = set()
+    chosen: dict[int, None] = {}
     for pattern in str(patterns).split() or [""]:
         fitting = {i for names in columns for i, name in enumerate(names) if name and _fits(name, pattern)}
         if not fitting:
             check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
-        chosen |= fitting
-    return sorted(chosen)
+        chosen |= dict.fromkeys(sorted(fitting))
+    return list(chosen)
 
 
 def _fits(name: str, pattern: str) -> bool:

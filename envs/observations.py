@@ -28,7 +28,7 @@ class Entry:
         if len(set(sizes)) > 1:
             raise ValueError(f"observation {text!r} must subtract entries of equal sizes; got {sizes}")
         self.size = sizes[0]
-        self.joints = self._parts[0].joints  # names of those whose coordinates it has
+        self.names = self._parts[0].names  # of the joints or sensors whose numbers it has
         self.reads_sensors = any(part.kind == "sensor" for part in self._parts)
 
     def __call__(self, physics: Physics) -> Array:
@@ -39,18 +39,20 @@ class Entry:
 
 
 class _Part:
-    joints: Sequence[str] = ()
+    names: Sequence[str] = ()
 
     def __init__(self, model: mujoco.MjModel, text: str):
         self.kind, _, name = text.partition(":")
         check_name(f"kind of observation {text!r}", self.kind, KINDS)
         if self.kind in ("qpos", "qvel"):
             joints = pick("joint", name, names := names_of(model, "joint"))
-            self.joints = [str(names[joint]) for joint in joints]
+            self.names = [str(names[joint]) for joint in joints]
             self.index = np.concatenate([_indices(model, joint, self.kind) for joint in joints])
             self.size = len(self.index)
         elif self.kind == "sensor":
-            sensors = [model.sensor(i) for i in pick("sensor", name, names_of(model, "sensor"))]
+            chosen = pick("sensor", name, names := names_of(model, "sensor"))
+            sensors = [model.sensor(i) for i in chosen]
+            self.names = [str(names[i]) for i in chosen]
             self.index = np.concatenate([sensor.adr[0] + np.arange(sensor.dim[0]) for sensor in sensors])
             self.size = len(self.index)
         else:

@@ -97,10 +97,20 @@ class MujocoTask(SimulatedTask):
 
     @property
     def robot_interface(self) -> dict[str, Any]:
-        """Controls, observation layout and joint names of its entries as JSON, for policy files."""
-        layout = {name: [part.start, part.stop] for name, part in self.layout.items()}
-        joints = {name: entry.joints for name, entry in zip(self.layout, self._entries) if entry.joints}
-        return {"controls": [part.describe() for part in self.parts], "layout": layout, "joints": joints}
+        """Controls, goal, observation layout, and names of joints and sensors of its entries as JSON, for policy files."""
+        named = [(name, entry) for name, entry in zip(self.layout, self._entries) if entry.names]
+        return {
+            "controls": [part.describe() for part in self.parts],
+            "goal": self.goal.describe() | {"threshold": self.distance_threshold},
+            "layout": {name: [part.start, part.stop] for name, part in self.layout.items()},
+            "joints": {name: entry.names for name, entry in named if not entry.reads_sensors},
+            "sensors": {name: entry.names for name, entry in named if entry.reads_sensors},
+        }
+
+    @property
+    def observes_sensors(self) -> bool:
+        """Whether observations have sensors of the MJCF."""
+        return self._sensors is not None
 
     @property
     def goal_bounds(self) -> np.ndarray | None:

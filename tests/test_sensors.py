@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import refuses
 
+from mjx_dher.envs.robot import RobotLoop
 from mjx_dher.envs.task import MujocoTask, Position
 
 PRESS = """
@@ -62,6 +63,17 @@ def test_sensors_are_those_of_the_present_state(engine, options):
     assert data.sensordata[3] > 10.0  # N: it touches
     np.testing.assert_allclose(state.obs["observation"][1], expected(), rtol=1e-3, atol=1e-3)
     env.check()
+
+
+def test_a_robots_loop_takes_sensors():
+    env = Press(engine="native")
+    loop = RobotLoop(env, lambda obs: obs["observation"][1:2] / 100)  # the touch
+    sensors, zeros = np.zeros(env.model.nsensordata), (np.float32(env.model.qpos0), np.zeros(env.model.nv), np.zeros(3))
+    sensors[3] = 50.0
+    assert loop(*zeros, sensors).ctrl[0] == pytest.approx(-0.15 + 0.5 * 0.35)
+    with refuses("sensors", "None"):
+        loop(*zeros)
+    assert env.robot_interface["sensors"]["sensor:push where - sensor:push where"] == ["push", "where"]
 
 
 def test_a_sensor_that_is_missing_is_named():

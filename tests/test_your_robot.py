@@ -9,10 +9,14 @@ import my_arm
 import numpy as np
 import pytest
 import seven_joints
-from conftest import EXAMPLES, ROOT
+from conftest import EXAMPLES, ROOT, refuses
 
-from mjx_dher import cli
+import mjx_dher
+import point_mass
+from mjx_dher import cli, envs
 from mjx_dher.envs.kinematics import Place
+from mjx_dher.envs.robot import RobotLoop
+from mjx_dher.envs.task import JointDelta
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
 
@@ -40,13 +44,54 @@ def test_the_page_works_line_by_line(tmp_path, monkeypatch, capsys):
     assert float(re.findall(r"^success ([\d.]+)", capsys.readouterr().out, re.M)[0]) >= 0.9
     assert (tmp_path / "arm.onnx").stat().st_size > 10_000
     assert json.loads((tmp_path / "runs/arm/config.json").read_text())["interface"]["dt"] == 0.04
-    (robot,) = [block for block in re.findall(r"```python\n(.*?)```", REAL, re.S) if "def targets" in block]
-    names = {"Reach": my_arm.Reach}
+    (robot,) = [block for block in re.findall(r"```python\n(.*?)```", REAL, re.S) if "RobotLoop" in block]
+    env = my_arm.Reach()
+    state = env.reset(jax.random.key(0))
+    names = {"Reach": my_arm.Reach, "qpos": state.physics.qpos, "qvel": state.physics.qvel, "goal": state.obs["desired_goal"]}
     exec(compile(robot, "real_robot.md", "exec"), names)
-    state = names["env"].reset(jax.random.key(0))
-    ctrl = names["targets"](state.physics.qpos, state.physics.qvel, state.obs["desired_goal"])
-    action = names["policy"](jax.tree.map(np.asarray, state.obs))
-    np.testing.assert_allclose(ctrl, names["env"].controls(state.physics, jnp.asarray(action)).ctrl, atol=1e-6)
+    action = mjx_dher.load_policy("runs/arm")(jax.tree.map(np.asarray, state.obs))
+    np.testing.assert_allclose(names["targets"], env.controls(state.physics, jnp.asarray(action)).ctrl, atol=1e-6)
+
+
+def test_a_robots_loop_sends_what_the_wrapped_task_sends():
+    """Three frames and a filter: the loop's targets are those of the environment at each step, also after `start`."""
+    env = envs.make("my_arm:Reach", engine="native", action_filter=0.5, action_delay=2, frame_stack=3)
+    weights = np.random.default_rng(0).normal(size=(env.observation_size, env.action_size))
+
+    def policy(obs):
+        return np.tanh(obs["observation"] @ weights)
+
+    loop, step = RobotLoop(env, policy), jax.jit(env.step)
+    for key in range(2):
+        loop.start()
+        state, filtered = env.reset(jax.random.key(key)), np.zeros(env.action_size)
+        for _ in range(4):
+            action = policy(jax.tree.map(np.asarray, state.obs))
+            filtered = 0.5 * filtered + 0.5 * action
+            expected = loop.task.controls(state.physics, jnp.float32(filtered)).ctrl
+            found = loop(state.physics.qpos, state.physics.qvel, state.obs["desired_goal"]).ctrl
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+            state = step(state, action)
+    with refuses("qpos", [1.0] * 6):
+        loop([1.0] * 6, state.physics.qvel, state.obs["desired_goal"])
+    with refuses("goal", [np.nan] * 3):
+        loop(state.physics.qpos, state.physics.qvel, [np.nan] * 3)
+    with refuses("env", "PointMass"):
+        RobotLoop(point_mass.PointMass(), policy)
+
+
+def test_joints_have_the_order_in_which_they_are_named():
+    class Swapped(my_arm.Reach):
+        control = JointDelta("j3 j1")
+        observations = ("qpos:j3 j1",)
+
+    env = Swapped(engine="native")
+    state = env.reset(jax.random.key(0))
+    third, first = state.physics.qpos[env.model.jnt_qposadr[[env.model.joint(name).id for name in ("j3", "j1")]]]
+    assert state.obs["observation"].tolist() == [third, first]
+    ctrl = env.controls(state.physics, jnp.float32([0.5, 0])).ctrl - env.controls(state.physics, jnp.zeros(2)).ctrl
+    np.testing.assert_allclose(ctrl, [0, 0, 0.05, 0, 0, 0], atol=1e-6)
+    assert env.robot_interface["joints"]["qpos:j3 j1"] == env.robot_interface["controls"][0]["moves"] == ["j3", "j1"]
 
 
 @pytest.mark.slow

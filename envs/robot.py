@@ -1,0 +1,108 @@
+"""A policy on a robot: measurements to targets, with the task's own observation and controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.task import MujocoTask
+from mjx_dher.envs.wrappers import ActionFilter, FrameStack, Wrapper
+from mjx_dher.types import Array, PyTree
+
+
+class RobotLoop:
+    """Maps a robot's measurements to the inputs of its servos and motors, one call per step of `env.dt` s.
+
+    Stacked frames and the action filter work as in training. Noise and delay of the environment are left out, because the robot
+    has its own. The constructor compiles all, for the CPU.
+
+    Args:
+      env: a `MujocoTask`, or wrappers around one, made as in training.
+      policy: maps {"observation": [D], "desired_goal": [G]} to an action [A], such as `mjx_dher.load_policy(path)`.
+
+    Raises:
+      ValueError: it is no such environment.
+    """
+
+    def __init__(self, env: Any, policy: Callable[[Mapping[str, Any]], np.ndarray]):
+        self._wrappers: list[Wrapper] = []
+        task = env
+        while isinstance(task, Wrapper):
+            if isinstance(task, ActionFilter | FrameStack):
+                self._wrappers.insert(0, task)  # the innermost first
+            task = task.env
+        if not isinstance(task, MujocoTask):
+            raise ValueError(f"env must be a MujocoTask, or wrappers around one; got {type(task).__name__}")
+        self.task, self.policy = task, policy
+        model = task.model
+        self._sizes = {"qpos": model.nq, "qvel": model.nv, "sensors": model.nsensordata, "goal": task.goal_size}
+        self._see, self._act = jax.jit(self._observe), jax.jit(self._control)
+        zeros = {name: np.zeros(size, np.float32) for name, size in self._sizes.items()}
+        self.start()
+        for _ in range(2):  # the first step of an episode and the others are two programs
+            self(**{**zeros, "qpos": model.qpos0})
+        self.start()
+
+    def start(self) -> None:
+        """Begins an episode: forgets the frames and the filtered action."""
+        self._memory: list[PyTree] | None = None
+
+    def __call__(self, qpos: Any, qvel: Any, goal: Any, sensors: Any = None) -> Controls:
+        """Inputs for the next step.
+
+        Args:
+          qpos: positions [nq] of all joints of the model in its order, rad or m; a free body has x, y, z, and w, x, y, z.
+          qvel: velocities [nv], rad/s or m/s.
+          goal: desired goal [G].
+          sensors: sensor data [nsensordata], if the task observes sensors.
+
+        Returns:
+          `ctrl` [nu] for the actuators and `mocap` [nmocap, 7], in NumPy.
+
+        Raises:
+          ValueError: a measurement or the policy's action has another size, or is not finite.
+        """
+        measured = {"qpos": qpos, "qvel": qvel} | ({"sensors": sensors} if self.task.observes_sensors else {})
+        arrays = {name: _checked(name, value, self._sizes[name]) for name, value in measured.items()}
+        desired = _checked("goal", goal, self._sizes["goal"])
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            self._memory, physics, observation = self._see(self._memory, arrays)
+            action = self.policy({"observation": np.asarray(observation), "desired_goal": desired})
+            action = _checked("action of the policy", action, self.task.action_size)
+            self._memory, controls = self._act(self._memory, physics, action)
+        return jax.tree.map(np.asarray, controls)
+
+    def _observe(self, memory: list[PyTree] | None, measured: dict[str, Array]) -> tuple[list[PyTree], Physics, PyTree]:
+        """Memory of the wrappers, physics, and observation."""
+        model = self.task.model
+        rest = {"warmstart": jnp.zeros(model.nv), "act": jnp.zeros(model.na)}
+        physics = Physics(**rest, **measured)
+        observation = self.task.observe(physics).astype(jnp.float32)
+        following = []
+        for i, wrapper in enumerate(self._wrappers):
+            seen = wrapper.begin(jax.random.key(0), observation) if memory is None else wrapper.see(memory[i], observation)
+            own, observation = seen
+            following.append(own)
+        return following, physics, observation
+
+    def _control(self, memory: list[PyTree], physics: Physics, action: Array) -> tuple[list[PyTree], Controls]:
+        """Memory of the wrappers, and inputs of the engine."""
+        action = jnp.clip(action, -1.0, 1.0)
+        following: list[PyTree] = []
+        for i, wrapper in reversed(list(enumerate(self._wrappers))):
+            own, action = wrapper.act(memory[i], action)
+            following.insert(0, own)
+        return following, self.task.controls(physics, action)
+
+
+def _checked(name: str, value: Any, size: int) -> np.ndarray:
+    """The value as float32 [size]. Raises ValueError if it has another size or is not finite."""
+    array = np.asarray(value, np.float32)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {size} finite numbers; got {value}")
+    return array
