@@ -41,6 +41,7 @@ class RobotLoop:
         self.task, self.policy = task, policy
         model = task.model
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "sensors": model.nsensordata, "goal": task.goal_size}
+        self._senses = bool(task.robot_interface.get("sensors"))
         self._see, self._act = jax.jit(self._observe), jax.jit(self._control)
         zeros = {name: np.zeros(size, np.float32) for name, size in self._sizes.items()}
         self.start()
@@ -67,7 +68,7 @@ class RobotLoop:
         Raises:
           ValueError: a measurement or the policy's action has another size, or is not finite.
         """
-        measured = {"qpos": qpos, "qvel": qvel} | ({"sensors": sensors} if self.task.observes_sensors else {})
+        measured = {"qpos": qpos, "qvel": qvel} | ({"sensors": sensors} if self._senses else {})
         arrays = {name: _checked(name, value, self._sizes[name]) for name, value in measured.items()}
         desired = _checked("goal", goal, self._sizes["goal"])
         with jax.default_device(jax.local_devices(backend="cpu")[0]):

@@ -108,11 +108,6 @@ class MujocoTask(SimulatedTask):
         }
 
     @property
-    def observes_sensors(self) -> bool:
-        """Whether observations have sensors of the MJCF."""
-        return self._sensors is not None
-
-    @property
     def goal_bounds(self) -> np.ndarray | None:
         """Lowest and highest coordinates [2, 3] of goals in m, if they are positions."""
         return None if self.goal.low is None or self.goal.place is None else np.stack([self.goal.low, self.goal.high])
