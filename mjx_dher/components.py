@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import importlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mjx_dher.lookup import check_function, check_name, load_import_path
+from mjx_dher.lookup import check_function, check_name
 
 
 class Component(NamedTuple):
@@ -69,35 +70,31 @@ COMPONENTS: dict[str, dict[str, Component]] = {
         "final": Component("mjx_dher.samplers:final", "the last goal of the episode"),
         "geometric": Component("mjx_dher.samplers:geometric", "goals after the step, those t steps later with weight gamma^t"),
         "closest": Component(
-            "mjx_dher.samplers:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
+            "mjx_dher.by_distance:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
         ),
         "epsilon_closest": Component(
-            "mjx_dher.samplers:epsilon_closest",
+            "mjx_dher.by_distance:epsilon_closest",
             "any future goal with probability epsilon, else the closest (method 2)",
             (*_BY_METRIC, "epsilon"),
         ),
-        "weighted": Component("mjx_dher.samplers:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
+        "weighted": Component("mjx_dher.by_distance:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
         "next_future": Component(
             "mjx_dher.contrib.goals:next_future",
             "the next goal with probability 1/her_k, else any future one (Next-Future)",
         ),
     },
     "weight_kernel": {
-        "linear": Component("mjx_dher.distance_normalization:linear", "weights fall linearly with distance"),
-        "inverse": Component("mjx_dher.distance_normalization:inverse", "weights fall as a power of distance"),
-        "softmax": Component("mjx_dher.distance_normalization:softmax", "weights fall exponentially with distance"),
+        "linear": Component("mjx_dher.by_distance:linear", "weights fall linearly with distance"),
+        "inverse": Component("mjx_dher.by_distance:inverse", "weights fall as a power of distance"),
+        "softmax": Component("mjx_dher.by_distance:softmax", "weights fall exponentially with distance"),
     },
     "weight_normalization": {
-        "mean": Component("mjx_dher.distance_normalization:by_mean", "distances relative to their mean"),
-        "sum": Component("mjx_dher.distance_normalization:by_sum", "distances relative to their sum: nearly future"),
-        "max": Component("mjx_dher.distance_normalization:by_max", "distances relative to the largest"),
-        "minmax": Component(
-            "mjx_dher.distance_normalization:by_range", "distances from the smallest to the largest, as 0 to 1"
-        ),
-        "none": Component(
-            "mjx_dher.distance_normalization:by_scale", "distances relative to weight_scale, in metres", ("weight_scale",)
-        ),
-        "far": Component("mjx_dher.distance_normalization:mirrored", "mean, mirrored: farther goals likelier"),
+        "mean": Component("mjx_dher.by_distance:by_mean", "distances relative to their mean"),
+        "sum": Component("mjx_dher.by_distance:by_sum", "distances relative to their sum: nearly future"),
+        "max": Component("mjx_dher.by_distance:by_max", "distances relative to the largest"),
+        "minmax": Component("mjx_dher.by_distance:by_range", "distances from the smallest to the largest, as 0 to 1"),
+        "none": Component("mjx_dher.by_distance:by_scale", "distances relative to weight_scale, in metres", ("weight_scale",)),
+        "far": Component("mjx_dher.by_distance:mirrored", "mean, mirrored: farther goals likelier"),
     },
     "metric": {
         "position": Component("mjx_dher.samplers:position", "Euclidean distance between goals"),
@@ -220,7 +217,13 @@ def load(field: str, value: Any, *parameters: str) -> Any:
     if isinstance(value, str):
         table = COMPONENTS[field]
         check_name(field, value, table, custom=True)
-        value = load_import_path(field, table[value].path if value in table else value)
+        if value in table:
+            module, _, attribute = table[value].path.partition(":")
+            value = getattr(importlib.import_module(module), attribute)
+        else:
+            from mjx_dher import import_paths
+
+            value = import_paths.load(field, value)
     return check_function(field, value, parameters) if parameters else value
 
 

@@ -1,4 +1,4 @@
-"""Names from users: checks with suggestions, import paths "module:attribute", and packages of optional extras.
+"""Names from users: checks with suggestions, and packages of optional extras. `import_paths` has "module:attribute".
 
 Loads neither JAX nor MuJoCo.
 """
@@ -6,43 +6,16 @@ Loads neither JAX nor MuJoCo.
 from __future__ import annotations
 
 import difflib
-import functools
-import importlib
 import importlib.util
 import inspect
-import pkgutil
 import sys
-import traceback
 from collections.abc import Callable, Iterable, Sequence
-from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import trust
-
-# Modules without components: the standard library, and the libraries that this one uses.
-NO_COMPONENTS = frozenset(
-    {
-        *sys.stdlib_module_names,
-        *(
-            "etils",
-            "filelock",
-            "flax",
-            "jax",
-            "jaxlib",
-            "ml_dtypes",
-            "mujoco",
-            "numpy",
-            "optax",
-            "orbax",
-            "ray",
-            "rich",
-            "scipy",
-        ),
-        *("setuptools", "tyro", "viser", "warp"),
-    }
-)
-current_folder = False  # whether to search the current folder for components, as commands do
+# Of the command that runs.
+current_folder = False  # whether to search the current folder for components
+trusts_files = False  # --trust (`trust`)
 
 
 def command_name() -> str:
@@ -61,68 +34,19 @@ def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = Fa
     if value in allowed:
         return
     if custom and is_import_path(value):
-        _check_import_path(field, value)
+        from mjx_dher import import_paths
+
+        import_paths.check(field, value)
         return
     rest = ", or module:attribute" if custom else ""
     raise ValueError(
-        f"{field} must be one of {', '.join(allowed) or '(there is none)'}{rest}; got {value!r}{_hint(str(value), allowed)}"
+        f"{field} must be one of {', '.join(allowed) or '(there is none)'}{rest}; got {value!r}{hint(str(value), allowed)}"
     )
 
 
 def is_import_path(name: str) -> bool:
     """Whether a name is "module:attribute" and not a built-in name."""
     return ":" in str(name)
-
-
-def load_import_path(field: str, value: str) -> Any:
-    """Imports "module:attribute". Raises ValueError if the module or attribute does not exist (the message suggests the
-    nearest) or belongs to another library, the name comes from a file that is not trusted, or the import raises an error.
-    """
-    _check_import_path(field, value)
-    trust.check(field, value, module_file(value))
-    name, attribute = value.split(":")
-    top = name.partition(".")[0]
-    if top not in sys.modules and importlib.util.find_spec(top) is None:  # then it is in the current folder
-        sys.path.append("")
-    try:
-        module = importlib.import_module(name)
-    except Exception as error:
-        missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None and f"{name}.".startswith(f"{missing}."):  # else the module itself imports a missing one
-            raise _no_module(field, value, missing) from None
-        frames = traceback.extract_tb(error.__traceback__)
-        place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-        raise ValueError(f"{field} {value!r}: importing it failed: {type(error).__name__}: {error}{place}") from error
-    if not hasattr(module, attribute):
-        hint = _hint(attribute, [name for name in dir(module) if not name.startswith("_")])
-        raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{hint}")
-    component = getattr(module, attribute)
-    made_by = component.func if isinstance(component, functools.partial) else component
-    if inspect.isclass(made_by) or inspect.isroutine(made_by):  # and not an instance of a library's class
-        _check_origin(field, value, str(inspect.unwrap(made_by).__module__))
-    return component
-
-
-def find_module(top: str) -> ModuleSpec | None:
-    """Finds a top-level module on Python's path, or in the current folder, without importing it.
-
-    The current folder joins the path only after the user has used a component from it. Otherwise JAX would import plugins, and
-    this library optional packages, from a folder that someone else may have made.
-    """
-    spec = importlib.util.find_spec(top)
-    return PathFinder.find_spec(top, [""]) if spec is None and current_folder else spec
-
-
-def module_file(value: str) -> Path | None:
-    """File of the module in "module:attribute", or None if it does not exist. Imports neither it nor its packages."""
-    top, *rest = value.partition(":")[0].split(".")
-    try:
-        spec = find_module(top)
-        for name in rest:
-            spec = PathFinder.find_spec(name, list(spec.submodule_search_locations or ())) if spec else None
-    except (ValueError, ImportError):  # __main__ has no spec, for example
-        return None
-    return Path(spec.origin) if spec is not None and spec.origin and Path(spec.origin).is_file() else None
 
 
 def check_function(field: str, function: Any, parameters: Sequence[str]) -> Callable[..., Any]:
@@ -145,30 +69,7 @@ def missing_extra(feature: str, package: str, extra: str) -> str:
     return f'{feature} needs {package}, which the extra "{extra}" installs: pip install -e ".[{extra}]"'
 
 
-def _check_import_path(field: str, value: str) -> None:
-    name, _, attribute = value.partition(":")
-    if not all(part.isidentifier() for part in (*name.split("."), attribute)):
-        raise ValueError(f"{field} must be module:attribute, with the module's name as in `import`; got {value!r}")
-    _check_origin(field, value, name)
-    top = name.partition(".")[0]
-    if top not in sys.modules and find_module(top) is None:
-        raise _no_module(field, value, top)
-
-
-def _check_origin(field: str, value: str, module: str) -> None:
-    if module.partition(".")[0] in NO_COMPONENTS:
-        raise ValueError(f"{field} must be a component; {value!r} is from {module}, which has none")
-
-
-def _no_module(field: str, value: str, missing: str) -> ValueError:
-    """Error for `missing`, the shortest prefix of a module's name that does not exist."""
-    parent = missing.rpartition(".")[0]
-    paths = getattr(sys.modules[parent], "__path__", ()) if parent else [".", *sys.path]
-    modules = [parent, *(f"{parent}.{module.name}".lstrip(".") for module in pkgutil.iter_modules(paths))]
-    place = f"in {parent}" if parent else "in the current folder or on Python's path"
-    return ValueError(f"{field} {value!r}: there is no module {missing!r} {place}{_hint(missing, modules, cutoff=0.75)}")
-
-
-def _hint(value: str, allowed: Iterable[str], cutoff: float = 0.5) -> str:
+def hint(value: str, allowed: Iterable[str], cutoff: float = 0.5) -> str:
+    """Text that suggests the nearest allowed names, "" if none is near."""
     nearest = difflib.get_close_matches(value, allowed, n=2, cutoff=cutoff)
     return f" (did you mean {' or '.join(map(repr, nearest))}?)" if nearest else ""

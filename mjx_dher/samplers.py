@@ -22,10 +22,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_dher import check, components, distance_normalization, lookup
+from mjx_dher import check, components, lookup
 from mjx_dher.config import HParams
 from mjx_dher.context import Context, euclidean, of_each_episode, one_of
-from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.types import Array, DistanceFn, Episode, PRNGKey
 
 # log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; with a score, (..., hparams, score [T+1])
@@ -34,6 +33,8 @@ LogWeightsFn = Callable[..., Array]
 MetricFn = Callable[[Array, Array], Array]
 # kernel(relative distance [T+1], temperature []) -> log weight [T+1]
 KernelFn = Callable[[Array, Array | float], Array]
+# normalization(distance [T+1], candidates [T+1] bool, scale [] in metres) -> relative distance [T+1]
+NormalizationFn = Callable[[Array, Array, Array | float], Array]
 # score(episode, context) -> [T+1]
 ScoreFn = Callable[[Episode, Context], Array]
 
@@ -69,7 +70,8 @@ def future_mask(num_goals: int, step: Array, length: Array | None = None) -> Arr
     return index > step if length is None else (index > step) & (index <= length)
 
 
-def _uniform(mask: Array) -> Array:
+def uniform(mask: Array) -> Array:
+    """Log weights [T+1] of equally likely goals."""
     return jnp.where(mask, 0.0, -jnp.inf)
 
 
@@ -77,12 +79,6 @@ def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> A
     """Any goal of the episode, uniformly."""
     del desired, step, hparams
     return jnp.zeros(achieved.shape[0])
-
-
-def distances(metric: MetricFn, achieved: Array, desired: Array) -> Array:
-    """Distances [T+1] between `achieved` [T+1, G] and `desired` [G]. A negative one becomes NaN, so that no goal is offered."""
-    distance = measure(metric, achieved, desired)
-    return distance if metric is position else jnp.where(distance >= 0, distance, jnp.nan)
 
 
 def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
@@ -93,81 +89,20 @@ def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """Any goal after the step, uniformly (Andrychowicz et al. 2017, the paper's baseline). See `weigh` for the arguments."""
     del desired, hparams
-    return _uniform(future_mask(achieved.shape[0], step, length))
+    return uniform(future_mask(achieved.shape[0], step, length))
 
 
 def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """The last goal of the episode."""
     del desired, step, hparams
     last = achieved.shape[0] - 1 if length is None else length
-    return _uniform(jnp.arange(achieved.shape[0]) == last)
+    return uniform(jnp.arange(achieved.shape[0]) == last)
 
 
 def geometric(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """Weighs the goal t steps later by gamma^t: then a contrastive critic estimates discounted occupancy (Eysenbach 2022)."""
     later = jnp.maximum(jnp.arange(achieved.shape[0]) - step, 0).astype(jnp.float32)
     return future(achieved, desired, step, hparams, length) + later * jnp.log(jnp.maximum(hparams.gamma, 1e-30))
-
-
-def closest(
-    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
-) -> Array:
-    """The future goal nearest to the desired one (the paper's method 1). Equally near goals are equally likely."""
-    del hparams
-    mask = future_mask(achieved.shape[0], step, length)
-    distance = jnp.where(mask, distances(metric, achieved, desired), jnp.inf)
-    return _uniform(distance == jnp.min(distance))
-
-
-def epsilon_closest(
-    achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
-) -> Array:
-    """Any future goal with probability `epsilon`, else the closest (the paper's method 2)."""
-    any_future = jax.nn.softmax(future(achieved, desired, step, hparams, length))
-    nearest = jax.nn.softmax(closest(achieved, desired, step, hparams, metric, length))
-    return jnp.log(hparams.epsilon * any_future + (1.0 - hparams.epsilon) * nearest)
-
-
-def weighted(
-    achieved: Array,
-    desired: Array,
-    step: Array,
-    hparams: HParams,
-    kernel: KernelFn,
-    metric: MetricFn = position,
-    normalization: NormalizationFn = distance_normalization.by_mean,
-    length: Array | None = None,
-) -> Array:
-    """Future goals, weighted by nearness to the desired goal (the paper's method 3).
-
-    The weight depends on the relative distance r. `normalization` computes r from the distances d = metric(achieved, desired)
-    of all goals after the step. By default
-
-        r_i = d_i / mean_j d_j,
-
-    so weights do not depend on the scale of the task, and equal distances (r_i = 1) give exactly `future`. The kernels at
-    temperature tau are
-
-        linear    w = max(1 - (r - 1) / tau, 0)    at tau = 1: 2 - r, from 2 at the goal to 0 at twice the mean distance
-        inverse   w = r^(-1/tau)
-        softmax   w = exp(-(r - 1) / tau)
-
-    `inverse` almost always takes a candidate that lies on the goal. `linear` at tau = 1 makes no candidate more than twice as
-    likely as one at the mean distance. If no candidate has a weight, the nearest is chosen. The paper gives no formula.
-    docs/samplers.md compares this default with the alternatives.
-    """
-    mask = future_mask(achieved.shape[0], step, length)
-    distance = jnp.where(mask, distances(metric, achieved, desired), 0.0)
-    relative = normalization(distance, mask, hparams.weight_scale)
-    relative = check.array("normalization: relative distances [T+1]", relative, mask.shape)
-    log_weights = check.array("kernel: log weights [T+1]", kernel(relative, hparams.temperature), mask.shape)
-    log_weights = jnp.where(mask, log_weights, -jnp.inf)
-    always = (distance_normalization.by_mean, distance_normalization.mirrored)  # some candidate always has weight (r <= 1)
-    if kernel is not distance_normalization.linear or normalization in always:
-        return log_weights
-    beyond = jnp.all(log_weights == -jnp.inf)
-    relative = jnp.where(mask, relative, jnp.inf)
-    return jnp.where(beyond, _uniform(relative == jnp.min(relative)), log_weights)
 
 
 random = Sampler(episode, cross_episode=True)
@@ -198,13 +133,14 @@ def make(
     """
     if not isinstance(name, str):
         return _to_sampler(name)
-    sampler = components.load("sampler", name)
-    kernel = components.load("weight_kernel", kernel, "relative", "temperature")
-    normalization = components.load("weight_normalization", normalization, "distance", "candidates", "scale")
-    if sampler is weighted:
-        sampler = functools.partial(weighted, kernel=kernel, normalization=normalization)
-    elif sampler not in (closest, epsilon_closest):
+    sampler, row = components.load("sampler", name), components.COMPONENTS["sampler"].get(name)
+    if (weighs := row is not None and "weight_kernel" in row.reads) or (kernel, normalization) != ("linear", "mean"):
+        kernel = components.load("weight_kernel", kernel, "relative", "temperature")
+        normalization = components.load("weight_normalization", normalization, "distance", "candidates", "scale")
+    if row is None or "metric" not in row.reads:
         return _to_sampler(sampler)
+    if weighs:
+        sampler = functools.partial(sampler, kernel=kernel, normalization=normalization)
     by = functools.partial(_by_metric, sampler)
     made = by(make_metric(metric, goal_distance or euclidean))
     if metric != "position" or goal_distance is not None:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from typing_extensions import Doc
 
-from mjx_dher import trust, validation
+from mjx_dher import validation
 from mjx_dher.components import COMPONENTS, help_text
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name, is_import_path
@@ -170,6 +170,8 @@ def find_demonstrations(source: str) -> Path:
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
     for path in (Path(source), root / source):
         if (source.endswith(".npz") and path.is_file()) or (source and (path / "data").is_dir()):
+            from mjx_dher import trust
+
             trust.check("demonstrations", source, path)
             return path
     raise ValueError(f"demonstrations must be an .npz file, or the folder or name of a Minari data set; got {source!r}")

@@ -13,7 +13,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-everything = False  # --trust of the command that runs
+from mjx_dher import lookup
 
 
 class FromFile(str):
@@ -41,7 +41,7 @@ def check(field: str, name: str, place: Path | None) -> None:
     Raises:
       ValueError: the name comes from a file, and the user has neither trained with it nor passed `--trust`.
     """
-    if everything or not isinstance(name, FromFile):
+    if lookup.trusts_files or not isinstance(name, FromFile):
         return
     try:
         if _record(field, name, place, name.arguments).exists():

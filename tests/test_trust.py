@@ -16,7 +16,7 @@ from conftest import refuses
 from rich.table import Table
 
 import mjx_dher
-from mjx_dher import RunSpec, cli, envs, lookup, trust
+from mjx_dher import RunSpec, cli, envs, import_paths, trust
 from mjx_dher.cli import train
 from mjx_dher.cli.output import PlainConsole, printable
 from mjx_dher.components import COMPONENTS
@@ -154,7 +154,7 @@ def test_the_same_name_with_other_arguments_or_of_another_file_is_not_trusted(he
     monkeypatch.delitem(sys.modules, "point_mass")
     spec = run_folder.read_spec(here / "received")
     with refuses("env", "point_mass:PointMass", here / "point_mass.py"):
-        lookup.load_import_path("env", spec.env)
+        import_paths.load("env", spec.env)
 
 
 def test_the_current_folder_is_on_the_path_only_for_a_component_from_there(received, here, monkeypatch):
@@ -212,7 +212,7 @@ def test_modules_without_components_are_no_source_of_one(value):
         with refuses(field, value):
             validate(RunSpec(**{field: value}))
         with refuses(field, value):
-            lookup.load_import_path(field, value)
+            import_paths.load(field, value)
 
 
 def test_an_argument_can_have_any_name(here):

@@ -8,7 +8,7 @@ import gc
 import sys
 from collections.abc import Sequence
 
-from mjx_dher import __version__, lookup, trust
+from mjx_dher import __version__, lookup
 from mjx_dher.cli import output
 from mjx_dher.cli.commands import COMMANDS, run
 from mjx_dher.system import signals
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except SystemExit as error:  # from --help, or invalid arguments
             ended, trains = error.code if isinstance(error.code, int) else 1, False
         finally:
-            trust.everything = False
+            lookup.trusts_files = False
         stream.flush()
     return output.status(stream, ended, trains)
 

@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
-from mjx_dher import trust
-from mjx_dher.lookup import command_name
+from mjx_dher import lookup
 
 Args = TypeVar("Args")
 
@@ -85,7 +84,7 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
             name, comma, rest = FOREIGN_FLAGS[flag].partition(",")
             raise ValueError(f"{flag} is called {name} here{comma}{rest}")
     command = kind.__name__.removesuffix("Args").lower()
-    prog = command_name() + ("" if command == "train" else f" {command}")
+    prog = lookup.command_name() + ("" if command == "train" else f" {command}")
     args = tyro.cli(kind, prog=prog, args=argv, **options)
-    trust.everything = getattr(args, "trust", False)
+    lookup.trusts_files = getattr(args, "trust", False)
     return args

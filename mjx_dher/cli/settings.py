@@ -15,7 +15,6 @@ from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
-from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
@@ -63,7 +62,7 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
 
 def without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
     """Run with the values of `base` for settings that its components do not read, and lines about ignored settings."""
-    kept = grid.with_unread_of(base, run)
+    kept = fingerprint.with_unread_of(base, run)
     old, new = fingerprint.settings(kept), fingerprint.settings(run)
     ignored = [f"{name} {text(new[name])}" for name in new if new[name] != old[name]]
     return kept, [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []

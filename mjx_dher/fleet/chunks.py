@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from mjx_dher import __version__, lookup
+from mjx_dher import __version__, import_paths
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, custom_components
@@ -139,7 +139,7 @@ def custom_code(specs: Sequence[RunSpec]) -> Path | None:
     for spec in specs:
         for field in custom_components(spec):
             value = str(getattr(spec, field))
-            module = lookup.find_module(value.partition(":")[0].partition(".")[0])
+            module = import_paths.find_module(value.partition(":")[0].partition(".")[0])
             if module is not None:
                 place = Path([*(module.submodule_search_locations or ()), module.origin or ""][0]).absolute()
                 if not {"site-packages", "dist-packages"} & set(place.parts):

@@ -7,14 +7,11 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_dher.components import reads
-from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 
 CELLS = "cells"
-_SIZES = tuple(field.name for field in dataclasses.fields(Config))
 
 
 def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
@@ -26,7 +23,7 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
     first: dict[str, RunSpec] = {}
     for spec in specs:
         base = first.setdefault(spec.env, spec)
-        settings[dataclasses.replace(with_unread_of(base, spec), seed=0)] = None
+        settings[dataclasses.replace(fingerprint.with_unread_of(base, spec), seed=0)] = None
     grouped = itertools.groupby(settings, key=lambda spec: spec.env)
     return [
         dataclasses.replace(spec, seed=seed)
@@ -34,17 +31,6 @@ def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
         for seed in seeds
         for spec in group
     ]
-
-
-def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
-    """Copy of `spec` in which settings that its sampler and learner do not read come from `base`."""
-    settings = fingerprint.settings(spec)
-    unread = [name for name in settings if not reads(settings, name)]
-    numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
-    sizes = {name: getattr(base.config, name) for name in unread if name in _SIZES}
-    parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}
-    config, hparams = dataclasses.replace(spec.config, **sizes), spec.hparams._replace(**numbers)
-    return dataclasses.replace(spec, config=config, hparams=hparams, **parts)
 
 
 def by_program(specs: Sequence[RunSpec]) -> list[list[RunSpec]]:

@@ -22,13 +22,12 @@ from mjx_dher.config import HParams
 from mjx_dher.contract import check_with_goal, env_spec
 from mjx_dher.contrib import generators
 from mjx_dher.contrib.generators import GenerateFn, Generator
-from mjx_dher.distance_normalization import NormalizationFn
 from mjx_dher.learners import Learner
 from mjx_dher.lookup import is_import_path
 from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, PriorityFn
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, Sampler
+from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, NormalizationFn, Sampler
 from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import stats
+from mjx_dher.rates import wilson_interval
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
@@ -105,7 +105,7 @@ def draw_curve(curve: Curve) -> Any:
 def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
     """Draws the success of evaluation, exploration, final evaluation and resets."""
     rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
-    bounds = [stats.wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
+    bounds = [wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
     low, high = np.reshape(bounds, (-1, 2)).T
     axis.fill_between(steps, low, high, color="#000000", alpha=0.13, linewidth=0)
     marker = "." if len(steps) == 1 else ""

@@ -29,7 +29,7 @@ from mjx_dher.runs.folder.run_folder import (
     epoch_of,
     read_manifest,
 )
-from mjx_dher.system import files, private_api
+from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 
 _STATE = "state"
@@ -302,6 +302,8 @@ def _read_arrays(path: Path, dtypes: Sequence[str]) -> list[np.ndarray]:
     names = [f"{index:04d}" for index in range(len(dtypes))]
     try:
         if not any(path.glob("*.npy")):  # from a version that used orbax
+            from mjx_dher.system import private_api
+
             with private_api.array_checkpointer() as checkpointer:
                 arrays = checkpointer.restore(path.absolute())
             return [np.asarray(arrays[name]) for name in names]

@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import lookup
 from mjx_dher.components import reads
 from mjx_dher.config import Config, HParams
 from mjx_dher.spec import RunSpec, custom_components, find_demonstrations
@@ -51,6 +50,17 @@ def settings(spec: RunSpec) -> dict[str, Any]:
     }
 
 
+def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
+    """Copy of `spec` in which settings that its sampler and learner do not read come from `base`."""
+    values = settings(spec)
+    unread = [name for name in values if not reads(values, name)]
+    numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
+    sizes = {name: getattr(base.config, name) for name in unread if hasattr(base.config, name)}
+    parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}
+    config, hparams = dataclasses.replace(spec.config, **sizes), spec.hparams._replace(**numbers)
+    return dataclasses.replace(spec, config=config, hparams=hparams, **parts)
+
+
 def groups(spec: RunSpec) -> dict[str, dict[str, Any]]:
     """Settings that a run reads, and its seed, in the groups run, sizes and numbers."""
     values = {**settings(spec), "seed": spec.seed}
@@ -80,7 +90,9 @@ def sources(spec: RunSpec) -> dict[str, str]:
 
 @functools.cache
 def _source(import_path: str) -> str | None:
-    file = lookup.module_file(import_path)
+    from mjx_dher.import_paths import module_file
+
+    file = module_file(import_path)
     if file is None:
         return None
     code = file.read_bytes()

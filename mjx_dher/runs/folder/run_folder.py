@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher import __version__, lookup, trust
+from mjx_dher import __version__, lookup
 from mjx_dher import spec as spec_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.runs.folder import contents, fingerprint
@@ -104,8 +104,14 @@ def write_config(
 
 def record_names(spec: RunSpec) -> None:
     """Records the custom components and demonstrations of a run that the user trains (`trust`)."""
-    for field, name in spec_lib.custom_components(spec).items():
-        trust.record(field, name, lookup.module_file(name), spec.env_kwargs if field == "env" else ())
+    custom = spec_lib.custom_components(spec)
+    if not custom and spec.demonstrations is None:
+        return
+    from mjx_dher import trust
+    from mjx_dher.import_paths import module_file
+
+    for field, name in custom.items():
+        trust.record(field, name, module_file(name), spec.env_kwargs if field == "env" else ())
     if spec.demonstrations is not None:
         trust.record("demonstrations", spec.demonstrations, spec_lib.find_demonstrations(spec.demonstrations))
 
@@ -333,6 +339,8 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
         spec_lib.validate_values(spec)
     if trusted:
         return spec
+    from mjx_dher import trust
+
     names = {**spec_lib.custom_components(spec), "demonstrations": spec.demonstrations}
     marked: dict[str, Any] = {
         field: trust.FromFile.of(name, file, spec.env_kwargs if field == "env" else ()) for field, name in names.items() if name
