@@ -77,7 +77,8 @@ def parse(
     try:
         if not args.plan:
             check_writable(args.out)
-        args.known = {run.name: run for path in args.runs for run in load(path, experiment)}
+        former = {arm.name for arm in experiment.arms if arm.former}  # their settings have another meaning today
+        args.known = {run.name: run for path in args.runs for run in load(path, experiment) if run.arm not in former}
     except files.FolderError as error:
         parser.error(str(error))
     return args

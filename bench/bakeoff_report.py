@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from bakeoff_arms import Arm
 from numpy.typing import NDArray
+from scipy.stats import t
 
 from mjx_dher import stats
 
@@ -29,7 +30,7 @@ class Scores(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Comparison of an arm with the baseline, for a learner and task. Differences are paired by seed; intervals are at 95 %."""
+    """Comparison of an arm with the baseline, for a learner and task. Differences are paired by seed, intervals at 95 %."""
 
     learner: str
     task: str
@@ -104,12 +105,12 @@ def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: in
     if own is not base and len(common) > 1:
         mine, theirs = ([scores.seeds.index(seed) for seed in common] for scores in (own, base))
         difference = own.area[mine] - base.area[theirs]
-        low, high = stats.bootstrap_interval(difference, np.mean)
+        half = float(t.ppf(0.975, len(common) - 1) * difference.std(ddof=1) / math.sqrt(len(common)))
         better_low, better_high = stats.improvement_interval(own.area, base.area)
         paired = {
             "difference": float(difference.mean()),
-            "low": low,
-            "high": high,
+            "low": float(difference.mean()) - half,
+            "high": float(difference.mean()) + half,
             "final_difference": float((own.final[mine] - base.final[theirs]).mean()),
             "better": stats.probability_of_improvement(own.area, base.area),
             "better_low": better_low,

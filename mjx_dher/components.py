@@ -117,6 +117,9 @@ COMPONENTS: dict[str, dict[str, Component]] = {
             "episodes",
         ),
         "energy": Component("mjx_dher.priorities:energy", "episodes by the energy given to the object (EBP)", (), "episodes"),
+        "energy_clipped": Component(
+            "mjx_dher.priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg", (), "episodes"
+        ),
         "max_entropy": Component(
             "mjx_dher.contrib.episodes:max_entropy",
             "episodes by how rare their achieved goals are in the ring (MEP)",

@@ -49,6 +49,7 @@ class Context(NamedTuple):
     dt: float = STEP_SECONDS  # seconds per step
     progress: Array | float = 0.0  # [] fraction of the run's updates made so far
     values: Values | None = None  # None unless the method has `uses_values`
+    updates: Array | float = 0.0  # [] number of the run's updates made so far
 
     def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:
         """Whether goals [..., G] are reached, bool [...]: by the environment's `reached`, or by a reward at its maximum."""

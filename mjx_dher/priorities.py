@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -189,10 +190,10 @@ def _choose(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, numb
     return check.array("priority: indices [B] of choose", indices, (number,), jnp.integer).astype(jnp.int32)
 
 
-def energy(episode: Episode, context: Context) -> Array:
+def energy(episode: Episode, context: Context, most: float = math.inf) -> Array:
     """Energy given to the object in an episode, in J per kg (Zhao & Tresp 2018, "EBP").
 
-    sum_t max(E_t - E_(t-1), 0),  E_t = g (z_t - z_0) + |v_t|^2 / 2,  E_0 = 0
+    sum_t min(max(E_t - E_(t-1), 0), most),  E_t = g (z_t - z_0) + |v_t|^2 / 2,  E_0 = 0
 
     where v_t are differences of achieved goals. Energy losses do not count, nor does rotation, which positions do not show. A
     goal of fewer than three coordinates has no height.
@@ -201,7 +202,11 @@ def energy(episode: Episode, context: Context) -> Array:
     kinetic = 0.5 * jnp.sum(jnp.square(displacements(achieved) / context.dt), axis=-1)
     potential = GRAVITY * (achieved[:, 2] - achieved[0, 2]) if achieved.shape[-1] > 2 else jnp.zeros_like(kinetic)
     total = potential + kinetic
-    return jnp.sum(jnp.maximum(total[1:] - total[:-1], 0.0))
+    return jnp.sum(jnp.clip(total[1:] - total[:-1], 0.0, most))
+
+
+# With the clip of the authors' runs on PickAndPlace, in J per kg and step.
+energy_clipped = functools.partial(energy, most=0.5)
 
 
 def displacements(achieved: Array) -> Array:

@@ -221,14 +221,13 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
     noise = loop.learner.noise(noise_key, env.episode_length, config.num_envs, hparams)
     learners.check_noise(noise, env.episode_length, config.num_envs)
-    updates = config_lib.num_updates(config, loop.spec.episode_length)
-    progress = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle / updates
-    before = _context(loop, state.learner, hparams, progress)
+    updates = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle
+    before = _context(loop, state.learner, hparams, updates)
     episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, _goals(loop, state, before))
     weights = priorities.weights(loop.priority, episodes, before)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
     learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
-    context = _context(loop, learner, anneal(hparams, progress), progress)
+    context = _context(loop, learner, anneal(hparams, before.progress), updates)
     ring = priorities.renew(loop.priority, ring, context, _rows_to_renew(loop, state, ring))
     learned, losses = _learn(loop, learner, ring, context, learn_key)
     # While the ring is empty, nothing is learned.
@@ -249,9 +248,10 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     return TrainState(learner=learner, replay=ring, hparams=hparams, key=key, env_steps=env_steps), metrics
 
 
-def _context(loop: Loop, learner: PyTree, hparams: HParams, progress: Array) -> Context:
+def _context(loop: Loop, learner: PyTree, hparams: HParams, updates: Array) -> Context:
+    progress = updates / config_lib.num_updates(loop.config, loop.spec.episode_length)
     values = learners.values_of(loop.learner, learner, hparams) if loop.uses_values else None
-    return context_lib.of_env(loop.env, hparams, progress=progress, values=values)
+    return context_lib.of_env(loop.env, hparams, progress=progress, updates=updates, values=values)
 
 
 def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState) -> Array | None:

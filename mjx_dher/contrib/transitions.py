@@ -14,9 +14,11 @@ from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, by_weight
 from mjx_dher.replay import Sample
 from mjx_dher.types import Array, Batch, PRNGKey
 
-_CURRICULUM_GROUP = 8  # transitions that `curriculum` chooses together, from four times that number
+_CURRICULUM_GROUP = 64  # transitions that `curriculum` chooses together, from twice that number
+_COMPARED = 3  # random candidates that `curriculum` compares for each place
+_PROXIMITY_RATE = 1e-4  # growth of the weight of proximity in `curriculum` per update
 _DIVERSE_WIDTH = 0.5  # m, width of the kernel of `dpp`, as in its authors' code
-_MOST_PROXIMITY = 10.0  # log weight of proximity in `curriculum` at the end of a run
+_MOST_PROXIMITY = 80.0  # log of its largest value, near float32's
 
 # pick(key, sample, batch of one group [C], number, context) -> indices [number] within the group
 GroupFn = Callable[[PRNGKey, Sample, Batch, int, Context], Array]
@@ -45,28 +47,34 @@ def _squared_distances(goals: Array) -> Array:
 
 
 def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
-    """Chooses `number` of a group one by one, for goals that represent the others and are near (Fang et al. 2019).
+    """Chooses `number` of the first 2 * number transitions of a group: diverse goals at first, near ones later.
 
-    Each choice adds most to F(A) = sum_i max_(j in A) sim(g_i, g_j) - lambda sum_(j in A) |g_j - a_j|, where sim = exp(-d^2 /
-    mean(d)^2) and a_j is the goal achieved before the step. lambda grows from 1 to e^10 over the run, as in 10^5 updates at
-    the authors' rate of 10^-4: diverse goals first, near goals later. The authors compare each goal with its nearest neighbour
-    in a larger batch, and look at three random candidates at a time. Groups here are small enough for all.
+    After the code of Fang et al. 2019 ("CHER"). For each place, three random candidates are compared by
+
+        F(j) - lambda |g_j - a_j|,   F(j) = sum of exp(-d_i^2 / mean(d)^2) over the goals i whose nearest other goal is g_j
+
+    where d_i is the distance of goal i to its nearest other goal, and a_j the goal achieved before the step. lambda is 1.0001
+    to the power of the updates made. As in that code, a candidate that led the three for a moment has F = 0 from then on.
     """
-    del key
-    goals, members = batch.desired_goal, jnp.arange(sample.step.shape[0])
-    squares = _squared_distances(goals)
-    mean = jnp.mean(jnp.sqrt(squares))
-    alike = jnp.exp(-squares / jnp.maximum(jnp.square(mean), 1e-12))
-    far = jnp.sqrt(jnp.sum(jnp.square(goals - sample.episode_goals[members, sample.step]), axis=-1))
-    strength = jnp.exp(_MOST_PROXIMITY * jnp.asarray(context.progress, jnp.float32))
+    size = 2 * number
+    goals, members = batch.desired_goal[:size], jnp.arange(size)
+    squares = _squared_distances(goals) + jnp.where(jnp.eye(size, dtype=bool), jnp.inf, 0.0)
+    nearest, distance = jnp.argmin(squares, axis=1), jnp.sqrt(jnp.min(squares, axis=1))
+    alike = jnp.exp(-jnp.square(distance / jnp.maximum(jnp.mean(distance), 1e-12)))
+    far = jnp.sqrt(jnp.sum(jnp.square(goals - sample.episode_goals[members, sample.step[:size]]), axis=-1))
+    growth = math.log1p(_PROXIMITY_RATE) * jnp.asarray(context.updates, jnp.float32)
+    cost = jnp.exp(jnp.minimum(growth, _MOST_PROXIMITY)) * far
 
-    def add(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
-        covered, free = state  # [C] how well each goal is represented, and which may still be chosen
-        gain = jnp.sum(jnp.maximum(alike - covered[None], 0.0), axis=1) - strength * far
-        best = jnp.argmax(jnp.where(free, gain, -jnp.inf))
-        return (jnp.maximum(covered, alike[best]), free & (members != best)), best
+    def add(state: tuple[Array, Array], key: PRNGKey) -> tuple[tuple[Array, Array], Array]:
+        covers, free = state  # [2 * number] F, and which may still be chosen
+        compared = jax.lax.top_k(jnp.where(free, jax.random.uniform(key, (size,)), -1.0), min(_COMPARED, number + 1))[1]
+        value = covers[compared] - cost[compared]
+        led = value > jnp.concatenate([jnp.array([-jnp.inf]), jax.lax.cummax(value)[:-1]])
+        best = compared[jnp.argmax(value)]
+        return (covers.at[compared].multiply(jnp.where(led, 0.0, 1.0)), free.at[best].set(False)), best
 
-    _, chosen = jax.lax.scan(add, (jnp.zeros_like(far), jnp.ones(far.shape, bool)), length=number)
+    covers = jnp.zeros(size).at[nearest].add(alike)
+    _, chosen = jax.lax.scan(add, (covers, jnp.ones(size, bool)), jax.random.split(key, number))
     return chosen
 
 
