@@ -35,7 +35,7 @@ class Page(NamedTuple):
     page: Path
     data: Path
     name: str  # of its table, and of its pictures
-    claims: bool = False  # whether the page has the table of claims, too
+    claims: bool = False  # whether the page has the table of claims, in place of the whole one
     pictures: bool = True
     over_tasks: bool = False  # whether p is corrected over the tasks, too
 
@@ -93,8 +93,11 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
 
 def claims(rows: Sequence[Row], experiment: Experiment) -> str:
     """Table of each arm's claims and the measured differences, significant ones in bold."""
-    lines = [[f"`{arm.name}`", arm.claim, arm.source, _found(arm.name, rows)] for arm in experiment.arms[1:]]
-    return table("arm | claimed | source | found with our variant", lines)
+    lines = []
+    for arm in experiment.arms[1:]:
+        departs = f"{arm.departs} (runs of commit {arm.former})" if arm.former else arm.departs
+        lines.append([f"`{arm.name}`", arm.claim, arm.source, departs, _found(arm.name, rows)])
+    return table("arm | claimed | source | departures | found with our form", lines)
 
 
 def _found(arm: str, rows: Sequence[Row]) -> str:
@@ -108,8 +111,7 @@ def _found(arm: str, rows: Sequence[Row]) -> str:
 
 def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
     """Tables of a page by name."""
-    found = {page.name: whole_table(page, rows)}
-    return {**found, "claims": claims(rows, page.experiment)} if page.claims else found
+    return {"claims": claims(rows, page.experiment)} if page.claims else {page.name: whole_table(page, rows)}
 
 
 def with_table(page: Page, rows: Sequence[Row]) -> str:

@@ -1,4 +1,7 @@
-"""Writes docs/images/samplers.png, the README's first picture: `python docs/make_readme_figure.py` (extra `plot`)."""
+"""Writes docs/images/samplers.png, the paper's comparison over its epochs: `python docs/make_readme_figure.py` (extra `plot`).
+
+Thin lines are seeds, thick ones their means. Red diamonds mark the gain that the paper reads off its single curves.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,7 @@ from typing import Any
 
 import numpy as np
 import paper_set
-from paper_analysis import DOCS, NAMES, STEPS, Sweeps
-
-from mjx_dher import stats
+from paper_analysis import DOCS, NAMES, THRESHOLDS, Curves, Sweeps, reach
 
 # Okabe and Ito's colours, and a line's style.
 STYLES = {
@@ -18,20 +19,38 @@ STYLES = {
     "epsilon_closest": ("#009E73", "-."),
     "closest": ("#000000", ":"),
 }
-SAMPLERS = {"push": tuple(STYLES), "pick_and_place": ("future", "weighted"), "slide": ("future", "weighted")}
-# Task, its file, environment steps per epoch, and samplers.
-PANELS = tuple((NAMES[task], task, STEPS[task], samplers) for task, samplers in SAMPLERS.items())
+CLAIMED = {"push": 5, "pick_and_place": 10}  # epochs that `weighted` is sooner than `future` in the paper
+SHOWN = {"push": 50, "pick_and_place": 50, "slide": 200}  # epochs
 
 
 @functools.cache
-def today() -> dict[str, Sweeps]:
+def data() -> dict[str, Sweeps]:
     """Curves of the paper's experiment by task."""
-    return paper_set.current(paper_set.load_set(paper_set.FOLDER))
+    return paper_set.load_set(paper_set.FOLDER)
 
 
-def curves(task: str, sampler: str) -> np.ndarray:
-    """Success rates [seeds, epochs] of a sampler in the paper's experiment, from docs/paper/TASK_curves.csv."""
-    return today()[task]["samplers", sampler].success
+def curves(task: str) -> dict[str, Curves]:
+    """Curves by sampler: with the paper's cycles, on Slide with one cycle per epoch."""
+    main = "slide" if task == "slide" else paper_set.OWN[task]
+    own = {name: found for (sweep, name), found in data()[task].items() if sweep in (main, "own_methods")}
+    return {name: own[name] for name in STYLES if name in own}
+
+
+def _panel(axis: Any, task: str) -> None:
+    own = curves(task)
+    for name, found in own.items():
+        color, line = STYLES[name]
+        x = np.arange(1, found.success.shape[1] + 1)
+        axis.plot(x, found.success.T, color=color, linewidth=0.5, alpha=0.16)
+        axis.plot(x, found.success.mean(axis=0), color=color, linestyle=line, linewidth=2.0, label=name)
+    if task in CLAIMED:
+        place, level = float(np.median(reach(own["future"], THRESHOLDS[task]))), THRESHOLDS[task]
+        axis.annotate("", (place - CLAIMED[task], level), (place, level), arrowprops={"arrowstyle": "->", "color": "#b3261e"})
+        axis.plot(place - CLAIMED[task], level, "D", color="#b3261e", markersize=6, label="the paper's gain", zorder=5)
+    cycles = "one cycle per epoch" if task == "slide" else "the paper's cycles"
+    axis.set(title=f"{NAMES[task]}, {len(own['future'].seeds)} seeds, {cycles}", xlabel="epoch")
+    axis.set(xlim=(0, SHOWN[task]), ylim=(0, 1.02))
+    axis.grid(alpha=0.2)
 
 
 def make() -> Any:
@@ -42,18 +61,11 @@ def make() -> Any:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.9), sharey=True, layout="constrained")
-    for axis, (title, task, steps, samplers) in zip(axes, PANELS, strict=True):
-        for sampler in samplers:
-            color, line = STYLES[sampler]
-            middle, low, high = stats.curve_interval(curves(task, sampler))
-            x = np.arange(1, len(middle) + 1) * steps / 1e6
-            axis.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0)
-            axis.plot(x, middle, color=color, linestyle=line, linewidth=1.8, label=sampler)
-        axis.set(title=title, xlabel="million environment steps", xlim=(0, None), ylim=(0, 1.02))
-        axis.grid(alpha=0.2)
+    for axis, task in zip(axes, NAMES, strict=True):
+        _panel(axis, task)
     axes[0].set_ylabel("success rate")
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=11)
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, fontsize=11)
     return figure
 
 

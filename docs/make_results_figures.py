@@ -7,19 +7,17 @@ from bench/paper.py (docs/paper/TASK_curves.csv), and from 2026-11-22 (docs/pape
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import paper_forest
 import paper_set
 from paper_analysis import (
     DOCS,
-    FIRST,
     LAST,
     MARGIN,
     NAMES,
     START,
-    STEPS,
     THRESHOLDS,
     Difference,
     Sweeps,
@@ -33,7 +31,6 @@ from paper_analysis import (
     signed,
     sooner,
     table,
-    window,
     with_tables,
 )
 from scipy.stats import t
@@ -43,8 +40,9 @@ from mjx_dher import stats
 SCRIPT = "docs/make_results_figures.py"
 # The tables of each page.
 PAGES = {
-    DOCS / "results.md": ("verdicts", "lottery", "own_samplers", "samplers", "field"),
-    DOCS / "experiments" / "paper_set.md": ("power", "set", "k", "kernels"),
+    DOCS / "results.md": ("verdicts", "pooled", "lottery", "samplers"),
+    DOCS / "experiments" / "paper_own_cycles.md": ("own",),
+    DOCS / "experiments" / "paper_set.md": ("power", "set", "k"),
     DOCS / "experiments" / "paper_repeats.md": ("repeats", "robustness"),
 }
 
@@ -53,152 +51,121 @@ OWN_CYCLES, LONG_CYCLES = "50 an epoch", "1 an epoch"
 
 
 def verdicts(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of the paper's claims, with the paper's cycles or, if these have not been run, with longer ones."""
+    """Table of the paper's claims, with the paper's cycles or, if these have not been run, with one cycle per epoch."""
     push, pick = the_set["push"], the_set["pick_and_place"]
     found = paper_set.compared(the_set)
     claim = {result.comparison.task: result for result in found["the paper's own cycles"]}
-    behind = {result.comparison.setting: result for result in found["methods 1 and 2, own cycles"]}
-    methods = gain(push, "own_methods", "epsilon_closest", "closest")
+    behind = next(r for r in found["methods 1 and 2, own cycles"] if r.comparison.setting == "epsilon_closest")
+    methods = gain(push, "own_methods", "closest", "epsilon_closest")
     own = [
-        ["Push: `weighted` converges sooner than `future`", *_sooner(claim["push"])],
+        ["Push: `weighted` converges sooner than `future`", *_success(claim["push"].difference, 1, claim["push"].p)],
         ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(push, paper_set.OWN["push"], START), 2)],
         ["... is there about five epochs sooner (0.90)", *_epochs(sooner(push, paper_set.OWN["push"], 0.9), 5)],
-        ["Push: `epsilon_closest` is behind `future`", *_success(behind["epsilon_closest"].difference, -1)],
-        ["Push: `closest` is behind `epsilon_closest`", *_success(methods)],
-        ["PickAndPlace: `weighted` converges sooner than `future`", *_sooner(claim["pick_and_place"])],
+        ["Push: `epsilon_closest` is behind `future`", *_success(behind.difference, -1, behind.p)],
+        ["Push: `closest` is behind `epsilon_closest`", *_success(methods, -1)],
+        [
+            "PickAndPlace: `weighted` converges sooner than `future`",
+            *_success(claim["pick_and_place"].difference, 1, claim["pick_and_place"].p),
+        ],
         ["... starts two to three epochs sooner (0.20)", *_epochs(sooner(pick, paper_set.OWN["pick_and_place"], START), 2)],
         ["... is there about ten epochs sooner (0.90)", *_epochs(sooner(pick, paper_set.OWN["pick_and_place"], 0.9), 10)],
     ]
-    for task in ("push", "pick_and_place"):
-        early, late = (window(the_set[task], paper_set.OWN[task], part) for part in (slice(FIRST), slice(-LAST[task], None)))
-        own.append([f"{NAMES[task]}: epochs 1 to {FIRST} are alike", *_alike(early)])
-        own.append([f"{NAMES[task]}: in the last {LAST[task]} epochs `weighted` is at least as good", *_no_worse(late)])
     slide = next(result for result in found["the paper's claim"] if result.comparison.task == "slide")
-    late = window(the_set["slide"], "slide", slice(-LAST["slide"], None))
-    long = [
-        ["Slide: no noticeable difference", *_alike(slide.difference)],
-        [f"Slide: in the last {LAST['slide']} epochs `weighted` is at least as good", *_no_worse(late)],
-    ]
+    long = [["Slide: no noticeable difference", *_success(slide.difference, 1, slide.p)]]
     for result in found["k 16 against 8"]:
         long.append([f"{NAMES[result.comparison.task]}: k 16 is worse than k 8", *_success(result.difference, -1, result.p)])
-    rows = [[*row[:1], cycles, *row[1:]] for cycles, part in ((OWN_CYCLES, own), (LONG_CYCLES, long)) for row in part]
-    return table("the paper says | cycles | our estimate | 95 % interval | p | verdict", rows)
+    rows = [[row[0], row[1], cycles, *row[2:]] for cycles, part in ((OWN_CYCLES, own), (LONG_CYCLES, long)) for row in part]
+    return table("the paper says | seeds | cycles | our estimate | 95 % interval | p, corrected | verdict", rows)
 
 
-def _sooner(result: paper_set.Compared) -> list[str]:
-    """Cells of a claim that a setting learns sooner: alike, if its interval lies within the margin."""
-    d = result.difference
-    cells = _success(d, p=result.p)
-    return [*cells[:-1], "**no**: alike"] if d.low > -MARGIN and d.high < MARGIN else cells
-
-
-def lottery(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of single pairs of seeds: the number of pairs that show the gain in the paper."""
-    rows = []
-    for task, claimed in (("push", 5), ("pick_and_place", 10)):
-        weighted, future = (reach(the_set[task][paper_set.OWN[task], name], 0.9) for name in ("weighted", "future"))
-        same = (future[:, None] - future)[~np.eye(len(future), dtype=bool)]
-        counts = [f"{np.sum(gains >= claimed)} of {gains.size}" for gains in (future[:, None] - weighted, same)]
-        rows.append([NAMES[task], str(claimed), *counts])
-    return table("task | epochs sooner | `weighted` against `future` | `future` against `future`, another seed", rows)
-
-
-def _success(d: Difference, sign: int = 1, p: float | None = None) -> list[str]:
+def _success(d: Difference, sign: int, p: float | None = None) -> list[str]:
     """Cells of a claim that success is larger, or smaller if `sign` is -1.
 
-    `p` is corrected over the claim's family; None for a claim without a family.
+    `p` is corrected over the claim's family. A claim without a family has None, and the interval decides.
     """
     low, high = sorted((sign * d.low, sign * d.high))
-    verdict = "**yes**" if low > 0 else "**no**, the opposite" if high < 0 else "not shown"
-    if p is not None and not p < 0.05:
-        verdict = "not shown"
-    mean, interval, p = signed(d)
-    return [f"mean success {mean}", interval, p, verdict]
+    if p is not None and p >= 0.05:
+        verdict = "**alike**" if low > -MARGIN and high < MARGIN else "not shown"
+    else:
+        verdict = "**confirmed**" if low > 0 else "**the opposite**" if high < 0 else "not shown"
+    mean, interval, _ = signed(d)
+    return [str(len(d.each)), f"mean success {mean}", interval, "" if p is None else number(p), verdict]
 
 
 def _epochs(d: Difference, claimed: float) -> list[str]:
-    """Cells of a claim that at least `claimed` epochs are saved."""
-    left = f"**no**: {claimed:g} are outside the interval" if d.high < claimed else "not shown" if d.low <= 0 else "**yes**"
-    mean, interval, p = signed(d, 1)
-    return [f"{mean} epochs sooner", interval, p, left]
+    """Cells of a claim that at least `claimed` epochs are saved. The plan does not test epochs, so there is no p."""
+    verdict = "**refuted**" if d.high < claimed else "not shown" if d.low <= 0 else "**confirmed**"
+    mean, interval, _ = signed(d, 1)
+    return [str(len(d.each)), f"{mean} epochs sooner", interval, "", verdict]
 
 
-def _alike(d: Difference) -> list[str]:
-    within = abs(d.low) < MARGIN and abs(d.high) < MARGIN
-    verdict = (
-        "**yes**"
-        if within
-        else "not shown: up to 0.02 would be"
-        if d.low <= 0 <= d.high
-        else "**no**: a small one, for `weighted`"
-        if d.low > 0
-        else "**no**: a small one, against `weighted`"
-    )
-    mean, interval, p = signed(d)
-    return [f"mean success {mean}", interval, p, verdict]
+def lottery(the_set: Mapping[str, Sweeps]) -> str:
+    """Table of single pairs of seeds: the number of pairs with the paper's gain, and with as large a loss."""
+    rows = []
+    for task, claimed in (("push", 5), ("pick_and_place", 10)):
+        weighted, future = (reach(the_set[task][paper_set.OWN[task], name], 0.9) for name in ("weighted", "future"))
+        gains, same = future[:, None] - weighted, (future[:, None] - future)[~np.eye(len(future), dtype=bool)]
+        counts = [f"{np.sum(hits)} of {hits.size}" for hits in (gains >= claimed, gains <= -claimed, same >= claimed)]
+        rows.append([NAMES[task], str(claimed), *counts])
+    return table("task | epochs | `weighted` sooner by these | `weighted` later | `future` sooner than `future`", rows)
 
 
-def _no_worse(d: Difference) -> list[str]:
-    mean, interval, p = signed(d)
-    verdict = "**yes**, to within 0.02" if d.low > -MARGIN else "**no**" if d.high < 0 and d.p < 0.05 else "not shown"
-    return [f"mean success {mean}", interval, p, verdict]
-
-
-def samplers(data: Mapping[str, Sweeps]) -> str:
-    """Table of the samplers, on all tasks."""
-    order = ("future", "weighted", "episode", "epsilon_closest", "closest", "random")
+def pooled_gains(data: Mapping[str, Sweeps]) -> str:
+    """Table of the random-effects mean over all sweeps, by task."""
     rows = []
     for task, sweeps in data.items():
-        names = [name for name in order if ("samplers", name) in sweeps]
-        compared = {name: gain(sweeps, "samplers", name, "future") for name in names[1:]}
-        corrected = dict(zip(compared, stats.holm([d.p for d in compared.values()])))
-        for name in names:
-            curves, last = sweeps["samplers", name], LAST[task]
-            epochs, base = reach(curves, THRESHOLDS[task]), area(sweeps["samplers", "future"])
+        gains = [gain(sweeps, sweep, "weighted", "future") for sweep in _with_both(sweeps)]
+        mean, low, high = pooled(gains)
+        pairs = sum(len(d.each) for d in gains)
+        rows.append([NAMES[task], str(len(gains)), str(pairs), f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}"])
+    return table("task | sweeps | pairs | mean success, `weighted` less `future` | 95 % interval", rows)
+
+
+def _with_both(sweeps: Sweeps) -> list[str]:
+    """Names of the sweeps with `weighted` and `future`."""
+    return list(dict.fromkeys(sweep for sweep, setting in sweeps if setting == "weighted" and (sweep, "future") in sweeps))
+
+
+def samplers(the_set: Mapping[str, Sweeps]) -> str:
+    """Table of the samplers: with the paper's cycles, or with one cycle per epoch if a task has only those."""
+    rows = []
+    for task, sweeps in the_set.items():
+        main, cycles = (paper_set.OWN[task], OWN_CYCLES) if (paper_set.OWN[task], "future") in sweeps else (task, LONG_CYCLES)
+        own = {name: curves for (sweep, name), curves in sweeps.items() if sweep in (main, "own_methods")}
+        base = area(own["future"])
+        for name in (name for name in ("future", "weighted", "epsilon_closest", "closest") if name in own):
+            curves, epochs = own[name], reach(own[name], THRESHOLDS[task])
             better = "" if name == "future" else f"{stats.probability_of_improvement(area(curves), base):.2f}"
-            cells = [of(curves.success[:, -last:].mean(axis=1)), of(area(curves)), of(epochs, 0, np.median)]
-            there = f"{np.isfinite(epochs).sum()} of {len(epochs)}"
-            p = number(corrected[name]) if name in corrected else ""
-            rows.append([NAMES[task] if name == "future" else "", f"`{name}`", *cells, there, better, p])
-    head = "task | sampler | late success, IQM | mean success, IQM | epochs to 0.90 (Slide: 0.60), median | seeds there"
-    return table(f"{head} | P(better than `future`) | p, corrected", rows)
+            late = curves.success[:, -LAST[task] :].mean(axis=1)
+            cells = [of(late), of(area(curves)), of(epochs, 0, np.median), f"{np.isfinite(epochs).sum()} of {len(epochs)}"]
+            rows.append([*([NAMES[task], cycles] if name == "future" else ["", ""]), f"`{name}`", *cells, better])
+    head = "task | cycles | sampler | late success, IQM | mean success, IQM | epochs to 0.90 (Slide: 0.60), median"
+    return table(f"{head} | seeds there | P(better than `future`)", rows)
 
 
 def ks(the_set: Mapping[str, Sweeps]) -> str:
     """Table of hindsight goals."""
-    rows = []
+    rows, found = [], {(r.comparison.task, r.comparison.setting): r for r in paper_set.compared(the_set)["k against 4"]}
     for task, curves in paper_set.ks(the_set).items():
         for k, own in curves.items():
-            against = signed(difference(area(own), area(curves[4]))) if k != 4 else ["", "", ""]
+            result = found.get((task, f"future, her_k {k}"))
+            against = [*signed(result.difference)[:2], number(result.p)] if result else ["", "", ""]
             epochs = of(reach(own, THRESHOLDS[task]), 0, np.median)
             rows.append([NAMES[task] if k == 1 else "", str(k), of(area(own)), *against, epochs])
-    head = "task | k | mean success, IQM | against k 4 | 95 % interval | p"
+    head = "task | k | mean success, IQM | against k 4 | 95 % interval | p, corrected"
     return table(f"{head} | epochs to 0.90 (Slide: 0.60), median", rows)
 
 
-def kernels(data: Mapping[str, Sweeps]) -> str:
-    """Table of kernels and temperatures."""
-    push, rows, default = data["push"], [], "weighted, linear, temperature 1"
-    for kernel in ("linear", "inverse", "softmax"):
-        for temperature in ("0.25", "1", "4"):
-            name = f"weighted, {kernel}, temperature {temperature}"
-            against = ["", "", ""] if name == default else signed(gain(push, "kernels", name, default))
-            rows.append([f"`{kernel}`", temperature, of(area(push["kernels", name])), *against])
-    return table("kernel | temperature | mean success, IQM | against `linear` at 1 | 95 % interval | p", rows)
-
-
 def repeats(data: Mapping[str, Sweeps]) -> str:
-    """Table of `weighted` against `future` in every sweep that has both, and their random-effects mean by task."""
+    """Table of `weighted` against `future` in every sweep that has both."""
     rows = []
     for task, sweeps in data.items():
-        names = list(dict.fromkeys(sweep for sweep, setting in sweeps if setting == "weighted" and (sweep, "future") in sweeps))
+        names = _with_both(sweeps)
         gains = [gain(sweeps, sweep, "weighted", "future") for sweep in names]
         for sweep, success in zip(names, gains):
             epochs = sooner(sweeps, sweep, THRESHOLDS[task])
             length = str(sweeps[sweep, "future"].success.shape[1])
             rows.append([NAMES[task] if sweep == names[0] else "", sweep, length, *signed(success), *signed(epochs, 1)[:2]])
-        mean, low, high = pooled(gains)
-        rows.append(["", "**all of them**", "", f"{mean:+.3f}", f"{low:+.3f} to {high:+.3f}", "", "", ""])
     return table(
         "task | sweep | epochs | mean success, `weighted` less `future` | 95 % interval | p | epochs sooner | 95 % interval",
         rows,
@@ -231,10 +198,6 @@ CHANGES = (  # what, task, the sweep, and the one that it is compared with
     ("`fast`: bfloat16, a cycle an epoch", "push", "fast", "samplers"),
     ("... PickAndPlace", "pick_and_place", "fast", "samplers"),
     ("... Slide, from cycles half as long", "slide", "fast", "samplers"),
-    ("`hopper`: from `fast`, the learner's kernels", "push", "hopper", "fast"),
-    ("... again", "push", "hopper again", "fast"),
-    ("... PickAndPlace", "pick_and_place", "hopper", "fast"),
-    ("... Slide", "slide", "hopper", "fast"),
 )
 
 
@@ -252,45 +215,14 @@ def robustness(data: Mapping[str, Sweeps]) -> str:
     return table("change | epochs | sampler | mean success | difference | 95 % interval | p", rows)
 
 
-PUBLISHED = (  # million steps to a success rate, as read off a published curve (to 3 points of success), and its end
-    ("DDPG and HER, PyTorch and MPI (a), 5 seeds, median", "0.64", "0.99", "2.6", "0.93", "2.4", "0.72"),
-    ("TQC and HER (b), one run", "", "1.00 after 1.0", "", "1.00 after 1.0", "", "0.80 after 2.5"),
-)
-
-
-def field(data: Mapping[str, Sweeps]) -> str:
-    """Table of published curves and ours, in environment steps."""
-    rows = [list(row) for row in PUBLISHED]
-    for name in ("future", "weighted"):
-        cells = []
-        for task, sweeps in data.items():
-            curves = sweeps["samplers", name]
-            steps = float(np.median(reach(curves, THRESHOLDS[task]))) * STEPS[task] / 1e6
-            cells += [f"{steps:.2f}", f"{np.median(curves.success[:, -LAST[task] :].mean(axis=1)):.2f}"]
-        rows.append([f"ours, `{name}`, 10 seeds, median", *cells])
-    return table("who | Push: to 0.90 | at the end | PickAndPlace: to 0.90 | at the end | Slide: to 0.60 | at the end", rows)
-
-
 OWN, TODAY = "the paper's cycles, 20 seeds", "today's preset"  # names of the set's sweeps among those of 2026-11-22
-
-
-def own_samplers(the_set: Mapping[str, Sweeps]) -> str:
-    """Table of the samplers with the paper's own cycles."""
-    names = {"own_methods", *paper_set.OWN.values()}
-    own = {t: {("samplers", n): c for (w, n), c in s.items() if w in names} for t, s in the_set.items()}
-    return samplers({task: sweeps for task, sweeps in own.items() if sweeps})
-
-
-OF_TODAY: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"samplers": samplers, "field": field}
-OF_BEFORE: dict[str, Callable[[Mapping[str, Sweeps]], str]] = {"kernels": kernels, "robustness": robustness}
 
 
 def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
     """All tables by name, from the curves of the set and of 2026-11-22."""
-    today = paper_set.current(the_set)
-    found = {name: make(today) for name, make in OF_TODAY.items()} | {name: make(before) for name, make in OF_BEFORE.items()}
-    found |= {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "own_samplers": own_samplers(the_set)}
-    found |= {"k": ks(the_set), "repeats": repeats(with_repeats(the_set, before))}
+    both = with_repeats(the_set, before)
+    found = {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "samplers": samplers(the_set), "k": ks(the_set)}
+    found |= {"pooled": pooled_gains(both), "repeats": repeats(both), "robustness": robustness(before)}
     return found | paper_set.blocks(the_set, before)
 
 

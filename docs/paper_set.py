@@ -155,10 +155,11 @@ def compared(data: Mapping[str, Sweeps]) -> dict[str, list[Compared]]:
     return found
 
 
-def rows(data: Mapping[str, Sweeps]) -> list[list[str]]:
-    """A row for each comparison whose curves are complete."""
+def rows(data: Mapping[str, Sweeps], own_cycles: bool = False) -> list[list[str]]:
+    """A row for each complete comparison, with the paper's own cycles or with longer ones. k against 4 has another table."""
     found = []
-    for family, results in compared(data).items():
+    wanted = {name for name in FAMILIES if ("own cycles" in name) == own_cycles and name != "k against 4"}
+    for family, results in ((name, results) for name, results in compared(data).items() if name in wanted):
         for c, d, epochs, p, joint in results:
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
             found.append([family, *cells, number(p), number(joint), verdict(d.low, d.high, p)])
@@ -217,6 +218,5 @@ def power(data: Mapping[str, Sweeps]) -> str:
 
 
 def blocks(data: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
-    """Tables of the set, `data`, and of its power, which is computed from the earlier curves."""
-    found = rows(data)
-    return {"set": table(HEAD, found) if found else "Not run yet: there are no curves in docs/paper.", "power": power(before)}
+    """Tables of the comparisons in `data`, and of the set's power, which is computed from the earlier curves."""
+    return {"set": table(HEAD, rows(data)), "own": table(HEAD, rows(data, own_cycles=True)), "power": power(before)}

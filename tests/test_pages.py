@@ -4,6 +4,7 @@ import csv
 import re
 
 import make_comparison_tables
+import make_preference_figure
 import make_results_figures
 import make_samplers_figure
 import numpy as np
@@ -75,9 +76,10 @@ def test_each_table_of_results_with_numbers_is_made_from_the_curves():
     heads = [rest.splitlines()[start] for start, _ in tables]
     assert heads == [
         "| departure from the paper | where |",
-        "| term or row | meaning |",
+        "| term | meaning |",
         "| the paper says | finding |",
-        "| figure of the paper | ours | command | curves | on one H100 |",
+        "| figure of the paper | ours | command | curves | minutes, GPU |",
+        "| script | makes |",
     ]
 
 
@@ -111,7 +113,6 @@ def test_readings_by_formula():
         "`minmax`, `linear`": lambda d: 1 - (d - d.min()) / (d.max() - d.min()),
         "`none`, `softmax`": lambda d: np.exp(-d / 0.05),
         "`far`, `linear`": lambda d: d,
-        "`mean`, `inverse`": lambda d: 1 / d,
         "`epsilon_closest`": lambda d: 0.2 / d.size + 0.8 * (d == d.min()) / (d == d.min()).sum(),
     }
     rows = dict(make_samplers_figure.rows())
@@ -119,6 +120,20 @@ def test_readings_by_formula():
         weights = [formula(np.asarray(d, np.float32)) for d in make_samplers_figure.SITUATIONS.values()]
         expected = [np.abs(w / w.sum() - 1 / w.size).sum() / 2 for w in weights]
         np.testing.assert_allclose(rows[name], expected, atol=1e-5, err_msg=name)
+
+
+def test_loss_grows_with_the_preference_for_near_goals():
+    """Thirteen settings, their correlation as the page has it, and one difference by hand."""
+    found = make_preference_figure.points()
+    assert len(found) == 13
+    page = (ROOT / "docs" / "results.md").read_text()
+    assert f"Spearman {make_preference_figure.correlation(found):.2f}" in page
+    ranks = [np.argsort(np.argsort(values)) for values in ([p.share for p in found], [p.gain.mean for p in found])]
+    assert np.corrcoef(*ranks)[0, 1] < -0.85  # ties, of `max` and `minmax`, apart
+    push = paper_set.load_set(paper_set.FOLDER)["push"]
+    base, own = (push["samplers", name].success[:, :30] for name in ("future", "closest"))
+    by_hand = np.mean([np.trapezoid(a - b) / 29 for a, b in zip(own, base)])
+    assert {p.name: p.gain.mean for p in found}["closest"] == pytest.approx(by_hand)
 
 
 SUCCESS = re.compile(r"[01]\.\d{3}")
