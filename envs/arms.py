@@ -109,10 +109,8 @@ def _servo(joint: str, limits: str, force: float, gain: float, stiffness: float)
 def mjcf(areas: dict[str, tuple[float, float, float]], cube: tuple[float, float] | None, bins: bool = False) -> str:
     """MJCF of a task.
 
-    Args:
-      areas: x and y of the centre and half a side in m, by colour.
-      cube: initial position of the cube in m, or None for an arm without gripper and cube.
-      bins: whether the areas have walls, which do not scale with their size.
+    `areas` has x and y of the centre and half a side in m, by colour. `cube` is the cube's initial position in m, or None for
+    an arm without gripper and cube. With `bins`, the areas have walls, which do not scale with their size.
     """
     hand = '<geom name="hand" type="capsule" size="0.04 0.06" pos="0 0 0.142" quat="{0} {0} -{1} -{1}"/>'
     hand = hand.format(0.653281535, 0.270597922)

@@ -30,15 +30,10 @@ def write_demonstrations(path: Path, episodes: Episode) -> None:
 
 
 def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
-    """Reads N episodes, padded to the environment's episode length.
+    """Reads at most `max_episodes` episodes from an .npz file, or the folder or name of a Minari data set.
 
-    Args:
-      source: an .npz file, or the folder or name of a Minari data set.
-      env: environment of the episodes.
-      max_episodes: number of episodes that the ring holds.
-
-    Raises:
-      ValueError: the file cannot be read, or its episodes do not fit the environment. The message names each invalid array.
+    They are padded to the environment's episode length. Raises ValueError if the file cannot be read, or its episodes do not
+    fit the environment. The message names each invalid array.
     """
     path, template = find_demonstrations(source), episode_template(env)
     names = _named(template)

@@ -24,27 +24,17 @@ CHUNK = 500  # episodes at once
 
 
 def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
-    """Plays episodes of a deterministic policy. Traceable.
+    """Plays parallel episodes of a deterministic policy. Traceable. Returns outcomes [num_episodes].
 
-    Args:
-      act: maps observations, whose leaves lead with [num_episodes], to actions [num_episodes, A].
-      key: draws the initial states.
-      num_episodes: number of parallel episodes.
-
-    Returns:
-      Outcomes [num_episodes].
+    `act` maps observations, whose leaves lead with [num_episodes], to actions [num_episodes, A]. `key` draws the initial
+    states.
     """
     return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
 
 
 def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:
-    """Plays episodes of a policy from `load_policy`.
-
-    Args:
-      seed: draws the initial states.
-
-    Returns:
-      Outcomes [num_episodes] as NumPy arrays.
+    """Plays episodes of a policy from `load_policy`, with initial states drawn by `seed`. Returns outcomes [num_episodes] as
+    NumPy arrays.
     """
     chunk = min(num_episodes, CHUNK)
 

@@ -31,15 +31,8 @@ class FromFile(str):
 
 
 def check(field: str, name: str, place: Path | None) -> None:
-    """Checks that a name may be used.
-
-    Args:
-      field: setting that the message names.
-      name: the name. Only a `FromFile` is checked.
-      place: file of the module or data, or None.
-
-    Raises:
-      ValueError: the name comes from a file, and the user has neither trained with it nor passed `--trust`.
+    """Checks that a name may be used. Only a `FromFile` is checked. `place` is the file of its module or data. Raises
+    ValueError if the name comes from a file, and the user has neither trained with it nor passed `--trust`.
     """
     if lookup.trusts_files or not isinstance(name, FromFile):
         return
@@ -57,12 +50,8 @@ def check(field: str, name: str, place: Path | None) -> None:
 
 
 def record(field: str, name: str, place: Path | None, arguments: Sequence[str] = ()) -> None:
-    """Records a name that the user typed or passed. Does nothing if there is no state folder.
-
-    Args:
-      name: the name. A `FromFile` is not recorded.
-      place: file of the module or data, or None.
-      arguments: arguments of the environment.
+    """Records a name that the user typed or passed, with the file of its module or data. A `FromFile` is not recorded. Does
+    nothing if there is no state folder.
     """
     if isinstance(name, FromFile):
         return

@@ -21,15 +21,8 @@ def check_devices(devices: Any) -> None:
 
 
 def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[str, int]:
-    """Splits an address into a host, without brackets, and a port.
-
-    Args:
-      name: setting that the error message names.
-      value: HOST:PORT, such as "[::1]:8000".
-      allowed: valid form in the error message.
-
-    Raises:
-      ValueError: `value` is invalid.
+    """Splits an address, such as "[::1]:8000", into a host, without brackets, and a port. Raises ValueError that names the
+    setting and the `allowed` form.
     """
     host, _, port = value.rpartition(":")
     if not host or "/" in host or not (port.isascii() and port.isdecimal()) or not 0 < int(port[:6]) < 1 << 16:
@@ -73,12 +66,8 @@ def check_all(*calls: tuple[Any, ...]) -> None:
 
 
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
-    """Raises ValueError unless `value` is a number in an interval.
-
-    Args:
-      field: setting that the message names.
-      interval: such as "[0, 1)".
-      kind: int, or float, which also allows integers.
+    """Raises ValueError, naming `field`, unless `value` is a number in an interval, such as "[0, 1)". The kind float allows
+    integers too.
     """
     if problem := _number_problem(field, value, Number(interval), kind):
         raise ValueError(problem)
@@ -90,14 +79,8 @@ def check_count(field: str, value: Any) -> None:
 
 
 def validate(config: Config, hparams: HParams, episode_length: int) -> None:
-    """Checks sizes and numbers of a run.
-
-    Args:
-      hparams: numbers. Arrays, one value per seed, are not checked.
-      episode_length: steps of the environment's episodes.
-
-    Raises:
-      ValueError: names each invalid field, its value and the allowed values.
+    """Checks sizes and numbers of a run. Arrays of numbers, one per seed, are not checked. Raises ValueError with each invalid
+    field, its value and the allowed values.
     """
     check_count("episode_length", episode_length)
     problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]

@@ -60,11 +60,7 @@ def _is_count(name: str) -> bool:
 
 
 def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> list[str]:
-    """Features of a model whose fields do not have their defaults, with their elements.
-
-    Args:
-      concerns: whether to check a field of this name.
-    """
+    """Features of a model whose fields, if `concerns(field)`, do not have their defaults, with their elements."""
     features: list[str] = []
     defaults = _defaults()
     for name, value in fields(model):

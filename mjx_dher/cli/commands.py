@@ -66,15 +66,8 @@ def run(name: str, argv: Sequence[str], console: Console) -> int:
 
 
 def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
-    """Parses the arguments of a command.
-
-    Args:
-      kind: class of the arguments, such as EvalArgs.
-      argv: words after the command's name.
-      **options: other arguments of `tyro.cli`.
-
-    Raises:
-      ValueError: a flag of another library. The message names ours.
+    """Parses the words after a command's name into `kind`, such as EvalArgs. `options` are those of `tyro.cli`. Raises
+    ValueError for a flag of another library. The message names ours.
     """
     import tyro
 

@@ -149,10 +149,8 @@ def compare(
 
 
 class Screen:
-    """Progress of runs: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s.
-
-    Args:
-      success: success rates of earlier epochs, if a run resumes.
+    """Progress of runs: a live bar and curve on a terminal, else lines, for a sweep at most one every 10 s. `success` has the
+    rates of earlier epochs, if a run resumes.
     """
 
     def __init__(self, console: Console, specs: Sequence[RunSpec], success: Sequence[float] = ()):

@@ -57,13 +57,8 @@ def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
 
 
 def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec]]:
-    """Trains a sweep on a cluster.
-
-    Returns:
-      All trials, and those that had not ended before.
-
-    Raises:
-      ValueError: the cluster cannot be used, or a run cannot be trained.
+    """Trains a sweep on a cluster. Returns all trials, and those that had not ended before. Raises ValueError if the cluster
+    cannot be used, or a run cannot be trained.
     """
     import jax
 

@@ -20,13 +20,8 @@ from mjx_dher.system.files import FolderError
 
 
 def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
-    """Reads settings and options from a run's config.json, and lines about their origin.
-
-    Args:
-      path: a run folder, or any config.json, possibly edited.
-
-    Raises:
-      FolderError: it does not describe a run, or has another schema.
+    """Reads settings and options from a run folder or any config.json, and lines about their origin. Raises FolderError if it
+    does not describe a run, or has another schema.
     """
     file = path / run_folder.CONFIG_FILE if path.is_dir() else path
     try:

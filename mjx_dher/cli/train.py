@@ -167,11 +167,8 @@ def resume_command(argv: list[str], console: Console) -> int:
 def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
     """The run in a locked folder and its options, with the changes of the command line.
 
-    `stop_at` is the command line's. A reached value does not stop the run again unless it is passed again.
-
-    Raises:
-      FolderError: the run has ended, has no checkpoint, or its settings were edited.
-      ValueError: an invalid option.
+    `stop_at` is the command line's. A reached value does not stop the run again unless it is passed again. Raises FolderError
+    if the run has ended, has no checkpoint, or its settings were edited.
     """
     run, options = run_folder.to_spec(args.run, content), args.options
     edits = run_folder.edited(args.run, content, run)

@@ -116,10 +116,8 @@ def _view(args: ViewArgs, console: Console) -> int:
 
 
 class Beside:
-    """Viewer of a run in training, in its own process, which starts when there is a policy to show.
-
-    Args:
-      port: port of the page from `address.check`, or None for no viewer.
+    """Viewer of a run in training, in its own process, which starts when there is a policy to show. `port` is from
+    `address.check`.
     """
 
     def __init__(self, folder: Path, port: int | None, console: Console):

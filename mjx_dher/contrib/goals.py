@@ -31,15 +31,11 @@ def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) 
 
 
 def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, rounds: int = _SINKHORN_ROUNDS) -> Array:
-    """Soft matching of N rows to P columns: log probabilities [N, P] that a row takes a column.
+    """Soft matching of N rows to P columns at costs [N, P]: log probabilities [N, P] that a row takes a column.
 
-    Every row has the same mass, and so has every usable column (Sinkhorn & Knopp 1967; Cuturi 2013). Computed in logarithms,
-    so that no mass vanishes.
-
-    Args:
-      cost: costs [N, P].
-      usable: mask [P] of the columns to use. At least one must be True.
-      softness: fraction of the mean cost. The smaller it is, the nearer the result is to the assignment of least cost.
+    Every row has the same mass, and so has every column that the mask `usable` [P] selects, at least one (Sinkhorn & Knopp
+    1967; Cuturi 2013). Computed in logarithms, so that no mass vanishes. `softness` is a fraction of the mean cost. The smaller
+    it is, the nearer the result is to the assignment of least cost.
     """
     open_to = jnp.broadcast_to(usable[None], cost.shape)
     mean = jnp.sum(jnp.where(open_to, jnp.abs(cost), 0.0)) / jnp.sum(open_to, dtype=cost.dtype)

@@ -62,14 +62,9 @@ def task_of(cpus: int | None, nodes: Sequence[Mapping[str, float]]) -> Task:
 
 
 def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, size: int | None) -> list[tuple[RunSpec, ...]]:
-    """Splits runs into chunks of equal size that share a program, so that all slots are busy until the end.
+    """Splits runs, grouped by program, into chunks of equal size, so that all slots are busy until the end.
 
-    Args:
-      specs: runs to train, grouped by program.
-      task: resources per chunk.
-      slots: number of parallel tasks in the cluster.
-      lanes: most parallel runs per task.
-      size: runs per chunk. Default: chosen to fill the slots.
+    A chunk has `size` runs, by default as many as fill the cluster's parallel `slots`, and trains at most `lanes` at once.
     """
     chunks: list[tuple[RunSpec, ...]] = []
     most = (lanes or MOST_RUNS["gpu"]) if task.gpus else MOST_RUNS["cpu"] * (lanes or 1)

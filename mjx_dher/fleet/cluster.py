@@ -64,14 +64,10 @@ class Board:
 
 @contextlib.contextmanager
 def joined(address: str, code: Path | None) -> Iterator[Cluster]:
-    """Joins a cluster, or starts one on this machine, for the duration of the block.
+    """Joins a cluster (auto or HOST:PORT), or starts one on this machine (local), for the duration of the block.
 
-    Args:
-      address: local, auto or HOST:PORT.
-      code: folder with custom code, which is sent to the nodes.
-
-    Raises:
-      ValueError: there is no such cluster, this machine does not belong to it, or the code cannot be sent.
+    `code` is a folder with custom code, which is sent to the nodes. Raises ValueError if there is no such cluster, this machine
+    does not belong to it, or the code cannot be sent.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     options: dict[str, Any] = {"runtime_env": {} if code is None else {"working_dir": str(code), "excludes": NOT_SENT}}
@@ -168,11 +164,8 @@ class Cluster:
         return [by_ref[ref] for ref in ended]
 
     def result(self, running: Running) -> list[bytes]:
-        """Runs of an ended chunk, from `worker.train`. Empty if it was cancelled.
-
-        Raises:
-          LostError: its worker or node was lost too often.
-          Exception: raised by its training.
+        """Runs of an ended chunk, from `worker.train`. Empty if it was cancelled. Raises LostError if its worker or node was
+        lost too often, and errors of its training.
         """
         errors = self._ray.exceptions
         try:

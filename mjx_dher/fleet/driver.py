@@ -48,16 +48,11 @@ class Job:
 
 
 def run(cluster: Any, job: Job) -> list[str]:
-    """Trains the chunks of a job. Returns one line per chunk that was lost for good.
+    """Trains the chunks of a job on a `cluster.Cluster`. Returns one line per chunk that was lost for good.
 
     Slightly more chunks than slots are submitted, for clusters that grow on demand. A lost chunk is trained again from its
-    checkpoints in the storage, or without storage from the start.
-
-    Args:
-      cluster: `cluster.Cluster`, or an object with its methods.
-
-    Raises:
-      ValueError: raised by the training of a chunk. Runs that have ended by then are written.
+    checkpoints in the storage, or without storage from the start. Errors of the training are raised again. Runs that have ended
+    by then are written.
     """
     waiting, running, begun = deque(job.chunks), list[Running](), set[str]()
     lost: list[str] = []

@@ -48,16 +48,11 @@ Tell = Callable[[News], bool]  # returns True to stop
 
 
 def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[bytes]:
-    """Trains a chunk, from its checkpoints if its folder in the storage has any.
+    """Trains a chunk, from its checkpoints if its folder in the storage has any. `tell` reports progress, and returns True to
+    stop.
 
-    Args:
-      tell: reports progress, and returns True to stop the chunk.
-
-    Returns:
-      Each run folder as bytes from `pack`, or empty bytes if a run was stopped.
-
-    Raises:
-      ValueError: as in `train_runs`, or this node has other code or storage than the driver.
+    Returns each run folder as bytes from `pack`, or empty bytes if a run was stopped. Raises ValueError as `train_runs` does,
+    or if this node has other code or storage than the driver.
     """
     here = chunks.code_of(chunk.specs)
     names = {**chunk.code, **here}

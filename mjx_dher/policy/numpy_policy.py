@@ -166,13 +166,8 @@ def _check_bounds(layers: Sequence[Sequence[NDArray]], arrays: Mapping[str, Any]
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
-    """Makes a policy.
-
-    Args:
-      dense: linear layers of the actor, by flax's names.
-      observation_norm: `NormalizerState` of observations [D].
-      goal_norm: `NormalizerState` of goals [G].
-      hparams: numbers of the normalization.
+    """Makes a policy from the actor's linear layers, by flax's names, and the `NormalizerState`s of observations [D] and goals
+    [G].
     """
     layers = tuple(
         (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))

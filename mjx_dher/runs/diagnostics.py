@@ -13,11 +13,8 @@ from mjx_dher.spec import RunSpec
 
 
 def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
-    """Reason why a run fails after an epoch, or None.
-
-    Args:
-      metrics: metrics of the epoch from `trainer.make_train`.
-      finite: whether all of the learner's floats are finite.
+    """Reason why a run fails after an epoch with these metrics, or None. `finite` tells whether all of the learner's floats
+    are.
     """
     if not finite:
         return "the networks or normalizers have numbers that are not finite (smaller actor_lr and critic_lr may help)"

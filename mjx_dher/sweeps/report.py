@@ -21,13 +21,8 @@ REPORT = "report.html"
 
 
 def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> str:
-    """HTML report of a run, which may still be training.
-
-    Args:
-      report: called with a line about each video that is left out.
-
-    Raises:
-      FolderError: it is not a run folder, or it is damaged.
+    """HTML report of a run, which may still be training. `report` is called with a line about each video that is left out.
+    Raises FolderError if it is not a run folder, or it is damaged.
     """
     curve = curves.read_curve(folder, allow_empty=True)
     spec = curve.spec
@@ -84,15 +79,8 @@ def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
 
 
 def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
-    """HTML report of all finished runs of a sweep.
-
-    Args:
-      baseline: setting to compare with, as in `comparison.compare`.
-      threshold: success rate for the time to success.
-      report: called with a line about each video that is left out.
-
-    Raises:
-      FolderError: it is not a sweep, it is damaged, or none of its runs has ended.
+    """HTML report of all finished runs of a sweep. Arguments are as in `of_run` and `comparison.compare`. Raises FolderError if
+    it is not a sweep, it is damaged, or none of its runs has ended.
     """
     trials = tables.read(folder)
     failed = [trial for trial in trials if trial["status"] == FAILED]

@@ -32,22 +32,11 @@ def run(
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
 ) -> list[Result]:
-    """Trains trials into the folder of a sweep. Trials share programs if possible, in any order.
+    """Trains trials into the folder of a sweep, which is made if necessary. Trials share programs if possible, in any order.
 
-    Args:
-      folder: folder of the sweep, made if it does not exist.
-      make_env: function that makes the environment of a trial.
-      devices: number of devices, or "all", as in `train_runs`.
-      should_stop: called after every epoch. True stops the sweep with a checkpoint.
-      report: called with a line about each program and checkpoint.
-      on_epoch: called after every epoch of the parallel runs.
-
-    Returns:
-      One Result per trained trial. Trials that had ended before, that another process trains, or that were waiting when the
-      sweep was stopped have none.
-
-    Raises:
-      ValueError: as in `train_runs`.
+    `make_env` makes the environment of a trial. The options, and errors, are those of `train_runs`. Returns one Result per
+    trained trial. Trials that had ended before, that another process trains, or that were waiting when the sweep was stopped
+    have none.
     """
     results: list[Result] = []
     for trials in grid.by_program(specs):

@@ -64,11 +64,8 @@ def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
 
 
 def read_json(file: Path) -> Any:
-    """Content of a JSON file.
-
-    Raises:
-      FileNotFoundError: there is no such file.
-      FolderError: it is larger than LARGEST_JSON, is not JSON, or cannot be read.
+    """Content of a JSON file. Raises FileNotFoundError if there is none, and FolderError if it is larger than LARGEST_JSON, is
+    not JSON, or cannot be read.
     """
     if file.exists() and not file.is_file():
         raise FolderError(f"{file} is not a file")  # reading a FIFO would block
@@ -105,10 +102,6 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
 
     The system releases the lock when this process ends. The file stays, because unlinking it could give the lock to two
     processes. On a file system without locks, a file that names this process marks the folder.
-
-    Args:
-      folder: an existing folder.
-      wait: whether to wait until another process releases the lock.
 
     Raises:
       BusyError: another process holds the lock, and `wait` is False.
@@ -158,12 +151,8 @@ def _tell_no_locks() -> None:
 
 @contextlib.contextmanager
 def new_folder(folder: Path) -> Iterator[None]:
-    """Makes and locks a folder, and removes it if the block leaves nothing in it.
-
-    Raises:
-      BusyError: another process holds the lock.
-      FolderError: the folder is not empty.
-      OSError: it cannot be made or written to.
+    """Makes and locks a folder, and removes it if the block leaves nothing in it. Raises BusyError if another process holds the
+    lock, and FolderError if the folder is not empty.
     """
 
     def unlink_lock() -> None:

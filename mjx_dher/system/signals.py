@@ -224,10 +224,8 @@ def are_asked() -> bool:
 def held(report: Callable[[str], None], place: object, patience: float = math.inf) -> Iterator[Held]:
     """Lets the block end in order after a first signal. It must check `asked`. A second signal ends the process at once.
 
-    Args:
-      report: called with a line when a signal arrives.
-      place: where the block saves its work.
-      patience: seconds after a signal until the process ends, unless the block calls `alive`.
+    `report` is called with a line when a signal arrives. The block saves its work in `place`. Unless it calls `alive`, the
+    process ends `patience` seconds after the signal.
     """
     block = Held(report, f"stopped at once; saved work is in {place}", patience)
     take_back()

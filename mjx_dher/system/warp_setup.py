@@ -49,9 +49,7 @@ def prepare() -> None:
 
 def load(module: Any, block: int | None = None) -> None:
     """Compiles a Warp module for the current device, or loads it from the cache. Recompiles if the cached one is damaged.
-
-    Args:
-      block: threads per block to compile for. Default: Warp's.
+    `block` is the number of threads per block to compile for, by default Warp's.
     """
     block = (1 if wp.get_device().is_cpu else module.options["block_dim"]) if block is None else block
     kept = os.path.join(str(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim=block))

@@ -30,13 +30,8 @@ KEPT_SECONDS = 90 * 24 * 3600.0  # lifetime of a verdict
 
 
 def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[str]:
-    """Checks the custom components of runs of `env`, each once. Yields lines for the screen.
-
-    Args:
-      again: whether to check components that have passed before.
-
-    Raises:
-      ComponentError: names the component and the first violation.
+    """Checks the custom components of runs of `env`, each once, or `again`. Yields lines for the screen. Raises ComponentError
+    for the first violation.
     """
     runs = list(dict.fromkeys(_read(spec) for spec in specs if custom_components(spec)))
     if not runs:

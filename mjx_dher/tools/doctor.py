@@ -31,14 +31,10 @@ Report = dict[str, dict[str, Any]]
 
 
 def examine(seconds: float) -> Report:
-    """Examines the machine. On a GPU, Warp caches the kernels that it compiles; nothing else is left behind.
+    """Examines the machine, with a time limit in seconds for each child process. Only kernels that Warp compiles stay behind.
 
-    Args:
-      seconds: time limit of each child process.
-
-    Returns:
-      Sections `versions`, `machine`, `engines`, `drawing` and `folders`. Each value is a text, or for an engine one text per
-      completed stage. The text of a failure begins with "error: ".
+    Returns the sections `versions`, `machine`, `engines`, `drawing` and `folders`. Each value is a text, or for an engine one
+    text per completed stage. The text of a failure begins with "error: ".
     """
     requested = os.environ.get("MUJOCO_GL", "")
     backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])

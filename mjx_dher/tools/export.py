@@ -71,16 +71,8 @@ def sizes(policy: Policy) -> tuple[int, int, int]:
 def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
     """Writes the policy to `out`, reads it back and compares. If this fails, an existing file stays unchanged.
 
-    Args:
-      run: settings of the run, for the metadata.
-      file_format: one of FORMATS.
-      out: file to write; see `check`.
-
-    Returns:
-      The largest difference between actions of the file and of the policy, over CHECKED observations.
-
-    Raises:
-      ValueError: `out` cannot be written, or the file differs from the policy.
+    Returns the largest difference between actions of the file and of the policy, over CHECKED observations. Raises ValueError
+    if `out` cannot be written, or the file differs from the policy.
     """
     to_bytes, read = FORMATS[file_format]
     about = metadata(policy, run)

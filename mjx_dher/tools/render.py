@@ -174,12 +174,8 @@ def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int,
 
 
 def stills(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Draws pictures of the first episode side by side, from start to end: [height, STILLS * width, 3] uint8.
-
-    Args:
-      qpos: configurations [N, T+1, nq].
-      goals: goals [N, G].
-      width, height: size of one picture in pixels.
+    """Draws pictures of the first episode side by side, from start to end: [height, STILLS * width, 3] uint8. Configurations
+    are [N, T+1, nq] and goals [N, G]. Width and height, in pixels, are those of one picture.
     """
     # Closer together at the start, where a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)

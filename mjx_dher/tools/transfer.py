@@ -82,17 +82,10 @@ def check_original(env_name: str, python: Path) -> str:
 
 
 def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) -> dict[str, np.ndarray]:
-    """Plays a run's policy in its original task, in `workers` processes of another Python.
+    """Plays a run's policy in its original task, in `workers` processes of another Python. Episode i has the seed `seed` + i.
 
-    Args:
-      python: Python of the virtual environment.
-      seed: seed of the first episode. Others follow.
-
-    Returns:
-      Arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return.
-
-    Raises:
-      ValueError: a process failed. The message includes the end of its output.
+    Returns arrays [episodes]: success and reset_success, bool, and ret, the undiscounted return. Raises ValueError if a process
+    failed. The message includes the end of its output.
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]

@@ -86,7 +86,7 @@ _decode = msgspec.msgpack.Decoder(_Camera | _Drag | _DragStart | _DragEnd | _Con
 
 
 class Guard:
-    """Rules of a port, and its open connections."""
+    """Rules of a port, and its open connections. `host` is the user's address."""
 
     def __init__(self, host: str):
         self.controls: dict[str, Callable[[Any], bool]] = {}  # tests of values, by id of a panel's control

@@ -40,7 +40,7 @@ class Commands:
 
 
 class Panel:
-    """Buttons, counters and curves.
+    """Buttons, counters and curves in the GUI of a viser server.
 
     Args:
       controls: receives a test of allowed values for each control.

@@ -102,14 +102,11 @@ class Tally:
 
 
 class Player:
-    """A policy that plays in an environment.
+    """A policy that plays in an environment. The first episode has the seed `seed`, and others follow.
 
-    An attempt has as many steps as an episode. It begins with a reset, or when goal or object are moved. It counts as a
-    success if the goal is reached at its last step, as in an evaluation. If `renew` is set, the next episode begins then.
-    Moving something unsets `renew`, so that a user can continue.
-
-    Args:
-      seed: seed of the first episode. Others follow.
+    An attempt has as many steps as an episode. It begins with a reset, or when goal or object are moved. It counts as a success
+    if the goal is reached at its last step, as in an evaluation. If `renew` is set, the next episode begins then. Moving
+    something unsets `renew`, so that a user can continue.
     """
 
     def __init__(self, game: Game, act: Act, value: Value | None = None, seed: int = 1):

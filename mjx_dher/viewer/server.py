@@ -28,14 +28,8 @@ _BACK = 1.3  # distance of the page's camera relative to the model's
 class Viewer:
     """A page with a scene and a panel, and its player. Use it in a `with` block, and call `run`.
 
-    Args:
-      sources: policies to choose from. The first one plays.
-      make_env: makes a source's environment.
-      host, port: address of the page, with a port from `address.check`.
-      seed: seed of the first episode.
-
-    Raises:
-      ValueError: the first policy cannot be played, its environment cannot be drawn, or the port is taken.
+    The first of the sources plays. `port` is from `address.check`. Raises ValueError if the first policy cannot be played, its
+    environment cannot be drawn, or the port is taken.
     """
 
     def __init__(self, sources: Sequence[Source], make_env: Callable[[Source], Any], host: str, port: int, seed: int):

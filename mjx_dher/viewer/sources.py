@@ -37,16 +37,10 @@ class Source:
 
 
 def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequence[str] = ()) -> Source:
-    """Source of a run's policy, which must exist.
+    """Source of a run's policy, which must exist, in its own environment or in `env`. `env_kwargs` override the run's.
 
-    Args:
-      label: name for the user.
-      env: environment to play in. Default: the run's, with its arguments.
-      env_kwargs: arguments of the environment as NAME=VALUE, which override the run's.
-
-    Raises:
-      FolderError: it is not a run folder, or has no policy.
-      ValueError: the policy is of another Shadow-hand task, whose observations and goals have the same sizes.
+    Raises FolderError if it is not a run folder, or has no policy, and ValueError if the policy is of another Shadow-hand task,
+    whose observations and goals have the same sizes.
     """
     run = run_folder.read_spec(folder)
     if env not in (None, run.env) and is_hand(env) and is_hand(run.env):

@@ -38,11 +38,8 @@ class Claims:
     def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
         """Makes and locks the folders of the first `lanes` runs that have not ended and that no other process trains.
 
-        Returns:
-          The claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither.
-
-        Raises:
-          FolderError: a run has ended or another process trains it, and this is not a sweep, or a folder is not writable.
+        Returns the claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither. Raises
+        FolderError if a folder is not writable or, except in a sweep, if a run has ended or another process trains it.
         """
         claimed: list[Run] = []
         busy: list[Run] = []

@@ -36,12 +36,7 @@ class Sink(Protocol):
 class CsvSink:
     """metrics.csv, with one line per epoch, written before the next epoch begins. The last column is the run's digest.
 
-    Args:
-      epochs: epochs that had ended, if the run resumes. Later lines are removed.
-      digest: `fingerprint.digest` of the run.
-
-    Raises:
-      FolderError: the file lacks lines of these epochs.
+    If a run resumes after some epochs, later lines are removed. Raises FolderError if the file lacks lines of these epochs.
     """
 
     def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
@@ -72,10 +67,8 @@ class CsvSink:
 
 
 class JsonlSink:
-    """metrics.jsonl, with one object per epoch. Numbers that are not finite are null.
-
-    Args:
-      epochs: epochs that had ended, if the run resumes. Missing lines are taken from metrics.csv.
+    """metrics.jsonl, with one object per epoch. Numbers that are not finite are null. If a run resumes after some epochs,
+    missing lines are taken from metrics.csv.
     """
 
     def __init__(self, path: Path, epochs: int = 0):
@@ -95,11 +88,8 @@ class JsonlSink:
 def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Reads the lines of a metrics.csv as numbers, up to the first truncated one. The digest stays text.
 
-    Args:
-      digests: digests that the run has had, in order, or None if unknown.
-
-    Raises:
-      FolderError: a line is missing, has an invalid value, or belongs to another run.
+    `digests` are those that the run has had, in order. Raises FolderError if a line is missing, has an invalid value, or
+    belongs to another run.
     """
     head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
     rows: list[dict[str, Any]] = []
@@ -166,9 +156,7 @@ class TensorBoardSink:
 class WandbSink:
     """A Weights & Biases run, configured by its environment variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
 
-    Args:
-      folder: run folder. It holds offline logs, and a resumed run continues the same W&B run.
-      content: content of config.json.
+    The run folder holds offline logs, and a resumed run continues the same W&B run.
     """
 
     def __init__(self, folder: Path, content: dict[str, Any]):

@@ -37,11 +37,8 @@ FINISHED, FAILED = contents.FINISHED, contents.FAILED
 
 @contextlib.contextmanager
 def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
-    """Makes and locks the folder of a new run: `out`, or a new one under runs/. Removes it if it stays empty.
-
-    Raises:
-      FolderError: `out` is not an empty folder, or another process has locked it.
-      OSError: the folder cannot be made or written to.
+    """Makes and locks the folder of a new run: `out`, or a new one under runs/. Removes it if it stays empty. Raises
+    FolderError if `out` is not an empty folder, or another process has locked it.
     """
     if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
         raise FolderError(f"out: {out} exists and is not a folder")
@@ -150,11 +147,8 @@ def checkpoints_to_resume(path: Path) -> list[Path]:
 
 
 def read_versioned(file: Path, schema: int) -> dict[str, Any]:
-    """Reads a JSON object whose key "schema" is `schema`.
-
-    Raises:
-      FileNotFoundError: there is no such file.
-      FolderError: it cannot be read, or has another schema.
+    """Reads a JSON object whose key "schema" is `schema`. Raises FileNotFoundError if there is none, and FolderError if it
+    cannot be read, or has another schema.
     """
     content = files.read_json(file)
     written = content.get("schema") if isinstance(content, dict) else None
@@ -174,11 +168,8 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def read_config_file(file: Path) -> dict[str, Any]:
-    """Reads a run's config.json from any path.
-
-    Raises:
-      FileNotFoundError: there is no such file.
-      FolderError: it does not describe a run, or has another schema.
+    """Reads a run's config.json from any path. Raises FileNotFoundError if there is none, and FolderError if it does not
+    describe a run, or has another schema.
     """
     content = read_versioned(file, SCHEMA)
     with checked(file, "does not describe a run"):

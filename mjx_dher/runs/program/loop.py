@@ -103,13 +103,8 @@ def run(
 ) -> Iterator[Progress]:
     """Runs a compiled program, yielding after every epoch. Metrics stay arrays.
 
-    The device works in its own thread, so signal handlers can run during an epoch.
-
-    Args:
-      fetch: converts a tree of arrays to NumPy.
-
-    Raises:
-      ValueError: an error of `env.check` after an epoch.
+    The device works in its own thread, so signal handlers can run during an epoch. `fetch` converts a tree of arrays to NumPy.
+    Raises ValueError for an error of `env.check` after an epoch.
     """
     num_epochs = config_lib.num_epochs(config, env.episode_length)
     state = jax.block_until_ready(start.state)
@@ -140,9 +135,7 @@ def run(
 
 def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0, layout: Layout = ONE) -> Compiled:
     """Compiles `program` for one run, or for L parallel runs if `key` and `hparams` lead with [L]. Their values do not matter.
-
-    Args:
-      updates: updates per run. For many updates, a longer search by the compiler pays.
+    If each run makes many `updates`, the compiler searches longer.
     """
 
     def epoch_and_check(state: TrainState) -> tuple[TrainState, Metrics, Array]:

@@ -226,9 +226,7 @@ def evaluate(
 ) -> Outcome:
     """Outcomes [lanes, episodes] of the final evaluation of each lane, as NumPy arrays.
 
-    Args:
-      keys: keys of the runs. Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`.
-      fetch: converts arrays of all devices to NumPy.
+    Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`. `fetch` converts arrays of all devices to NumPy.
     """
 
     def key_of(number: int) -> Any:
