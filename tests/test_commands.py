@@ -12,7 +12,7 @@ from conftest import EXAMPLES, names
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec
-from mjx_dher.cli import completion, listing
+from mjx_dher.cli import show
 from mjx_dher.cli import train as cli_train
 from mjx_dher.cli.commands import COMMANDS
 from mjx_dher.components import COMPONENTS
@@ -46,13 +46,13 @@ def test_the_version_is_the_package_s(capsys):
 
 
 def test_list_names_all_that_there_is(capsys):
-    assert set(listing.FIELDS.values()) == set(COMPONENTS)
-    assert tuple(listing.ENGINES) == spec.ENGINES
-    assert tuple(listing.PRESETS) == ("auto", *presets.PRESETS)
+    assert set(show.FIELDS.values()) == set(COMPONENTS)
+    assert tuple(show.ENGINES) == spec.ENGINES
+    assert tuple(show.PRESETS) == ("auto", *presets.PRESETS)
     assert cli.main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    number = sum(map(len, [*COMPONENTS.values(), listing.ENGINES, listing.PRESETS, bundled.names()]))
-    assert len(lines) == len(listing.KINDS) + number
+    number = sum(map(len, [*COMPONENTS.values(), show.ENGINES, show.PRESETS, bundled.names()]))
+    assert len(lines) == len(show.KINDS) + number
     assert "kernels (--weight-kernel)" in lines
     assert cli.main(["list", "tasks", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"tasks": {name: row.line for name, row in COMPONENTS["env"].items()}}
@@ -86,7 +86,7 @@ def completions(words, script):
 
 def test_bash_completes_commands_and_options(tmp_path):
     script = tmp_path / "mjx-dher"
-    script.write_text(completion.script("bash"))
+    script.write_text(show.completion("bash"))
     assert {"eval", "export", "engines"} == set(completions(["mjx-dher", "e"], script))
     assert completions(["mjx-dher", "eval", "--epi"], script) == ["--episodes"]
     assert {"--sampler"} <= set(completions(["mjx-dher", "train", "--sam"], script))

@@ -109,8 +109,8 @@ def shell(code, redirect):
 
 
 DOCTOR = (
-    TRAINS.replace("from mjx_dher.cli import train", "from mjx_dher.cli import doctor")
-    .replace("train.train_command = fake", "doctor.doctor_command = fake")
+    TRAINS.replace("from mjx_dher.cli import train", "from mjx_dher.cli import show")
+    .replace("train.train_command = fake", "show.doctor_command = fake")
     .replace("cli.main([])", "cli.main(['doctor'])")
 )
 

@@ -23,13 +23,13 @@ COMMANDS = {
     "transfer": "mjx_dher.cli.transfer:transfer_command",
     "export": "mjx_dher.cli.export:export_command",
     "sweep": "mjx_dher.cli.sweep:sweep_command",
-    "plot": "mjx_dher.cli.plot:plot_command",
+    "plot": "mjx_dher.cli.report:plot_command",
     "report": "mjx_dher.cli.report:report_command",
-    "list": "mjx_dher.cli.listing:list_command",
-    "check": "mjx_dher.cli.check:check_command",
-    "engines": "mjx_dher.cli.engines:engines_command",
-    "doctor": "mjx_dher.cli.doctor:doctor_command",
-    "completion": "mjx_dher.cli.completion:completion_command",
+    "list": "mjx_dher.cli.show:list_command",
+    "check": "mjx_dher.cli.show:check_command",
+    "engines": "mjx_dher.cli.show:engines_command",
+    "doctor": "mjx_dher.cli.show:doctor_command",
+    "completion": "mjx_dher.cli.show:completion_command",
 }
 # Our flags, and their names in other libraries.
 _FOREIGN = {

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -16,11 +18,12 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 from rich.table import Column, Table
+from typing_extensions import Doc
 
-from mjx_dher import envs
+from mjx_dher import __version__, envs
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.lookup import check_name
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
 from mjx_dher.validation import check_count, check_number
 
@@ -28,31 +31,37 @@ if TYPE_CHECKING:
     from mjx_dher.sweeps import comparison
 
 CURVE_WIDTH = 24  # characters of the live curve
-Devices = int | Literal["all"]  # type of --devices
+# Types of options.
+Devices = int | Literal["all"]
+EnvKwargs = Annotated[tuple[str, ...], Doc("Arguments of the environment as NAME=VALUE, which override the run's.")]
+Physics = Annotated[str | None, Doc("Physics: native, jax, warp or auto. Default: the run's.")]
+Trust = Annotated[
+    bool, Doc("Use code and data that the run folder names even if you have not trained with them on this machine.")
+]
 VIEW_PORT = 8080  # port of the viewer
 SECONDS_PER_LINE = 10.0  # between a sweep's lines of progress without a terminal
-
-LEAST_LIKELY_POLYAK = 0.5  # a smaller one is probably meant as tau
 
 
 def warn_of_tau(polyak: float, console: Console) -> None:
     """Explains a small polyak, which is probably meant as the tau of other libraries."""
-    if polyak < LEAST_LIKELY_POLYAK:
+    if polyak < 0.5:
         console.print(
             f"polyak {polyak:g} keeps {polyak:.0%} of the old target at each soft update: it is 1 - tau in other libraries"
         )
-
-
-def check_episodes(episodes: int, seed: int) -> None:
-    """Raises ValueError for an invalid number of episodes or seed."""
-    check_count("episodes", episodes)
-    check_number("seed", seed, "[0, 4294967295]")
 
 
 def check_engine(engine: str | None) -> None:
     """Raises ValueError for an unknown engine."""
     if engine is not None:
         check_name("engine", engine, ENGINES)
+
+
+def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Sequence[str] = ()) -> None:
+    """Raises ValueError for an invalid option of a command that plays episodes."""
+    check_count("episodes", episodes)
+    check_number("seed", seed, "[0, 4294967295]")
+    check_engine(engine)
+    to_arguments(env_kwargs)
 
 
 def make_env(run: RunSpec, engine: str | None = None) -> Any:
@@ -75,12 +84,19 @@ def settle_compiler(engine: str) -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_enable_concurrency_optimized_scheduler=false".strip()
 
 
-def try_components(env: Any, specs: Sequence[RunSpec], console: Console) -> None:
-    """Tests the custom components of runs before anything is compiled or written. Raises ValueError for the first violation."""
-    if any(custom_components(spec) for spec in specs):
+def try_components(specs: Sequence[RunSpec], console: Console, env: Any = None, on_cpu: bool = False) -> None:
+    """Tests the custom components of runs, grouped by environment, before anything is compiled or written.
+
+    Without `env`, the environments are made, with native physics in place of warp if `on_cpu`. Raises ValueError for the first
+    violation.
+    """
+    own = [spec for spec in specs if custom_components(spec)]
+    for _, group in itertools.groupby(own, key=lambda spec: spec.env):
         from mjx_dher.testing import verdicts
 
-        for line in verdicts.check(env, specs):
+        runs = list(group)
+        made = make_env(runs[0], "native" if on_cpu and runs[0].engine == "warp" else None) if env is None else env
+        for line in verdicts.check(made, runs):
             console.print(line)
 
 
@@ -106,6 +122,21 @@ def read_run(path: Path, console: Console) -> RunSpec:
     for text in run_folder.changed_code(content, spec):
         console.print(f"since {path} was trained: {text}")
     return spec
+
+
+def join(distributed: bool, described: Mapping[str, Any], console: Console) -> Console:
+    """Joins this process to the others if the command is `distributed`. Returns a console that prints in the first process.
+
+    Raises ValueError if there are no other processes, or their versions or settings in `described` differ.
+    """
+    if not distributed:
+        return console
+    from mjx_dher.parallel import processes
+
+    processes.connect()
+    versions = {"version of mjx_dher": __version__, "version of jax": metadata.version("jax"), **fingerprint.jax_flags()}
+    processes.check_equal({**versions, **described})
+    return console if processes.leads() else Console(quiet=True)
 
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:

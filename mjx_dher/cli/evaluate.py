@@ -11,20 +11,12 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from mjx_dher.cli import common
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import (
-    changed_arguments,
-    check_engine,
-    check_episodes,
-    find_run,
-    make_env,
-    print_summary,
-    read_run,
-    settle_compiler,
-)
+from mjx_dher.cli.common import EnvKwargs, Physics, Trust, make_env, print_summary
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.spec import RunSpec, to_arguments
+from mjx_dher.spec import RunSpec
 from mjx_dher.system.caches import keep_compiled_programs
 
 
@@ -38,12 +30,9 @@ class EvalArgs:
     """Episodes to play."""
     seed: int = 1
     """Seed of the starts and goals."""
-    engine: str | None = None
-    """Physics: native, jax, warp or auto. Default: the run's."""
-    env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment as NAME=VALUE, which override the run's."""
-    trust: bool = False
-    """Use code and data that the run folder names even if you have not trained with them on this machine."""
+    engine: Physics = None
+    env_kwargs: EnvKwargs = ()
+    trust: Trust = False
     json: bool = False
     """Print one line of JSON per run instead, and remarks to standard error."""
 
@@ -53,14 +42,12 @@ def eval_command(argv: list[str], console: Console) -> int:
     args = parse(EvalArgs, argv)
     if not args.runs:
         raise ValueError("eval needs one or more run folders or bundled policies; got none")
-    check_episodes(args.episodes, args.seed)
-    check_engine(args.engine)
-    to_arguments(args.env_kwargs)
+    common.check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
     remarks = PlainConsole(stderr=True, soft_wrap=True) if args.json else console
-    folders = [find_run(run, remarks) for run in args.runs]
-    runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
+    folders = [common.find_run(run, remarks) for run in args.runs]
+    runs = [common.changed_arguments(common.read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:
-        settle_compiler(args.engine or run.engine)
+        common.settle_compiler(args.engine or run.engine)
     from mjx_dher.policy.load import load_policy
 
     policies = [load_policy(folder) for folder in folders]  # all, before any is played

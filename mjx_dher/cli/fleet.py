@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from mjx_dher import spec
 from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_components
 from mjx_dher.fleet import chunks, cluster, driver, worker
 from mjx_dher.fleet.chunks import Chunk
@@ -67,7 +65,8 @@ def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec]]
     with cluster.joined(str(order.fleet.ray), code) as ray:
         task = chunks.task_of(order.fleet.ray_cpus, ray.resources())
         trials = order.make_trials("gpu" if task.gpus else "cpu")
-        _try_own(trials, order.engine, console)  # JAX starts here, after Ray has forked its processes
+        settle_compiler(order.engine)
+        try_components(trials, console, on_cpu=True)  # JAX starts here, after Ray has forked its processes
         report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
         if order.storage is not None:
             try:
@@ -121,15 +120,6 @@ def _train(
         for path in (order.storage, order.storage.parent) if order.fleet.storage is None else (order.storage,):
             with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
-
-
-def _try_own(specs: Sequence[RunSpec], engine: str, console: Console) -> None:
-    """Tests custom components on this machine."""
-    for _, group in itertools.groupby(specs, key=lambda run: run.env):
-        own = list({dataclasses.replace(run, seed=0): None for run in group})
-        if any(map(spec.custom_components, own)):
-            settle_compiler(engine)
-            try_components(make_env(own[0], "native" if own[0].engine == "warp" else None), own, console)
 
 
 class _Screen:

@@ -11,10 +11,10 @@ from rich.console import Console
 
 from mjx_dher import envs
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import changed_arguments, check_engine, check_episodes, find_run, make_env, read_run
+from mjx_dher.cli.common import EnvKwargs, Physics, Trust, changed_arguments, check_play, find_run, make_env, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.spec import RunSpec, to_arguments
+from mjx_dher.spec import RunSpec
 from mjx_dher.system.caches import check_platform
 
 
@@ -35,12 +35,9 @@ class RenderArgs:
     """Episodes to play, one after the other."""
     seed: int = 1
     """Seed of the starts, the goals and the random actions."""
-    env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment as NAME=VALUE, which override the run's."""
-    engine: str | None = None
-    """Physics: native, jax, warp or auto. Default: the run's."""
-    trust: bool = False
-    """Use code and data that the run folder names even if you have not trained with them on this machine."""
+    env_kwargs: EnvKwargs = ()
+    engine: Physics = None
+    trust: Trust = False
     width: int = 640
     """Width in pixels."""
     height: int = 480
@@ -56,9 +53,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
     args = parse(RenderArgs, argv)
     render.check_output(args.out, args.width, args.height, args.overwrite)
-    check_episodes(args.episodes, args.seed)
-    check_engine(args.engine)
-    to_arguments(args.env_kwargs)
+    check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
     if args.run is not None and args.env is None:
         folder = find_run(args.run, console)
         played, policy = read_run(folder, console), load_policy(folder)

@@ -1,4 +1,4 @@
-"""The command `report`."""
+"""The commands `plot` and `report`."""
 
 from __future__ import annotations
 
@@ -10,13 +10,70 @@ import tyro
 from rich.console import Console
 
 from mjx_dher.cli import commands
+from mjx_dher.cli.common import Trust, compare, print_table
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
-from mjx_dher.tools import figures
+from mjx_dher.tools import curves, figures
 from mjx_dher.validation import check_number
 
 EPISODES = 3  # per video
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotArgs:
+    """Draw the curves of a run, of several runs together, or of a sweep.
+
+    One run: success, returns, values and losses, in its folder. Several runs: their success together, in the current folder. A
+    sweep: learning curves, epochs to a threshold, and comparison, in its folder. comparison.csv is rewritten.
+    """
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders, or the folder of one sweep."""
+    out: Path | None = None
+    """Folder for the pictures. Default: the folder of the run or sweep, or the current folder for several runs."""
+    threshold: float = 0.9
+    """Success rate for the time to success (for a sweep)."""
+    baseline: str = "future"
+    """Setting to compare with: a sampler, or a setting as named in the table (for a sweep)."""
+    formats: tuple[str, ...] = ("png", "svg")
+    """Formats of the pictures: png, svg, pdf."""
+
+
+def plot_command(argv: list[str], console: Console) -> int:
+    """Draws runs, or a sweep."""
+    args = commands.parse(PlotArgs, argv)
+    check_number("threshold", args.threshold, "(0, 1]", float)
+    figures.check(args.formats)
+    if grid.is_sweep(args.folders):
+        return _plot_sweep(args, console)
+    runs = [curves.read_curve(folder) for folder in args.folders]
+    together = len(runs) > 1
+    out = args.out or (Path() if together else args.folders[0])
+    files.make_folder(out)
+    if together:
+        print_table(*curves.curves_table(runs), console)
+    name = "curves" if together else curves.CURVE
+    for ending in args.formats:  # drawn for each, because writing a figure changes its layout
+        path = out / f"{name}.{ending}"
+        figures.write(curves.draw_together(runs) if together else curves.draw_curve(runs[0]), path)
+        console.print(f"wrote {path}")
+    return 0
+
+
+def _plot_sweep(args: PlotArgs, console: Console) -> int:
+    from mjx_dher.sweeps import comparison, plotting, tables
+
+    (folder,) = args.folders
+    by_env = comparison.groups(tables.read(folder))
+    out = args.out or folder
+    files.make_folder(out)
+    rows = compare(out, by_env, args.baseline, args.threshold, console)
+    for env, groups in by_env.items():
+        own = [row for row in rows if row.env == env]
+        for path in plotting.write(out, groups, own, args.threshold, args.formats):
+            console.print(f"wrote {path}")
+    return 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +91,7 @@ class ReportArgs:
     """Replace an existing file."""
     video: bool = False
     """First draw a video of the run, or of a sweep's best run per task, into the folder (extra video)."""
-    trust: bool = False
-    """Use code and data that the run folder names even if you have not trained with them on this machine."""
+    trust: Trust = False
     threshold: float = 0.9
     """Success rate for the time to success (for a sweep)."""
     baseline: str = "future"
@@ -52,18 +108,16 @@ def report_command(argv: list[str], console: Console) -> int:
         files.check_file(args.out, (".html",), args.overwrite)
     from mjx_dher.sweeps import report
 
-    def tell(text: str) -> None:
-        console.print(text)
-
     if args.video:
         for run, out in _to_film(args.folder, sweep):
             own = ("--out", str(out), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
             commands.run("render", [str(run), *own], console)
+    tell = console.print
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
     out = args.out or args.folder / report.REPORT
     with files.atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
-    tell(f"wrote {out}")
+    console.print(f"wrote {out}")
     return 0
 
 

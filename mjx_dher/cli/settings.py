@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import tempfile
@@ -11,7 +12,7 @@ from typing import Any
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
@@ -124,3 +125,16 @@ def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
         f" the compiled program needs more; {free} is free",
         f"physics {run_folder.engine_name(env)}, learner on {jax.devices()[0].device_kind}",
     ]
+
+
+def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:
+    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run. Raises FolderError if it
+    holds something else, or the run has ended.
+    """
+    if not resumes or out is None or not (out / run_folder.CONFIG_FILE).exists():
+        return stack.enter_context(run_folder.claim_new(out, spec))
+    stack.enter_context(files.lock(out))
+    run_folder.check_same(out, spec)
+    if results.has_result(out) and results.read_result(out)["status"] != run_folder.FAILED:
+        raise FolderError(f"out: {out} holds this run, and it has ended")
+    return out

@@ -15,8 +15,7 @@ from typing_extensions import Doc
 from mjx_dher import components, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import Devices, Screen, compare, make_env, settle_compiler, try_components
-from mjx_dher.cli.processes import join
+from mjx_dher.cli.common import Devices, Screen, compare, join, make_env, settle_compiler, try_components
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet.options import FleetOptions
 from mjx_dher.runs.folder import fingerprint
@@ -285,10 +284,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
     from mjx_dher.sweeps import sweep
 
     prepare()
-    for _, group in itertools.groupby(todo, key=lambda run: run.env):
-        own = list({dataclasses.replace(run, seed=0): None for run in group})
-        if any(map(spec.custom_components, own)):
-            try_components(make_env(own[0]), own, console)
+    try_components(todo, console)
     screen = Screen(console, todo)
     try:
         sweep.run(

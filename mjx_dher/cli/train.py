@@ -14,20 +14,9 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup, presets, spec
-from mjx_dher.cli import settings
+from mjx_dher.cli import common, settings
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import (
-    VIEW_PORT,
-    Devices,
-    Screen,
-    check_engine,
-    make_env,
-    print_summary,
-    settle_compiler,
-    try_components,
-    warn_of_tau,
-)
-from mjx_dher.cli.processes import check_out, claim, join
+from mjx_dher.cli.common import VIEW_PORT, Devices, Physics, Screen, Trust, make_env, settle_compiler
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, results, run_folder
@@ -86,10 +75,8 @@ class ResumeArgs:
 
     run: tyro.conf.Positional[Path]
     """Run folder."""
-    engine: str | None = None
-    """Physics: native, jax, warp or auto. Default: the run's."""
-    trust: bool = False
-    """Use code and data that the run folder names even if you have not trained with them on this machine."""
+    engine: Physics = None
+    trust: Trust = False
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
     total_steps: int | None = None
@@ -108,14 +95,14 @@ def train_command(argv: list[str], console: Console) -> int:
     settle_compiler(args.spec.engine)
     own = {"seed": args.spec.seed, "sources": fingerprint.sources(args.spec), "devices": args.devices}
     described = {**fingerprint.settings(args.spec), **dataclasses.asdict(args.options), **own}
-    screen = join(args.distributed, described, console)
+    screen = common.join(args.distributed, described, console)
     from mjx_dher.parallel import processes
 
     with contextlib.ExitStack() as stack:
-        folder = Path(processes.broadcast(lambda: str(claim(stack, args.out, args.spec, resumes=args.distributed))))
+        folder = Path(processes.broadcast(lambda: str(settings.claim(stack, args.out, args.spec, resumes=args.distributed))))
         prepare()
         env = make_env(args.spec)
-        try_components(env, [args.spec], screen)
+        common.try_components([args.spec], screen, env)
         beside = stack.enter_context(viewer(folder, screen)) if viewer and processes.leads() else None
         after_epoch = (lambda: None) if beside is None else beside.after_epoch
         return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, after_epoch)
@@ -150,10 +137,10 @@ def resume_command(argv: list[str], console: Console) -> int:
     asked = parse(ResumeArgs, argv)  # to find the run
     content = run_folder.read_config(asked.run)
     args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
-    check_engine(args.engine)
+    common.check_engine(args.engine)
     settle_compiler(args.engine or content["physics"])
     described = {name: str(value) for name, value in vars(args).items()} | {"digest": content["digest"]}
-    screen = join(args.distributed, described, console)
+    screen = common.join(args.distributed, described, console)
     from mjx_dher.parallel import processes
 
     with contextlib.ExitStack() as stack:
@@ -260,9 +247,13 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
 def _parse(argv: list[str], default: TrainArgs, origin: str) -> TrainArgs:
     head = f"{inspect.getdoc(TrainArgs)}\n\nDefaults below are {origin}."
     args = parse(TrainArgs, argv, description=head, default=default, config=(tyro.conf.OmitArgPrefixes,))
-    alone = (spec.validate, args.spec), (args.options.check,), (check_devices, args.devices)
-    check_all(*alone, (check_out, args.distributed, args.out))
+    check_all((spec.validate, args.spec), (args.options.check,), (check_devices, args.devices), (_check_out, args))
     return args
+
+
+def _check_out(args: TrainArgs) -> None:
+    if args.distributed and args.out is None:
+        raise ValueError("out must name the run folder with --distributed, so that the same command can resume it; got none")
 
 
 def _train(
@@ -294,7 +285,7 @@ def _train(
             figures.preload()
         after_epoch()
 
-    warn_of_tau(run.hparams.polyak, console)
+    common.warn_of_tau(run.hparams.polyak, console)
     try:
         (result,) = driver.train_runs(
             env,
@@ -318,7 +309,7 @@ def _train(
     if result.status == run_folder.FAILED:
         _draw(folder, curve, console)
         raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")
-    print_summary(result.content, console)
+    common.print_summary(result.content, console)
     console.print(f"run folder: {folder}")
     _draw(folder, curve, console)
     return 0

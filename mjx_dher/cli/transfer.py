@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import check_engine, check_episodes, find_run, make_env, print_summary, read_run, settle_compiler
+from mjx_dher.cli.common import check_play, find_run, make_env, print_summary, read_run, settle_compiler
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.system.caches import keep_compiled_programs
 
@@ -38,8 +38,7 @@ class TransferArgs:
 def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
     args = parse(TransferArgs, argv)
-    check_engine(args.engine)
-    check_episodes(args.episodes, args.seed)
+    check_play(args.seed, args.engine, args.episodes)
     folder = find_run(args.run, console)
     run = read_run(folder, console)
     settle_compiler(args.engine or run.engine)

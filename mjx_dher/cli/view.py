@@ -16,7 +16,7 @@ from rich.console import Console
 
 from mjx_dher import envs
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import VIEW_PORT, check_engine, check_episodes, find_run, read_run
+from mjx_dher.cli.common import VIEW_PORT, EnvKwargs, Trust, check_play, find_run, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments
@@ -53,10 +53,8 @@ class ViewArgs:
     """Physics: native, jax, warp or auto. Default: native for the built-in tasks."""
     seed: int = 1
     """Seed of the first start and goal."""
-    env_kwargs: tuple[str, ...] = ()
-    """Arguments of the environment as NAME=VALUE, which override the runs'."""
-    trust: bool = False
-    """Use code and data that the run folder names even if you have not trained with them on this machine."""
+    env_kwargs: EnvKwargs = ()
+    trust: Trust = False
     page: tyro.conf.OmitArgPrefixes[Page] = dataclasses.field(default_factory=Page)
 
 
@@ -85,9 +83,7 @@ def _view(args: ViewArgs, console: Console) -> int:
         raise ValueError(f"view needs run folders, bundled policies ({', '.join(bundled.names())}), or --env")
     if args.env is not None:
         check_name("env", args.env, envs.list_envs(), custom=True)
-    check_engine(args.engine)
-    check_episodes(1, args.seed)
-    to_arguments(args.env_kwargs)
+    check_play(args.seed, args.engine, env_kwargs=args.env_kwargs)
     folders = [(str(run), find_run(run, console)) for run in args.runs]
     for _, folder in folders:
         read_run(folder, console)
