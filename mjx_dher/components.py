@@ -28,188 +28,165 @@ _ENTROPY = ("entropy_weight", "entropy_target")
 _CONTRAST = ("energy", "contrastive_loss", "representation_size", "same_episode", "logsumexp_penalty")
 _QUANTILES = ("num_quantiles", "dropped_quantiles")
 
-# Built-in components by `RunSpec` field and name. Each field also takes a custom component as "module:attribute".
-COMPONENTS: dict[str, dict[str, Component]] = {
+# Built-in components by `RunSpec` field and name, with paths inside mjx_dher. Each field also takes a custom component as
+# "module:attribute".
+_TABLE = {
     "env": {
-        "arm_reach": Component("mjx_dher.envs.arms:ArmReach", "move the end of a Panda to a goal (JaxGCRL's arm_reach)"),
-        "arm_push_easy": Component(
-            "mjx_dher.envs.arms:ArmPushEasy", "push a cube to the square beside it (JaxGCRL's arm_push_easy)"
-        ),
-        "arm_push_hard": Component("mjx_dher.envs.arms:ArmPushHard", "the same on larger squares (JaxGCRL's arm_push_hard)"),
-        "arm_grasp": Component("mjx_dher.envs.arms:ArmGrasp", "close the gripper around a cube (JaxGCRL's arm_grasp)"),
-        "arm_binpick_easy": Component(
-            "mjx_dher.envs.arms:ArmBinpickEasy", "move a cube into another bin (JaxGCRL's arm_binpick_easy)"
-        ),
-        "block": Component("mjx_dher.envs.hand:Block", "bring a block in the Shadow hand to a pose (HandManipulateBlock-v1)"),
+        "arm_reach": Component("envs.arms:ArmReach", "move the end of a Panda to a goal (JaxGCRL's arm_reach)"),
+        "arm_push_easy": Component("envs.arms:ArmPushEasy", "push a cube to the square beside it (JaxGCRL's arm_push_easy)"),
+        "arm_push_hard": Component("envs.arms:ArmPushHard", "the same on larger squares (JaxGCRL's arm_push_hard)"),
+        "arm_grasp": Component("envs.arms:ArmGrasp", "close the gripper around a cube (JaxGCRL's arm_grasp)"),
+        "arm_binpick_easy": Component("envs.arms:ArmBinpickEasy", "move a cube into another bin (JaxGCRL's arm_binpick_easy)"),
+        "block": Component("envs.hand:Block", "bring a block in the Shadow hand to a pose (HandManipulateBlock-v1)"),
         "block_rotate_parallel": Component(
-            "mjx_dher.envs.hand:BlockRotateParallel", "turn a block to another face (HandManipulateBlockRotateParallel-v1)"
+            "envs.hand:BlockRotateParallel", "turn a block to another face (HandManipulateBlockRotateParallel-v1)"
         ),
         "block_rotate_xyz": Component(
-            "mjx_dher.envs.hand:BlockRotateXYZ", "turn a block to any orientation (HandManipulateBlockRotateXYZ-v1)"
+            "envs.hand:BlockRotateXYZ", "turn a block to any orientation (HandManipulateBlockRotateXYZ-v1)"
         ),
         "block_rotate_z": Component(
-            "mjx_dher.envs.hand:BlockRotateZ", "turn a block about the vertical (HandManipulateBlockRotateZ-v1)"
+            "envs.hand:BlockRotateZ", "turn a block about the vertical (HandManipulateBlockRotateZ-v1)"
         ),
-        "egg": Component("mjx_dher.envs.hand:Egg", "bring an egg in the Shadow hand to a pose (HandManipulateEgg-v1)"),
-        "egg_rotate": Component("mjx_dher.envs.hand:EggRotate", "turn an egg to any orientation (HandManipulateEggRotate-v1)"),
-        "hand_reach": Component("mjx_dher.envs.hand:HandReach", "bring the fingertips to goals (HandReach-v3)"),
-        "pen": Component("mjx_dher.envs.hand:Pen", "bring a pen in the Shadow hand to a pose (HandManipulatePen-v1)"),
-        "pen_rotate": Component("mjx_dher.envs.hand:PenRotate", "turn a pen to any direction (HandManipulatePenRotate-v1)"),
+        "egg": Component("envs.hand:Egg", "bring an egg in the Shadow hand to a pose (HandManipulateEgg-v1)"),
+        "egg_rotate": Component("envs.hand:EggRotate", "turn an egg to any orientation (HandManipulateEggRotate-v1)"),
+        "hand_reach": Component("envs.hand:HandReach", "bring the fingertips to goals (HandReach-v3)"),
+        "pen": Component("envs.hand:Pen", "bring a pen in the Shadow hand to a pose (HandManipulatePen-v1)"),
+        "pen_rotate": Component("envs.hand:PenRotate", "turn a pen to any direction (HandManipulatePenRotate-v1)"),
         "pick_and_place": Component(
-            "mjx_dher.envs.pick_and_place:PickAndPlace",
-            "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)",
+            "envs.pick_and_place:PickAndPlace", "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)"
         ),
-        "push": Component("mjx_dher.envs.push:Push", "push a block on the table to a goal (FetchPush-v4)"),
-        "reach": Component("mjx_dher.envs.reach:Reach", "move the gripper to a goal (FetchReach-v4)"),
-        "slide": Component("mjx_dher.envs.slide:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
+        "push": Component("envs.push:Push", "push a block on the table to a goal (FetchPush-v4)"),
+        "reach": Component("envs.reach:Reach", "move the gripper to a goal (FetchReach-v4)"),
+        "slide": Component("envs.slide:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
     },
     "sampler": {
-        "random": Component("mjx_dher.samplers:random", "any goal of any episode"),
-        "episode": Component("mjx_dher.samplers:episode", "any goal of the episode"),
-        "future": Component("mjx_dher.samplers:future", "any goal after the step (Andrychowicz et al. 2017)"),
-        "final": Component("mjx_dher.samplers:final", "the last goal of the episode"),
-        "geometric": Component("mjx_dher.samplers:geometric", "goals after the step, those t steps later with weight gamma^t"),
+        "random": Component("samplers:random", "any goal of any episode"),
+        "episode": Component("samplers:episode", "any goal of the episode"),
+        "future": Component("samplers:future", "any goal after the step (Andrychowicz et al. 2017)"),
+        "final": Component("samplers:final", "the last goal of the episode"),
+        "geometric": Component("samplers:geometric", "goals after the step, those t steps later with weight gamma^t"),
         "closest": Component(
-            "mjx_dher.by_distance:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
+            "by_distance:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
         ),
         "epsilon_closest": Component(
-            "mjx_dher.by_distance:epsilon_closest",
+            "by_distance:epsilon_closest",
             "any future goal with probability epsilon, else the closest (method 2)",
             (*_BY_METRIC, "epsilon"),
         ),
-        "weighted": Component("mjx_dher.by_distance:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
+        "weighted": Component("by_distance:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
         "next_future": Component(
-            "mjx_dher.contrib.goals:next_future",
-            "the next goal with probability 1/her_k, else any future one (Next-Future)",
+            "contrib.goals:next_future", "the next goal with probability 1/her_k, else any future one (Next-Future)"
         ),
     },
     "weight_kernel": {
-        "linear": Component("mjx_dher.by_distance:linear", "weights fall linearly with distance"),
-        "inverse": Component("mjx_dher.by_distance:inverse", "weights fall as a power of distance"),
-        "softmax": Component("mjx_dher.by_distance:softmax", "weights fall exponentially with distance"),
+        "linear": Component("by_distance:linear", "weights fall linearly with distance"),
+        "inverse": Component("by_distance:inverse", "weights fall as a power of distance"),
+        "softmax": Component("by_distance:softmax", "weights fall exponentially with distance"),
     },
     "weight_normalization": {
-        "mean": Component("mjx_dher.by_distance:by_mean", "distances relative to their mean"),
-        "sum": Component("mjx_dher.by_distance:by_sum", "distances relative to their sum: nearly future"),
-        "max": Component("mjx_dher.by_distance:by_max", "distances relative to the largest"),
-        "minmax": Component("mjx_dher.by_distance:by_range", "distances from the smallest to the largest, as 0 to 1"),
-        "none": Component("mjx_dher.by_distance:by_scale", "distances relative to weight_scale, in metres", ("weight_scale",)),
-        "far": Component("mjx_dher.by_distance:mirrored", "mean, mirrored: farther goals likelier"),
+        "mean": Component("by_distance:by_mean", "distances relative to their mean"),
+        "sum": Component("by_distance:by_sum", "distances relative to their sum: nearly future"),
+        "max": Component("by_distance:by_max", "distances relative to the largest"),
+        "minmax": Component("by_distance:by_range", "distances from the smallest to the largest, as 0 to 1"),
+        "none": Component("by_distance:by_scale", "distances relative to weight_scale, in metres", ("weight_scale",)),
+        "far": Component("by_distance:mirrored", "mean, mirrored: farther goals likelier"),
     },
     "metric": {
-        "position": Component("mjx_dher.samplers:position", "Euclidean distance between goals"),
-        "velocity": Component("mjx_dher.contrib.metrics:velocity", "distance in position and velocity to rest at the goal"),
+        "position": Component("samplers:position", "Euclidean distance between goals"),
+        "velocity": Component("contrib.metrics:velocity", "distance in position and velocity to rest at the goal"),
         "resting_point": Component(
-            "mjx_dher.contrib.metrics:resting_point", "distance from the point where Slide's puck would come to rest"
+            "contrib.metrics:resting_point", "distance from the point where Slide's puck would come to rest"
         ),
         "resting_point_rough": Component(
-            "mjx_dher.contrib.metrics:resting_point_rough", "the same with the friction of Push's and PickAndPlace's block"
+            "contrib.metrics:resting_point_rough", "the same with the friction of Push's and PickAndPlace's block"
         ),
-        "time_to_goal": Component(
-            "mjx_dher.contrib.metrics:time_to_goal", "steps to the goal as estimated by the learner's critic"
-        ),
+        "time_to_goal": Component("contrib.metrics:time_to_goal", "steps to the goal as estimated by the learner's critic"),
     },
     "priority": {
         "eventful": Component(
-            "mjx_dher.priorities:eventful",
-            "episodes whose last achieved goal was not yet reached at their start",
-            (),
-            "episodes",
+            "priorities:eventful", "episodes whose last achieved goal was not yet reached at their start", group="episodes"
         ),
-        "energy": Component("mjx_dher.priorities:energy", "episodes by the energy given to the object (EBP)", (), "episodes"),
+        "energy": Component("priorities:energy", "episodes by the energy given to the object (EBP)", group="episodes"),
         "energy_clipped": Component(
-            "mjx_dher.priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg", (), "episodes"
+            "priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg", group="episodes"
         ),
         "max_entropy": Component(
-            "mjx_dher.contrib.episodes:max_entropy",
-            "episodes by how rare their achieved goals are in the ring (MEP)",
-            (),
-            "episodes",
+            "contrib.episodes:max_entropy", "episodes by how rare their achieved goals are in the ring (MEP)", group="episodes"
         ),
         "diversity": Component(
-            "mjx_dher.contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)", (), "episodes"
+            "contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)", group="episodes"
         ),
         "dpp": Component(
-            "mjx_dher.contrib.transitions:dpp",
+            "contrib.transitions:dpp",
             "diversity, and pairs of transitions with goals far apart (DTGSH's k-DPP)",
-            (),
-            "transitions",
+            group="transitions",
         ),
         "td_error": Component(
-            "mjx_dher.priorities:td_error",
+            "priorities:td_error",
             "episodes and relabelled transitions by their one-step errors (HGR)",
             ("renewals",),
             "transitions",
         ),
         "curriculum": Component(
-            "mjx_dher.contrib.transitions:curriculum",
+            "contrib.transitions:curriculum",
             "transitions with diverse goals at first, near goals later (CHER)",
-            (),
-            "transitions",
+            group="transitions",
         ),
         "not_misleading": Component(
-            "mjx_dher.contrib.transitions:not_misleading",
+            "contrib.transitions:not_misleading",
             "transitions whose hindsight goal was not reached before they began (bias-reduced HER)",
-            (),
-            "transitions",
+            group="transitions",
         ),
     },
     "generator": {
-        "reset": Component("mjx_dher.contrib.generators:reset", "goals from the environment's reset"),
-        "hgg": Component(
-            "mjx_dher.contrib.goals:hgg", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"
-        ),
+        "reset": Component("contrib.generators:reset", "goals from the environment's reset"),
+        "hgg": Component("contrib.goals:hgg", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"),
     },
     "learner": {
-        "ddpg": Component(
-            "mjx_dher.learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE
-        ),
+        "ddpg": Component("learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE),
         "td3": Component(
-            "mjx_dher.learners.actor_critic:td3",
+            "learners.actor_critic:td3",
             "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
             (*_NOISE, *_CRITICS, *_SMOOTHING),
         ),
         "sac": Component(
-            "mjx_dher.learners.actor_critic:sac",
+            "learners.actor_critic:sac",
             "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
             (*_CRITICS, *_ENTROPY),
         ),
-        "csac": Component(
-            "mjx_dher.learners.actor_critic:csac", "sac with categorical critics", (*_CRITICS, "num_bins", *_ENTROPY)
-        ),
+        "csac": Component("learners.actor_critic:csac", "sac with categorical critics", (*_CRITICS, "num_bins", *_ENTROPY)),
         "ctd3": Component(
-            "mjx_dher.learners.actor_critic:ctd3",
-            "td3 with categorical critics",
-            (*_NOISE, *_CRITICS, "num_bins", *_SMOOTHING),
+            "learners.actor_critic:ctd3", "td3 with categorical critics", (*_NOISE, *_CRITICS, "num_bins", *_SMOOTHING)
         ),
         "redq": Component(
-            "mjx_dher.learners.actor_critic:redq",
+            "learners.actor_critic:redq",
             "REDQ (Chen et al. 2021): SAC with many critics, a random subset per target",
             (*_CRITICS, "subset_critics", *_ENTROPY),
         ),
         "tqc": Component(
-            "mjx_dher.learners.actor_critic:tqc",
+            "learners.actor_critic:tqc",
             "TQC (Kuznetsov et al. 2020): SAC with quantile critics, the largest quantiles dropped",
             (*_CRITICS, *_QUANTILES, *_ENTROPY),
         ),
         "dtqc": Component(
-            "mjx_dher.learners.actor_critic:dtqc",
-            "tqc with a deterministic actor",
-            (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING),
+            "learners.actor_critic:dtqc", "tqc with a deterministic actor", (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING)
         ),
         "crl": Component(
-            "mjx_dher.learners.crl:make",
+            "learners.crl:make",
             "contrastive RL (Eysenbach et al. 2022, JaxGCRL): InfoNCE critic without rewards, stochastic actor",
             ("policy_delay", "reset_every", *_ENTROPY, *_CONTRAST),
         ),
     },
     "networks": {
-        "mlp": Component("mjx_dher.networks:mlp", "hidden layers with ReLU"),
-        "layer_norm": Component("mjx_dher.networks:layer_norm", "mlp with layer normalization in the critics"),
-        "fan_in": Component("mjx_dher.networks:fan_in", "mlp with PyTorch's initialization"),
-        "unit_norm": Component("mjx_dher.networks:unit_norm", "residual, with hidden weights projected to length 1"),
-        "residual": Component("mjx_dher.networks:residual", "residual blocks with layer normalization and swish, of any depth"),
+        "mlp": Component("networks:mlp", "hidden layers with ReLU"),
+        "layer_norm": Component("networks:layer_norm", "mlp with layer normalization in the critics"),
+        "fan_in": Component("networks:fan_in", "mlp with PyTorch's initialization"),
+        "unit_norm": Component("networks:unit_norm", "residual, with hidden weights projected to length 1"),
+        "residual": Component("networks:residual", "residual blocks with layer normalization and swish, of any depth"),
     },
+}
+COMPONENTS: dict[str, dict[str, Component]] = {
+    field: {name: row._replace(path=f"mjx_dher.{row.path}") for name, row in rows.items()} for field, rows in _TABLE.items()
 }
 
 

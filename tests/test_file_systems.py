@@ -67,7 +67,6 @@ def no_locks(request, monkeypatch):
         raise OSError(request.param, os.strerror(request.param))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    files._tell_no_locks.cache_clear()
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("default")
         yield request.param

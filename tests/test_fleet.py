@@ -15,9 +15,8 @@ from sweep_helpers import CONFIG, compile_once, make_grid, run, table  # noqa: F
 from mjx_dher import Options, cli, lookup
 from mjx_dher.cli import fleet
 from mjx_dher.fleet import chunks, driver, worker
-from mjx_dher.fleet.chunks import Task
+from mjx_dher.fleet.chunks import FleetOptions, Task
 from mjx_dher.fleet.cluster import LostError, Running
-from mjx_dher.fleet.options import FleetOptions
 from mjx_dher.runs.folder import results
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid, tables

@@ -15,7 +15,7 @@ from mjx_dher.policy import bundled
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.system.files import FolderError
-from mjx_dher.viewer import critic, scene, sources
+from mjx_dher.viewer import scene, sources
 
 TINY = Config(
     num_envs=2,
@@ -126,12 +126,12 @@ def test_a_geom_that_cannot_be_drawn_is_named():
 
 def test_a_critic_is_in_a_checkpoint(stopped):
     folder, run = stopped
-    loaded = critic.load(folder, run, reach())
+    loaded = sources.load_critic(folder, run, reach())
     assert loaded.epoch == 1
     obs = {"observation": np.zeros(10, np.float32), "achieved_goal": np.zeros(3), "desired_goal": np.ones(3, np.float32)}
     assert loaded.value(obs, np.zeros(4, np.float32)) != loaded.value(obs, np.ones(4, np.float32))
     with refuses("checkpoint", error=FolderError):
-        critic.load(bundled.FOLDER / "reach", dataclasses.replace(run), reach())
+        sources.load_critic(bundled.FOLDER / "reach", dataclasses.replace(run), reach())
 
 
 # What is played

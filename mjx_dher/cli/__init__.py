@@ -1,4 +1,4 @@
-"""The command line: `python train.py COMMAND`, one file per group of commands. Arguments are checked before JAX or MuJoCo is loaded."""
+"""The command line: `python train.py COMMAND`. Arguments are checked before JAX or MuJoCo is loaded."""
 
 from __future__ import annotations
 

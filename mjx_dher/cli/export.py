@@ -49,7 +49,7 @@ def export_command(argv: list[str], console: Console) -> int:
     if not policy.interface:  # older policy files leave it to the run folder
         policy = dataclasses.replace(policy, interface=content.get("interface", {}))
     difference = export.write(policy, run, args.format, out)
-    observation_size, goal_size, action_size = export.sizes(policy)
+    observation_size, goal_size, action_size = policy.sizes
     console.print(
         f"{run.env}: observation [N, {observation_size}], desired_goal [N, {goal_size}] -> action [N, {action_size}];"
         f" the same actions for {export.CHECKED:,} observations (largest difference {difference:.1g}); wrote {out}"

@@ -12,8 +12,7 @@ from rich.console import Console
 
 from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_components
 from mjx_dher.fleet import chunks, cluster, driver, worker
-from mjx_dher.fleet.chunks import Chunk
-from mjx_dher.fleet.options import LOCAL, FleetOptions
+from mjx_dher.fleet.chunks import LOCAL, Chunk, FleetOptions
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.locks import Claims

@@ -17,7 +17,7 @@ from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import Devices, Screen, compare, join, make_env, settle_compiler, try_components
 from mjx_dher.config import Config, HParams
-from mjx_dher.fleet.options import FleetOptions
+from mjx_dher.fleet.chunks import FleetOptions
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import Engine, RunSpec
@@ -37,17 +37,6 @@ def _doc(field: str, text: str) -> Doc:
     return Doc(components.help_text(field, text))
 
 
-def _optional(owner: Any, name: str) -> tuple[str, Any, Any]:
-    hint = get_type_hints(owner)[name]
-    return name, Annotated[hint | None, tyro.conf.arg(help=f"{name} instead of the preset's.")], dataclasses.field(default=None)
-
-
-def _values(name: str) -> tuple[str, Any, Any]:
-    help_text = f"Values of {name}. Default: the preset's."
-    hint = Annotated[tuple[float, ...] | None, tyro.conf.arg(help=help_text)]
-    return name, hint, dataclasses.field(default=None)
-
-
 if TYPE_CHECKING:
 
     class _Axes: ...
@@ -55,10 +44,16 @@ if TYPE_CHECKING:
     class _Changes: ...
 
 else:  # all numbers and sizes by name
-    _Axes = dataclasses.make_dataclass("_Axes", map(_values, HParams._fields), frozen=True)
-    _Changes = dataclasses.make_dataclass(
-        "_Changes", [_optional(Config, field.name) for field in dataclasses.fields(Config)], frozen=True
-    )
+
+    def _options(name: str, hints: dict[str, Any], text: str) -> type:
+        options = [
+            (field, Annotated[hint | None, Doc(text.format(field))], dataclasses.field(default=None))
+            for field, hint in hints.items()
+        ]
+        return dataclasses.make_dataclass(name, options, frozen=True)
+
+    _Axes = _options("_Axes", dict.fromkeys(HParams._fields, tuple[float, ...]), "Values of {}. Default: the preset's.")
+    _Changes = _options("_Changes", get_type_hints(Config), "{} instead of the preset's.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -103,18 +103,17 @@ def train_command(argv: list[str], console: Console) -> int:
         prepare()
         env = make_env(args.spec)
         common.try_components([args.spec], screen, env)
-        beside = stack.enter_context(viewer(folder, screen)) if viewer and processes.leads() else None
-        after_epoch = (lambda: None) if beside is None else beside.after_epoch
+        after_epoch = stack.enter_context(viewer(folder, screen)) if viewer and processes.leads() else lambda: None
         return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, after_epoch)
 
 
-def _viewer(port: int) -> Callable[[Path, Console], Any]:
-    """Makes the viewer of a run in training. Raises ValueError if the page cannot be served."""
-    from mjx_dher.cli.view import Beside, Page
+def _viewer(port: int) -> Callable[[Path, Console], contextlib.AbstractContextManager[Callable[[], None]]]:
+    """The viewer of a run in training. Raises ValueError if the page cannot be served."""
+    from mjx_dher.cli import view
     from mjx_dher.viewer import address
 
-    free = address.check(Page().host, port)
-    return lambda folder, console: Beside(folder, free, console)
+    free = address.check(view.Page().host, port)
+    return lambda folder, console: view.beside(folder, free, console)
 
 
 def _dry_run(args: TrainArgs, console: Console) -> int:

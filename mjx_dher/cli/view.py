@@ -7,7 +7,7 @@ import dataclasses
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -111,39 +111,35 @@ def _view(args: ViewArgs, console: Console) -> int:
     return 0
 
 
-class Beside:
-    """Viewer of a run in training, in its own process, which starts when there is a policy to show. `port` is from
+@contextlib.contextmanager
+def beside(folder: Path, port: int, console: Console) -> Iterator[Callable[[], None]]:
+    """Viewer of a run in training, in its own process. Yields a function to call after each epoch.
+
+    The first call starts the viewer, because there is a policy to show. A later one reports if it has exited. `port` is from
     `address.check`.
     """
+    from mjx_dher.viewer import address
 
-    def __init__(self, folder: Path, port: int | None, console: Console):
-        self._folder, self._port, self._console = folder, port, console
-        self._stack = contextlib.ExitStack()
-        self._process: subprocess.Popen[str] | None = None
+    place = str(subprocesses.PACKAGE.parent)  # this package need not be installed
+    code = f"import sys; sys.path.append({place!r}); from mjx_dher.__main__ import main; sys.exit(main())"
+    command = (sys.executable, "-c", code, "view", str(folder), "--trust", "--port", str(port))
+    variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
+    process: subprocess.Popen[str] | None = None
+    has_ended = False
+    with contextlib.ExitStack() as stack:
 
-    def __enter__(self) -> Beside:
-        return self
+        def after_epoch() -> None:
+            nonlocal process, has_ended
+            if process is None:
+                process = stack.enter_context(subprocesses.started(command, variables))
+                console.print(f"viewer: {address.address(Page().host, port)} (in a moment)")
+            elif not has_ended and process.poll() is not None:
+                has_ended = True
+                console.print(
+                    f"the viewer has ended ({subprocesses.answer(process).failure or 'it was closed'}); the run continues"
+                )
 
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
-
-    def after_epoch(self) -> None:
-        """Starts the viewer if necessary. Reports once if it has exited."""
-        if self._port is None:
-            return
-        if self._process is None:
-            from mjx_dher.viewer import address
-
-            place = str(subprocesses.PACKAGE.parent)  # this package need not be installed
-            code = f"import sys; sys.path.append({place!r}); from mjx_dher.__main__ import main; sys.exit(main())"
-            command = (sys.executable, "-c", code, "view", str(self._folder), "--trust", "--port", str(self._port))
-            variables = {"JAX_PLATFORMS": "cpu", PARENT: str(os.getpid())}
-            self._process = self._stack.enter_context(subprocesses.started(command, variables))
-            self._console.print(f"viewer: {address.address(Page().host, self._port)} (in a moment)")
-        elif self._process.poll() is not None:
-            failure = subprocesses.answer(self._process).failure or "it was closed"
-            self._console.print(f"the viewer has ended ({failure}); the run continues")
-            self._port = None
+        yield after_epoch
 
 
 def _maker(engine: str | None) -> Callable[[Any], Any]:

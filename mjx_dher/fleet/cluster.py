@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mjx_dher.fleet import worker
-from mjx_dher.fleet.chunks import Chunk, Task
-from mjx_dher.fleet.options import LOCAL
+from mjx_dher.fleet.chunks import LOCAL, Chunk, Task
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.system import files, signals, subprocesses
 from mjx_dher.validation import host_and_port

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -45,32 +46,28 @@ def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
     return {name: text for name, text in sentences.items() if metrics[name] > 0}
 
 
+@dataclasses.dataclass
 class Watch:
     """Failures and warnings of parallel runs."""
 
-    def __init__(
-        self,
-        specs: Sequence[RunSpec],
-        folders: Sequence[Path],
-        report: Callable[[str], None],
-        failed: dict[int, tuple[int, str]],
-    ):
-        self.failed = failed  # epoch and reason of each failed lane; updated in place
-        self._specs, self._report = specs, report
-        self._names = [f"{folder.name}: " if len(specs) > 1 else "" for folder in folders]
-        self._warned: set[tuple[int, str]] = set()
+    specs: Sequence[RunSpec]
+    folders: Sequence[Path]
+    report: Callable[[str], None]
+    failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane; updated in place
+    warned: set[tuple[int, str]] = dataclasses.field(default_factory=set)
 
     def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
         """Records the lanes that failed in an epoch, and reports each kind of warning once."""
         finite = np.atleast_1d(progress.finite)
-        for lane, (spec, row) in enumerate(zip(self._specs, rows)):
+        for lane, (spec, folder, row) in enumerate(zip(self.specs, self.folders, rows)):
+            name = f"{folder.name}: " if len(self.specs) > 1 else ""
             if lane in self.failed:
                 continue
             if reason := failure(row, spec.config, bool(finite[lane])):
                 self.failed[lane] = progress.epoch, reason
-                self._report(f"{self._names[lane]}failed in epoch {progress.epoch}: {reason}")
+                self.report(f"{name}failed in epoch {progress.epoch}: {reason}")
                 continue
             for kind, text in warnings(row, spec.config).items():
-                if (lane, kind) not in self._warned:
-                    self._warned.add((lane, kind))
-                    self._report(f"{self._names[lane]}epoch {progress.epoch}: {text}")
+                if (lane, kind) not in self.warned:
+                    self.warned.add((lane, kind))
+                    self.report(f"{name}epoch {progress.epoch}: {text}")

@@ -57,7 +57,6 @@ class _Session:
     should_stop: Callable[[], bool]
     report: Callable[[str], None]
     on_epoch: Callable[[Sequence[RunSpec], Progress], None]
-    make_sinks: Callable[[RunSpec, Path], Sequence[Sink]]
     shared: Path
     sweep: bool
     devices: int
@@ -76,7 +75,6 @@ def train_runs(
     should_stop: Callable[[], bool] = lambda: False,
     report: Callable[[str], None] = lambda text: None,
     on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
-    make_sinks: Callable[[RunSpec, Path], Sequence[Sink]] = lambda spec, folder: (),
 ) -> list[Result]:
     """Trains runs that share a program, as many in parallel as possible, each into its own folder.
 
@@ -95,7 +93,6 @@ def train_runs(
       should_stop: called after every epoch. True stops training with a checkpoint.
       report: called with a line about each program and checkpoint.
       on_epoch: called after every epoch of the parallel runs, the last time when their results are written.
-      make_sinks: makes additional sinks for a run's metrics.
 
     Returns:
       One Result per run. Fewer if training was stopped or runs were skipped.
@@ -110,7 +107,7 @@ def train_runs(
     placed_on = mesh.find(devices)
     shared = folders[0].parent / "unfinished" if shared is None else shared
     asked = lambda: processes.any_process(should_stop())  # noqa: E731
-    session = _Session(env, options, asked, report, on_epoch, make_sinks, shared, sweep, max(1, len(placed_on)))
+    session = _Session(env, options, asked, report, on_epoch, shared, sweep, max(1, len(placed_on)))
     claims = Claims(sweep, report)
     free = processes.broadcast(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
     waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
@@ -180,7 +177,8 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = zip(ended, specs, folders, runs) if processes.leads() else ()
         logs = [_open(stack, session, program.lanes, *run) for run in own]
-        success = processes.broadcast(lambda: _success_rates(folders[0]))  # for stop_at, which needs a single run
+        earlier = processes.broadcast(lambda: results.read_metrics(folders[0]))
+        success = [row["success_rate"] for row in earlier]  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
         for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
@@ -206,15 +204,11 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         session.report(f"stop_at {options.stop_at:g} is reached after epoch {progress.epoch} of {progress.num_epochs}")
     if options.keep_end and not watch.failed:
         checkpoints.try_save(progress)
-    results = _finish(session, program, progress, specs, folders, runs, watch.failed)
+    ended_runs = _finish(session, program, progress, specs, folders, runs, watch.failed)
     if len(watch.failed) < len(specs):
         checkpoints.clear(options.keep_end)
     session.on_epoch(specs, progress)
-    return results
-
-
-def _success_rates(folder: Path) -> list[float]:
-    return [row["success_rate"] for row in results.read_metrics(folder)]
+    return ended_runs
 
 
 def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
@@ -245,8 +239,7 @@ def _open(
     extra = {**dataclasses.asdict(session.options), **placed, "interface": robot_interface(session.env)}
     run_folder.write_config(folder, spec, run["physics"], extra, earlier, resumes=ended > 0)
     steps = ended * config_lib.steps_per_epoch(spec.config, session.env.episode_length)
-    own = session.make_sinks(spec, folder)
-    opened = [*loggers.open_sinks(folder, session.options.log, ended, steps, digest), *own]
+    opened = loggers.open_sinks(folder, session.options.log, ended, steps, digest)
     for sink in opened:
         stack.callback(sink.close)
     return opened

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from mjx_dher.parallel import processes
 from mjx_dher.runs.driver import Result, train_runs
-from mjx_dher.runs.options import Options
-from mjx_dher.runs.program.loop import Progress
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.types import Env
@@ -24,13 +23,8 @@ def run(
     folder: Path,
     specs: Sequence[RunSpec],
     make_env: Callable[[RunSpec], Env],
-    *,
-    options: Options,
-    lanes: int | None = None,
-    devices: int | str = 1,
     should_stop: Callable[[], bool] = lambda: False,
-    report: Callable[[str], None] = lambda text: None,
-    on_epoch: Callable[[Sequence[RunSpec], Progress], None] = lambda specs, progress: None,
+    **options: Any,
 ) -> list[Result]:
     """Trains trials into the folder of a sweep, which is made if necessary. Trials share programs if possible, in any order.
 
@@ -38,21 +32,10 @@ def run(
     trained trial. Trials that had ended before, that another process trains, or that were waiting when the sweep was stopped
     have none.
     """
+    options |= {"should_stop": should_stop, "shared": folder / UNFINISHED, "sweep": True}
     results: list[Result] = []
     for trials in grid.by_program(specs):
         if results and processes.any_process(should_stop()):
             break
-        results += train_runs(
-            make_env(trials[0]),
-            trials,
-            [grid.folder_of(folder, spec) for spec in trials],
-            options=options,
-            lanes=lanes,
-            devices=devices,
-            shared=folder / UNFINISHED,
-            sweep=True,
-            should_stop=should_stop,
-            report=report,
-            on_epoch=on_epoch,
-        )
+        results += train_runs(make_env(trials[0]), trials, [grid.folder_of(folder, spec) for spec in trials], **options)
     return results

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import itertools
 import json
 import os
@@ -135,18 +134,13 @@ def _mark(folder: Path, timeout: float) -> BaseFileLock:
     """Locks a folder on a file system without locks."""
     from filelock import SoftFileLock, Timeout
 
-    _tell_no_locks()
+    warnings.warn("the file system has no locks: folders in use are marked by files", stacklevel=2)
     held = SoftFileLock(folder.absolute() / _MARKER, timeout=timeout, is_singleton=True)
     try:
         held.acquire()
     except Timeout:
         raise BusyError(f"{folder} is being trained by another process; if not, delete {held.lock_file}") from None
     return held
-
-
-@functools.cache
-def _tell_no_locks() -> None:
-    warnings.warn("the file system has no locks: folders in use are marked by files", stacklevel=2)
 
 
 @contextlib.contextmanager

@@ -42,7 +42,7 @@ def check(file_format: str, out: Path, overwrite: bool) -> None:
 
 def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
     """Metadata of an exported file."""
-    observation_size, goal_size, action_size = sizes(policy)
+    observation_size, goal_size, action_size = policy.sizes
     content = {
         "format": "mjx-dher policy",
         "format_version": FORMAT_VERSION,
@@ -61,11 +61,6 @@ def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
     names = ("dt", "controls", "goal", "layout", "joints", "sensors")
     about = {name: json.dumps(policy.interface[name]) for name in names if name in policy.interface}
     return {**about, **{name: str(value) for name, value in content.items()}}
-
-
-def sizes(policy: Policy) -> tuple[int, int, int]:
-    """Sizes D, G and A of observation, goal and action."""
-    return len(policy.observation_mean), len(policy.goal_mean), len(policy.layers[-1][1])
 
 
 def write(policy: Policy, run: RunSpec, file_format: str, out: Path) -> float:
@@ -126,7 +121,7 @@ def _to_onnx(policy: Policy, about: dict[str, str]) -> bytes:
     arrays |= {f"minus_{name}": -arrays[name] for name in ("norm_clip", "obs_clip")}
     ends = {
         name: helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size])
-        for name, size in zip(("observation", "desired_goal", "action"), sizes(policy))
+        for name, size in zip(("observation", "desired_goal", "action"), policy.sizes)
     }
     graph = helper.make_graph(
         [helper.make_node(kind, inputs, [output], **options) for kind, inputs, output, options in _operations(policy)],

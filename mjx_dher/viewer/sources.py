@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher.components import is_hand
 from mjx_dher.policy import bundled, load
-from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.runs.folder import checkpoint, results, run_folder
+from mjx_dher.runs.program import loop, program
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
 from mjx_dher.system.files import FolderError
-from mjx_dher.viewer import critic
+from mjx_dher.types import Env
 from mjx_dher.viewer.player import Act, Value
 
 RANDOM = "random actions"
@@ -138,11 +141,40 @@ class Cast:
             return
         self._critic_seen = newest
         try:
-            loaded = critic.load(folder, run, self._env)
+            loaded = load_critic(folder, run, self._env)
         except (ValueError, OSError) as error:
             self.critic = f"No critic: {error}."
         else:
             self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
+
+
+class Critic(NamedTuple):
+    """Value function of a run's critic, and its age."""
+
+    value: Callable[[Mapping[str, Any], Any], float]  # observation of one state, action [A] -> expected return
+    epoch: int  # epochs that had ended
+
+
+def load_critic(folder: Path, run: RunSpec, env: Env) -> Critic:
+    """Critic in the newest checkpoint of a run that was trained alone. A finished run has none, because its checkpoints are
+    deleted. Raises FolderError if no checkpoint is usable, or the run's learner has no `value`.
+    """
+    run = dataclasses.replace(run, demonstrations=None)  # the checkpoint's ring holds them
+    train = program.make_loop(env, run, program.choices_of([run]))
+    learner: Any = train.learner
+    if not callable(getattr(learner, "value", None)):
+        raise FolderError(f"learner {run.learner!r} has no method value")
+    restored = checkpoint.restore(folder, loop.state_template(train))
+    state = restored.state.learner
+
+    @jax.jit
+    def value(state: Any, obs: Any, action: Any) -> Any:
+        return learner.value(state, obs, action, run.hparams)
+
+    def expect(obs: Mapping[str, Any], action: Any) -> float:
+        return float(np.asarray(value(state, dict(obs), jnp.asarray(action))))
+
+    return Critic(expect, restored.epoch)
 
 
 def _random(action_size: int) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:

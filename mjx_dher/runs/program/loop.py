@@ -63,7 +63,6 @@ def train(
     config: Config,
     hparams: HParams | None = None,
     seed: int = 0,
-    on_compile: Callable[[float | None], None] = lambda seconds: None,
     start: Start | None = None,
     devices: int | str = 1,
     **parts: Any,
@@ -73,7 +72,6 @@ def train(
     `train_runs` adds folders, checkpoints, logs and parallel runs.
 
     Args:
-      on_compile: called with None when compilation begins, and with its duration in seconds when it ends.
       start: point to resume from, as returned by `checkpoint.restore`.
       devices: number of devices that share the run, or "all". Each has an equal part of environments, ring and batches.
       **parts: sampler, priority and learner, as in `make_train`.
@@ -88,14 +86,11 @@ def train(
     program = make_train(env, config_lib.of_one_device(config, layout.shards), axis_name=layout.axis_name, **parts)
     key = jax.random.key(seed)
     check_memory(program, config, layout.sharers)
-    on_compile(None)
-    started = time.perf_counter()
     compiled = compile_program(program, key, hparams, config_lib.num_updates(config, env.episode_length), layout)
     check_program(compiled, config, layout.sharers)
     check_steps(env)
-    on_compile(time.perf_counter() - started)
     for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
-        yield progress._replace(metrics={name: to_float(value) for name, value in progress.metrics.items()})
+        yield progress._replace(metrics={name: float(f"{x:.6g}") for name, x in progress.metrics.items()})
 
 
 def run(
@@ -160,12 +155,10 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
         lowered = epoch.lower(state)
         compiled = compile_lowered(lowered, search)
         compiled_init = compiling.result()
-    sizes = compiled.memory_analysis()
-    nbytes = 0
+    nbytes, sizes = 0, compiled.memory_analysis()
     if sizes is not None:
-        nbytes = (
-            sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes + sizes.temp_size_in_bytes
-        )
+        held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes
+        nbytes = held + sizes.temp_size_in_bytes
     memory.release()
 
     def start(key: PRNGKey, hparams: HParams) -> TrainState:
@@ -244,8 +237,3 @@ def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
             f"an epoch needs {memory.format_bytes(nbytes)}, but only {memory.format_bytes(available)} of memory"
             f" is free; it depends on {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
         )
-
-
-def to_float(value: Any) -> float:
-    """A float32 rounded to six digits: 0.95 instead of 0.949999988..."""
-    return float(f"{value:.6g}")

@@ -74,12 +74,17 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     """Training loop of runs that share a program, with their components."""
     validation.check_parts(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
+    generator = None
+    if set(choices.generators) != {"reset"}:
+        from mjx_dher.contrib import generators
+
+        generator = generators.join([generators.make(name) for name in choices.generators])
     train = trainer.make_train(
         env,
         config,
         sampler=samplers.join([samplers.make(*choice) for choice in choices.samplers]),
         priority=priorities.join([priorities.make(name) for name in choices.priorities]),
-        generator=_join_generators(choices.generators),
+        generator=generator,
         learner=learners.make(spec.learner, config, env_spec(env), spec.networks),
         axis_name=layout.axis_name,
     )
@@ -90,15 +95,6 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     capacity = config_lib.episodes_capacity(spec.config, env.episode_length)
     episodes = read_demonstrations(spec.demonstrations, env, capacity)
     return train._replace(init=lambda key, hparams: train.add(train.init(key, hparams), episodes))
-
-
-def _join_generators(names: Sequence[str]) -> trainer.GoalsFn | None:
-    """Joined generators of these names, or None if all are the reset's goals."""
-    if set(names) == {"reset"}:
-        return None
-    from mjx_dher.contrib import generators
-
-    return generators.join([generators.make(name) for name in names])
 
 
 def compile_runs(
