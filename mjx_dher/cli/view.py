@@ -135,9 +135,8 @@ def beside(folder: Path, port: int, console: Console) -> Iterator[Callable[[], N
                 console.print(f"viewer: {address.address(Page().host, port)} (in a moment)")
             elif not has_ended and process.poll() is not None:
                 has_ended = True
-                console.print(
-                    f"the viewer has ended ({subprocesses.answer(process).failure or 'it was closed'}); the run continues"
-                )
+                failure = subprocesses.answer(process).failure or "it was closed"
+                console.print(f"the viewer has ended ({failure}); the run continues")
 
         yield after_epoch
 

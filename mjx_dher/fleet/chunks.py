@@ -1,4 +1,4 @@
-"""Options of a sweep on a Ray cluster, its chunks of runs, and what a chunk needs: resources and code. Loads neither Ray nor JAX."""
+"""Options of a sweep on a Ray cluster, and its chunks: runs of a task, resources and code. Loads neither Ray nor JAX."""
 
 from __future__ import annotations
 
