@@ -60,46 +60,48 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     )
 
 
-def _cpu(env: str) -> tuple[Config, HParams]:
-    config = Config(num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000)
+Settings = tuple[Config, HParams]
+
+
+def _with(settings: Settings, **changes: Any) -> Settings:
+    """The settings with other sizes and numbers."""
+    config, hparams = settings
+    numbers = {name: changes.pop(name) for name in HParams._fields if name in changes}
+    return dataclasses.replace(config, **changes), hparams._replace(**numbers)
+
+
+def _small(settings: Settings, **changes: Any) -> Settings:
+    """The settings with one critic, two layers, no target noise, and other `changes`."""
+    return _with(settings, num_critics=1, hidden_sizes=(256, 256), target_noise=0.0, **changes)
+
+
+def _cpu(env: str) -> Settings:
+    base = Config(num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000), _TUNED
     if env == "reach":
-        config = dataclasses.replace(config, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
-    elif is_hand(env):
+        return _with(base, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
+    if env == "pick_and_place":
+        return _with(base, total_steps=1_000_000, noise_std=0.2, lr_end=0.05)
+    if env == "slide":
+        return _with(base, total_steps=1_500_000, replay_size=1_500_000, gamma=0.97, noise_std=0.2, lr_end=0.05)
+    if is_hand(env):
         total_steps = 400_000 if env == "hand_reach" else 2_000_000
-        config = dataclasses.replace(config, cycles_per_epoch=8, total_steps=total_steps, replay_size=2_000_000)
-        return config, _TUNED._replace(gamma=0.98)
-    elif env == "pick_and_place":
-        config = dataclasses.replace(config, total_steps=1_000_000)
-        return config, _TUNED._replace(noise_std=0.2, lr_end=0.05)
-    elif env == "slide":
-        config = dataclasses.replace(config, total_steps=1_500_000, replay_size=1_500_000)
-        return config, _TUNED._replace(gamma=0.97, noise_std=0.2, lr_end=0.05)
-    return config, _TUNED
+        return _with(base, cycles_per_epoch=8, total_steps=total_steps, replay_size=2_000_000, gamma=0.98)
+    return base
 
 
-def _gpu(env: str) -> tuple[Config, HParams]:
-    config = Config(
-        num_envs=2048,
-        cycles_per_epoch=3,
-        updates_per_cycle=1000,
-        target_period=1,
-        batch_size=1024,
-        total_steps=1_500_000,
-        replay_size=2_000_000,
-    )
+def _gpu(env: str) -> Settings:
+    config = Config(num_envs=2048, cycles_per_epoch=3, updates_per_cycle=1000, target_period=1, batch_size=1024)
+    base = _with((config, _TUNED), total_steps=1_500_000, replay_size=2_000_000)
     if env == "reach":
-        config = dataclasses.replace(config, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
-    elif env in ("pick_and_place", "slide"):
-        total_steps = 6_000_000 if env == "pick_and_place" else 10_000_000
-        config = dataclasses.replace(
-            config, cycles_per_epoch=5, updates_per_cycle=500, total_steps=total_steps, replay_size=4_000_000
-        )
-        hparams = _TUNED._replace(noise_std=0.1, random_eps=0.2, lr_end=0.05)
-        return config, hparams if env == "pick_and_place" else hparams._replace(gamma=0.97, her_k=8.0)
-    return config, _TUNED
+        return _with(base, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
+    if env not in ("pick_and_place", "slide"):
+        return base
+    base = _with(base, cycles_per_epoch=5, updates_per_cycle=500, replay_size=4_000_000, lr_end=0.05)
+    base = _with(base, noise_std=0.1, random_eps=0.2, total_steps=6_000_000)
+    return base if env == "pick_and_place" else _with(base, total_steps=10_000_000, gamma=0.97, her_k=8.0)
 
 
-def _paper(env: str) -> tuple[Config, HParams]:
+def _paper(env: str) -> Settings:
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     total_steps = epochs * 50 * 2 * workers * 50
@@ -117,83 +119,54 @@ def _paper(env: str) -> tuple[Config, HParams]:
     return config, HParams(random_noise=1.0, adam_eps=1e-8 / workers)
 
 
-def _entropy_pick_and_place(env: str) -> tuple[Config, HParams]:
-    """Base settings of the PickAndPlace presets with `tqc`."""
-    config, hparams = _gpu(env)
-    config = dataclasses.replace(config, num_envs=512, updates_per_cycle=1000, total_steps=1_000_000)
-    return config, hparams._replace(action_l2=0.0, entropy_weight=0.1)
-
-
-def _gpu_slide(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu(env)
-    config = dataclasses.replace(config, updates_per_cycle=1000, total_steps=8_000_000, n_step=3, hidden_sizes=(512, 512, 512))
-    return config, hparams._replace(target_noise=0.0)
-
-
-def _small(config: Config, hparams: HParams, **sizes: Any) -> tuple[Config, HParams]:
-    """The settings with one critic, two layers, no target noise, and other `sizes`."""
-    config = dataclasses.replace(config, num_critics=1, hidden_sizes=(256, 256), **sizes)
-    return config, hparams._replace(target_noise=0.0)
-
-
-def _gpu_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _small(*_entropy_pick_and_place(env), num_envs=256, updates_per_cycle=500, policy_delay=2)
-    return config, hparams._replace(critic_lr=3e-3)
-
-
-def _gpu_hand(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu(env)
-    total_steps = 3_000_000 if env == "block_rotate_z" else 8_000_000
-    config = dataclasses.replace(config, num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
-    config = dataclasses.replace(config, hidden_sizes=(512, 512, 512), renewals=5)
-    return config, hparams._replace(gamma=0.98, her_k=4.0, lr_end=0.05)
-
-
-def _gpu_hand_reach(env: str) -> tuple[Config, HParams]:
-    config, hparams = _gpu(env)
-    config = dataclasses.replace(config, num_envs=128, cycles_per_epoch=8, updates_per_cycle=200, batch_size=2048)
-    config = dataclasses.replace(config, total_steps=3_000_000, replay_size=3_000_000)
-    return config, hparams._replace(gamma=0.98, polyak=0.995, noise_std=0.2, her_k=4.0, priority_fraction=0.0)
-
-
-def _cpu_push(env: str) -> tuple[Config, HParams]:
-    config, hparams = _small(*_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000)
-    return config, hparams._replace(critic_lr=2e-3)
-
-
-def _cpu_slide(env: str) -> tuple[Config, HParams]:
-    config, hparams = _small(*_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5)
-    config = dataclasses.replace(config, cycles_per_epoch=2, total_steps=1_280_000, replay_size=1_280_000)
-    return config, hparams._replace(critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
-
-
-def _cpu_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _entropy_pick_and_place(env)
-    # One cycle per epoch: on two cores it takes some ten seconds.
-    config = dataclasses.replace(config, cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000)
-    return _small(config, hparams, policy_delay=2)
-
-
-def _frugal(env: str) -> tuple[Config, HParams]:
-    config, hparams = _cpu(env)
+def _frugal(env: str) -> Settings:
+    base = _cpu(env)
     if env == "reach":
-        return dataclasses.replace(config, updates_per_cycle=80, total_steps=8_000), hparams
-    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, config.total_steps)
-    return dataclasses.replace(config, cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps), hparams
+        return _with(base, updates_per_cycle=80, total_steps=8_000)
+    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, base[0].total_steps)
+    return _with(base, cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
 
 
-def _frugal_push(env: str) -> tuple[Config, HParams]:
-    config, hparams = _frugal(env)
-    return config, hparams._replace(noise_std=0.6)
+def _entropy(env: str, **changes: Any) -> Settings:
+    """Base settings of the PickAndPlace presets with `tqc`, and `changes`."""
+    base = _with(_gpu(env), num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
+    return _with(base, **changes)
 
 
-def _frugal_pick_and_place(env: str) -> tuple[Config, HParams]:
-    config, hparams = _entropy_pick_and_place(env)
-    return dataclasses.replace(config, num_envs=64, total_steps=500_000, replay_size=500_000), hparams
+def _gpu_hand(env: str) -> Settings:
+    total_steps = 3_000_000 if env == "block_rotate_z" else 8_000_000
+    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
+    return _with(base, hidden_sizes=(512, 512, 512), renewals=5, gamma=0.98, her_k=4.0, lr_end=0.05)
 
 
-def _frugal_slide(env: str) -> tuple[Config, HParams]:
-    return _small(*_frugal(env), updates_per_cycle=150, n_step=3)
+def _gpu_hand_reach(env: str) -> Settings:
+    base = _with(_gpu(env), num_envs=128, cycles_per_epoch=8, updates_per_cycle=200, batch_size=2048)
+    base = _with(base, total_steps=3_000_000, replay_size=3_000_000, gamma=0.98, polyak=0.995)
+    return _with(base, noise_std=0.2, her_k=4.0, priority_fraction=0.0)
+
+
+def _gpu_slide(env: str) -> Settings:
+    base = _with(_gpu(env), updates_per_cycle=1000, total_steps=8_000_000, n_step=3)
+    return _with(base, hidden_sizes=(512, 512, 512), target_noise=0.0)
+
+
+def _cpu_slide(env: str) -> Settings:
+    base = _small(_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5, cycles_per_epoch=2)
+    base = _with(base, total_steps=1_280_000, replay_size=1_280_000, critic_lr=3e-3)
+    return _with(base, noise_std=0.1, random_eps=0.2, her_k=4.0)
+
+
+def _cpu_push(env: str) -> Settings:
+    return _small(_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000, critic_lr=2e-3)
+
+
+def _cpu_pick_and_place(env: str) -> Settings:
+    # One cycle per epoch: on two cores it takes some ten seconds.
+    return _small(_entropy(env), cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000, policy_delay=2)
+
+
+def _gpu_pick_and_place(env: str) -> Settings:
+    return _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
 
 
 class _Best(NamedTuple):
@@ -201,7 +174,7 @@ class _Best(NamedTuple):
 
     learner: str
     networks: str
-    setup: Callable[[str], tuple[Config, HParams]] | None
+    setup: Callable[[str], Settings] | None
     parts: Mapping[str, str] = {}  # fields of the run that differ from RunSpec's defaults
 
 
@@ -218,7 +191,11 @@ _LEARNERS = {
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
-    ("frugal", "push"): _Best("td3", "mlp", _frugal_push),
-    ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", _frugal_pick_and_place),
-    ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide, {"priority": "td_error"}),
+    ("frugal", "push"): _Best("td3", "mlp", lambda env: _with(_frugal(env), noise_std=0.6)),
+    ("frugal", "pick_and_place"): _Best(
+        "tqc", "layer_norm", lambda env: _entropy(env, num_envs=64, total_steps=500_000, replay_size=500_000)
+    ),
+    ("frugal", "slide"): _Best(
+        "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}
+    ),
 }
