@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import re
 from typing import Any, Self
 
 import jax
@@ -263,60 +264,23 @@ class ManipulateTask(HandTask):
         return super().compute_reward(achieved_goal, desired_goal)
 
 
-class BlockRotateZ(ManipulateTask):
-    """HandManipulateBlockRotateZ-v1: turn a block about the vertical."""
-
-    name, model = "block_rotate_z", "assets/hand/block.xml"
-    goal, start = ObjectPose("z"), Drop("z")
-
-
-class BlockRotateParallel(ManipulateTask):
-    """HandManipulateBlockRotateParallel-v1: turn a block to another face, and about the vertical."""
-
-    name, model = "block_rotate_parallel", "assets/hand/block.xml"
-    goal, start = ObjectPose("parallel"), Drop("parallel")
+def _task(name: str, rotation: str, text: str, **goal: Any) -> type[ManipulateTask]:
+    """Class of the task HandManipulate`name` of gymnasium-robotics. Objects start with random rotations, except the pen."""
+    words = re.findall(r"[A-Z]+[a-z]*", name)
+    fields: dict[str, Any] = {"name": "_".join(words).lower(), "model": f"assets/hand/{words[0].lower()}.xml"}
+    fields |= {"goal": ObjectPose(rotation, **goal), "start": Drop(None if words[0] == "Pen" else rotation)}
+    return type(name, (ManipulateTask,), {**fields, "__doc__": f"HandManipulate{name}-v1: {text}.", "__module__": __name__})
 
 
-class BlockRotateXYZ(ManipulateTask):
-    """HandManipulateBlockRotateXYZ-v1: turn a block to any orientation."""
-
-    name, model = "block_rotate_xyz", "assets/hand/block.xml"
-    goal, start = ObjectPose("xyz"), Drop("xyz")
-
-
-class Block(ManipulateTask):
-    """HandManipulateBlock-v1: bring a block to any orientation, and to a position."""
-
-    name, model = "block", "assets/hand/block.xml"
-    goal, start = ObjectPose("xyz", positions=True), Drop("xyz")
-
-
-class EggRotate(ManipulateTask):
-    """HandManipulateEggRotate-v1: turn an egg to any orientation."""
-
-    name, model = "egg_rotate", "assets/hand/egg.xml"
-    goal, start = ObjectPose("xyz"), Drop("xyz")
-
-
-class Egg(ManipulateTask):
-    """HandManipulateEgg-v1: bring an egg to any orientation, and to a position."""
-
-    name, model = "egg", "assets/hand/egg.xml"
-    goal, start = ObjectPose("xyz", positions=True), Drop("xyz")
-
-
-class PenRotate(ManipulateTask):
-    """HandManipulatePenRotate-v1: turn a pen to any direction."""
-
-    name, model = "pen_rotate", "assets/hand/pen.xml"
-    goal, start = ObjectPose("xyz", ignores_z=True), Drop(None)
-
-
-class Pen(ManipulateTask):
-    """HandManipulatePen-v1: bring a pen to any direction, and to a position."""
-
-    name, model = "pen", "assets/hand/pen.xml"
-    goal, start = ObjectPose("xyz", positions=True, reach=0.05, ignores_z=True), Drop(None)
+BlockRotateZ = _task("BlockRotateZ", "z", "turn a block about the vertical")
+BlockRotateParallel = _task("BlockRotateParallel", "parallel", "turn a block to another face, and about the vertical")
+BlockRotateXYZ = _task("BlockRotateXYZ", "xyz", "turn a block to any orientation")
+Block = _task("Block", "xyz", "bring a block to any orientation, and to a position", positions=True)
+EggRotate = _task("EggRotate", "xyz", "turn an egg to any orientation")
+Egg = _task("Egg", "xyz", "bring an egg to any orientation, and to a position", positions=True)
+PenRotate = _task("PenRotate", "xyz", "turn a pen to any direction", ignores_z=True)
+_PEN: dict[str, Any] = {"positions": True, "reach": 0.05, "ignores_z": True}
+Pen = _task("Pen", "xyz", "bring a pen to any direction, and to a position", **_PEN)
 
 
 def draw_rotation(key: PRNGKey, kind: str) -> Array:

@@ -1,4 +1,4 @@
-"""Check of arrays that user functions return."""
+"""Checks of arrays and states that user functions return."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_dher.types import Array
+from mjx_dher.types import Array, PyTree
 
 _NAMES = {jnp.floating: "floats", jnp.integer: "integers", jnp.number: "numbers", jnp.bool_: "booleans"}
 
@@ -41,3 +41,17 @@ def describe(value: Any) -> str:
     if isinstance(value, jax.Array):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"
+
+
+def kept(method: str, before: PyTree, after: PyTree, leading: int = 0) -> None:
+    """Raises ValueError unless a method keeps its state's structure, dtypes and shapes after `leading` axes, as scans need."""
+    old, new = (
+        {jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x)[leading:])}" for path, x in leaves}
+        for leaves in map(jax.tree_util.tree_leaves_with_path, (before, after))
+    )
+    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    differing = [f"{name} is {old.get(name, 'absent')} and becomes {new.get(name, 'absent')}" for name in names]
+    structure: Any = jax.tree.structure(before)
+    if structure != jax.tree.structure(after) or differing:
+        reason = (differing or ["its type or its static fields differ"])[0]
+        raise ValueError(f"{method} must keep the state's structure, shapes and types; {reason}")

@@ -114,24 +114,6 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
         )
 
 
-def check_same_shapes(before: Any, after: Any, method: str = "step") -> None:
-    """Raises ValueError unless a method keeps the state's structure, shapes and dtypes, as `lax.scan` needs."""
-    old, new = (dict(jax.tree_util.tree_leaves_with_path(state)) for state in (before, after))
-    structure: Any = jax.tree.structure(before)
-    if structure != jax.tree.structure(after):
-        differing = [jax.tree_util.keystr(path) for path in {**old, **new} if (path in old) != (path in new)]
-        raise ValueError(
-            f"reset and {method} must give states of one structure; only one has {', '.join(differing) or 'its type'}"
-        )
-    for path, leaf in old.items():
-        kept, changed = ((jnp.shape(x)[1:], jnp.result_type(x)) for x in (leaf, new[path]))
-        if kept != changed:
-            raise ValueError(
-                f"{method} must keep shapes and types; the state's {jax.tree_util.keystr(path)} is {kept[1]}{list(kept[0])} and"
-                f" becomes {changed[1]}{list(changed[0])}"
-            )
-
-
 def check_with_goal(env: Any) -> None:
     """Raises ValueError if the environment's goals cannot be set."""
     if not callable(getattr(env, "with_goal", None)):

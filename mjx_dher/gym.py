@@ -57,10 +57,8 @@ class _GoalApi:
     _compiled: Programs
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
-        """Rewards float32 [...] of goals [..., G]. Ignores `info`.
-
-        Raises:
-          ValueError: the last axis of the goals is not G, or their shapes cannot be broadcast.
+        """Rewards float32 [...] of goals [..., G]. Ignores `info`. Raises ValueError if the last axis of the goals is not G, or
+        their shapes cannot be broadcast.
         """
         achieved, desired = self._goals(achieved_goal, desired_goal)
         flat = achieved.reshape(-1, achieved.shape[-1]), desired.reshape(-1, desired.shape[-1])
@@ -126,10 +124,8 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         return {**vars(self), "_painter": None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Starts an episode. Returns its first observation and info, with `is_success` as in `step`.
-
-        Raises:
-          ValueError: `options` is not empty, or `GoalEnv.check` found a fault in earlier episodes.
+        """Starts an episode. Returns its first observation and info, with `is_success` as in `step`. Raises ValueError if
+        `options` is not empty, or `GoalEnv.check` found a fault in earlier episodes.
         """
         (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)

@@ -156,11 +156,9 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
 
 def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
     """Joins priorities in one compiled program, in which the traced number `hparams.priority_choice` selects a lane's priority.
-    Raises ValueError if `choices` is empty, or contains something other than a priority.
+    Raises ValueError for something other than a priority.
     """
     made = [whole(make(choice)) for choice in choices]
-    if not made:
-        raise ValueError("join takes one or more priorities; got none")
     if len(made) == 1:
         return made[0]
     index = "priority_choice"

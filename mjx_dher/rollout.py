@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher import context
-from mjx_dher.contract import check_first, check_same_shapes, check_with_goal, env_spec
+from mjx_dher import check, context
+from mjx_dher.contract import check_first, check_with_goal, env_spec
 from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
@@ -119,7 +119,7 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
     if np.shape(action) != (num_envs, env.action_size):
         raise ValueError(f"policy must return actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
     following = jax.vmap(env.step)(state, action)
-    check_same_shapes(state, following)
+    check.kept("step", state, following, leading=1)
     reward = following.reward
     if spec.ends:
         following = where_each(playing.over, state, following)
@@ -183,7 +183,7 @@ def _with_goals(env: Any, first: Any, goals: Array) -> Any:
     """Initial states of N episodes with other goals [N, G]."""
     check_with_goal(env)
     changed = jax.vmap(env.with_goal)(first, goals)
-    check_same_shapes(first, changed, "with_goal")
+    check.kept("with_goal", first, changed, leading=1)
     return changed
 
 

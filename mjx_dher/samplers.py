@@ -235,11 +235,9 @@ def _score(sampler: Sampler, episode: Episode, context: Context) -> Array:
 def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     """Joins samplers in one compiled program, in which the traced number `hparams.choice` selects a lane's sampler (`one_of`).
 
-    `choice` is no field of `HParams`; `runs.program` adds it. Raises ValueError if `choices` is empty or has no sampler.
+    `choice` is not a field of `HParams`; `runs.program` adds it. Raises ValueError for something other than a sampler.
     """
     samplers = [make(choice) for choice in choices]
-    if not samplers:
-        raise ValueError("join takes one or more samplers; got none")
     if len(samplers) == 1:
         return samplers[0]
     score = one_of([functools.partial(_score, sampler) for sampler in samplers], "choice")

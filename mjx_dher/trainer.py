@@ -291,7 +291,7 @@ def _update_normalizers(
     sample = add_choices(fresh, sample, loop.sampler, scores, relabel_key)
     batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, context.hparams, valid)
-    learners.check_kept("update_normalizers", learner, updated)
+    check.kept("learner.update_normalizers", learner, updated)
     return updated, {**_relabel_metrics(context, sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}
 
 

@@ -89,8 +89,6 @@ def test_samplers_side_by_side_are_checked_each(ring, gives):
     sample = replay.sample(ring, jax.random.key(0), 5)
     with refuses("sampler"):
         trace(lambda: relabel.hindsight_goals(sample, together, numbers, jax.random.key(1)))
-    with refuses("samplers"):
-        samplers.join([])
 
 
 PRIORITIES = [

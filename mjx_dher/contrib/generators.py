@@ -54,11 +54,9 @@ def make(name: str | Generator | GenerateFn) -> Generator:
 
 def join(choices: Sequence[Generator | GenerateFn]) -> Generator:
     """Joins generators in one compiled program, in which the traced number `hparams.generator_choice` selects a lane's
-    generator. Raises ValueError if `choices` is empty, or contains something other than a generator.
+    generator. Raises ValueError for something other than a generator.
     """
     made = [make(choice) for choice in choices]
-    if not made:
-        raise ValueError("join takes one or more generators; got none")
     if len(made) == 1:
         return made[0]
     generate = one_of(made, "generator_choice")

@@ -182,26 +182,12 @@ def policy_delay(learner: Any) -> int:
     return getattr(learner, "policy_delay", 1)
 
 
-def check_kept(method: str, before: PyTree, after: PyTree) -> None:
-    """Raises ValueError unless a learner's method keeps its state's structure, shapes and dtypes, as `lax.scan` needs."""
-    old, new = (
-        {jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x))}" for path, x in _leaves(state)}
-        for state in (before, after)
-    )
-    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    differing = [f"{name} is {old.get(name, 'absent')} and becomes {new.get(name, 'absent')}" for name in names]
-    structure: Any = jax.tree.structure(before)
-    if structure != jax.tree.structure(after) or differing:
-        reason = (differing or ["its type or its static fields differ"])[0]
-        raise ValueError(f"learner.{method} must keep the state's structure, shapes and types; {reason}")
-
-
 def check_update(state: PyTree, result: Any) -> tuple[PyTree, Metrics]:
     """Returns the result of a learner's `update`. Raises ValueError unless it is a state like the one before, and metrics."""
     if not (isinstance(result, tuple) and len(result) == 2):
         raise ValueError(f"learner.update must return (state, metrics); got a {type(result).__name__}")
     updated, metrics = result
-    check_kept("update", state, updated)
+    check.kept("learner.update", state, updated)
     check_metrics("update", metrics)
     return updated, metrics
 
@@ -220,11 +206,7 @@ def check_metrics(method: str, metrics: Any, taken: Collection[str] = ()) -> Non
 def check_noise(noise: PyTree, num_steps: int, num_envs: int) -> None:
     """Raises ValueError unless the leaves of a learner's noise lead with [T, N]."""
     leading = (num_steps, num_envs)
-    for path, leaf in _leaves(noise):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(noise):
         if jnp.shape(leaf)[:2] != leading:
             name, shape = f"noise{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
             raise ValueError(f"learner.noise must return arrays that lead with [T, N] = {list(leading)}; {name} is {shape}")
-
-
-def _leaves(tree: PyTree) -> Any:
-    return jax.tree_util.tree_leaves_with_path(tree)

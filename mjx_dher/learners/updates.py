@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from mjx_dher import learners
+from mjx_dher import check, learners
 from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
 from mjx_dher.types import Batch, Metrics, PyTree
@@ -40,5 +40,5 @@ def _delayed_update(learner: Learner, period: int, hparams: HParams, state: PyTr
 
 def _move_targets(learner: Learner, hparams: HParams, state: PyTree) -> PyTree:
     moved = learner.update_target(state, hparams)
-    learners.check_kept("update_target", state, moved)
+    check.kept("learner.update_target", state, moved)
     return moved

@@ -85,7 +85,7 @@ def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> N
 def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
     """State after a method of the learner. It must be finite and like `state`."""
     after = attempt(f"learner.{name}", function, state, *args)
-    learners.check_kept(name, state, after)
+    check.kept(f"learner.{name}", state, after)
     expect_finite(f"the state that learner.{name} gives", after)
     return after
 

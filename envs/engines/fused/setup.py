@@ -10,25 +10,12 @@ from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, 
 from mjx_dher.envs.engines.pairs import all_pairs
 from mjx_dher.system.warp_setup import wp
 
-CONTACT_KINDS = {
-    ("PLANE", "BOX"): (kinds.PLANE_BOX, 4),
-    ("PLANE", "CYLINDER"): (kinds.PLANE_CYLINDER, 4),
-    ("BOX", "BOX"): (kinds.BOX_BOX, 8),
-    ("CYLINDER", "BOX"): (kinds.CYLINDER_BOX, 5),
-    ("PLANE", "SPHERE"): (kinds.PLANE_SPHERE, 1),
-    ("PLANE", "CAPSULE"): (kinds.PLANE_CAPSULE, 2),
-    ("SPHERE", "SPHERE"): (kinds.SPHERE_SPHERE, 1),
-    ("SPHERE", "CAPSULE"): (kinds.SPHERE_CAPSULE, 1),
-    ("SPHERE", "BOX"): (kinds.SPHERE_BOX, 1),
-    ("CAPSULE", "CAPSULE"): (kinds.CAPSULE_CAPSULE, 2),
-    ("CAPSULE", "BOX"): (kinds.CAPSULE_BOX, 2),
-    ("PLANE", "ELLIPSOID"): (kinds.PLANE_ELLIPSOID, 1),
-    ("SPHERE", "ELLIPSOID"): (kinds.SPHERE_ELLIPSOID, 1),
-    ("CAPSULE", "ELLIPSOID"): (kinds.CAPSULE_ELLIPSOID, 1),
-    ("ELLIPSOID", "BOX"): (kinds.ELLIPSOID_BOX, 1),
-    ("SPHERE", "CYLINDER"): (kinds.SPHERE_CYLINDER, 1),
-    ("CAPSULE", "CYLINDER"): (kinds.CAPSULE_CYLINDER, 2),
-}  # types of two geoms -> (kind, most contacts)
+_MOST = {"PLANE_BOX": 4, "PLANE_CYLINDER": 4, "BOX_BOX": 8, "CYLINDER_BOX": 5, "PLANE_CAPSULE": 2}
+_MOST |= {"CAPSULE_CAPSULE": 2, "CAPSULE_BOX": 2, "CAPSULE_CYLINDER": 2}
+_MOST |= dict.fromkeys(("PLANE_SPHERE", "SPHERE_SPHERE", "SPHERE_CAPSULE", "SPHERE_BOX", "SPHERE_CYLINDER"), 1)
+_MOST |= dict.fromkeys(("PLANE_ELLIPSOID", "SPHERE_ELLIPSOID", "CAPSULE_ELLIPSOID", "ELLIPSOID_BOX"), 1)
+# Types of two geoms -> (kind, most contacts).
+CONTACT_KINDS = {(*name.split("_"),): (int(getattr(kinds, name)), most) for name, most in _MOST.items()}
 # Pairs for which MuJoCo C runs its general convex solver, unless it is the older one of `nativeccd="disable"`.
 BY_GENERAL_SOLVER = [("SPHERE", "ELLIPSOID"), ("CAPSULE", "ELLIPSOID"), ("ELLIPSOID", "BOX"), ("CAPSULE", "CYLINDER")]
 FEW = 64  # contacts of all pairs, up to which there is memory for all of them
