@@ -168,7 +168,6 @@ class FetchEnv(SimulatedTask):
         return dataclasses.replace(physics, qpos=physics.qpos.at[self._finger_qpos].set(0.0))
 
     def is_sound(self, physics: Physics) -> Array:
-        """Whether this is a possible state of the task, bool []. NaN is not."""
         qpos, qvel = physics.qpos, physics.qvel
         sound = jnp.all(jnp.isfinite(qpos)) & jnp.all(jnp.isfinite(physics.warmstart)) & jnp.all(jnp.isfinite(qvel))
         sound &= jnp.all(jnp.abs(qvel[self.arm.qvel]) < MAX_JOINT_SPEED)

@@ -116,27 +116,21 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
     desired_goal = jnp.where(relabelled[:, None], hindsight.goals, sample.desired_goal)
     achieved_goal = sample.episode_goals[jnp.arange(batch_size), sample.step + 1]
     reward = context.compute_reward(achieved_goal, desired_goal)
+    terminal = sample.terminal
+    if context.ends_at_goal:
+        terminal |= context.reached(achieved_goal, desired_goal)
     batch = Batch(
         observation=sample.observation,
         next_observation=sample.next_observation,
         desired_goal=desired_goal,
         action=sample.action,
         reward=check.array("compute_reward: rewards [B]", reward, (batch_size,), jnp.number),
-        discount=jnp.where(_is_terminal(sample, achieved_goal, desired_goal, context), 0.0, _gamma(context)),
+        discount=jnp.where(terminal, 0.0, jnp.asarray(hparams.gamma, jnp.float32)),
         row=sample.row,
         hindsight_goal=hindsight.goals,
     )
     missed = jnp.sum(relabelled & ~hindsight.offered, dtype=jnp.float32)
     return Relabelled(batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0))
-
-
-def _gamma(context: Context) -> Array:
-    return jnp.asarray(context.hparams.gamma, jnp.float32)
-
-
-def _is_terminal(sample: Sample, achieved: Array, desired: Array, context: Context) -> Array:
-    """Whether no future follows transitions that end with `achieved` [B, G], bool [B]."""
-    return sample.terminal | context.reached(achieved, desired) if context.ends_at_goal else sample.terminal
 
 
 def draw_batches(

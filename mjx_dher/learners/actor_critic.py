@@ -73,7 +73,6 @@ class ActorCritic(ActorCriticBase):
     policy_delay: int = 1
 
     def init(self, key: PRNGKey) -> ActorCriticState:
-        """Fresh networks, equal targets and empty normalizers."""
         return first_state(self, key, functools.partial(self.critics.init, self.networks.critic))
 
     def value(self, state: ActorCriticState, obs: GoalObs, action: Array, hparams: HParams) -> Array:

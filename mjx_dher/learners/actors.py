@@ -92,15 +92,12 @@ class Deterministic:
     has_target: ClassVar[bool] = True
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Initial parameters."""
         return network.init(key, *inputs)
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
-        """Actions [..., A]."""
         return cast(Array, network.apply(params, observation, goal))
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        """Draws the noise for `explore`; leaves lead with [T, N]."""
         return exploration_noise(key, num_steps, num_envs, action_size, hparams)
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
@@ -126,7 +123,6 @@ class Deterministic:
         return -jnp.mean(judge(action)) + hparams.action_l2 * jnp.mean(jnp.square(action)), {}
 
     def dense(self, network: Any, params: PyTree) -> Any:
-        """Linear layers, or None for custom networks."""
         return params["params"] if isinstance(network, Actor) and network.style.is_plain else None
 
 
@@ -142,7 +138,6 @@ class Gaussian:
     has_target: ClassVar[bool] = False
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        """Initial parameters."""
         return {"network": network.init(key, *inputs), "log_alpha": jnp.zeros(())}
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
@@ -150,7 +145,6 @@ class Gaussian:
         return jnp.tanh(_moments(network, params, observation, goal)[0])
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        """Draws the noise for `explore`; leaves lead with [T, N]."""
         return exploration_noise(key, num_steps, num_envs, action_size, hparams._replace(noise_std=1.0, random_noise=0.0))
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:

@@ -108,16 +108,13 @@ class ActorCriticBase(Learner):
         return return_bounds(self.spec.reward_range, hparams.gamma)
 
     def act(self, state: State, obs: GoalObs, hparams: HParams) -> Array:
-        """Actions [..., A] of the deterministic policy."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return self.actor.act(self.networks.actor, state.params.actor, *inputs)
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, hparams: HParams) -> Noise:
-        """Exploration noise of `num_envs` episodes; leaves lead with [T, N]."""
         return self.actor.noise(key, num_steps, num_envs, self.spec.action_size, hparams)
 
     def explore(self, state: State, obs: GoalObs, noise: Noise, hparams: HParams) -> Array:
-        """Actions [N, A] of the exploring policy."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
         return self.actor.explore(self.networks.actor, state.params.actor, *inputs, noise)
 

@@ -84,7 +84,6 @@ class CRL(ActorCriticBase):
     policy_delay: int = 1
 
     def init(self, key: PRNGKey) -> ActorCriticState:
-        """Makes fresh networks and empty normalizers."""
         return first_state(self, key, self.networks.critic.init)
 
     def lagging(self, params: Params) -> Params:

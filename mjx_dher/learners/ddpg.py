@@ -65,7 +65,6 @@ class DDPG(ActorCriticBase):
     """Learner with pure functions of a `DDPGState`. `learners.Learner` documents the methods."""
 
     def init(self, key: PRNGKey) -> DDPGState:
-        """Fresh networks, equal targets and empty normalizers."""
         actor_key, critic_key = jax.random.split(key)
         observation, goal, action = zeros(self.spec, self.networks)
         params = Params(

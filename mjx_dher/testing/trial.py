@@ -28,7 +28,7 @@ EPISODES = 16  # random episodes
 TOLERANCE = 1e-3
 # Folders of code that does not belong to the user.
 _OURS = os.path.dirname(os.path.dirname(__file__)) + os.sep
-_INNER = (_OURS, *(os.path.dirname(str(module.__file__)) + os.sep for module in (jax, flax, np)))
+_INNER = ("<", _OURS, *(os.path.dirname(str(module.__file__)) + os.sep for module in (jax, flax, np)))
 
 
 class ComponentError(ValueError):
@@ -151,13 +151,9 @@ def attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:
 def _describe(error: Exception) -> str:
     """An error's type, the first line of its message, and its last place outside JAX and this library."""
     reason = (str(error).strip().splitlines() or [""])[0]
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_inner(frame.filename)]
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_INNER)]
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
     hint = ""
     if isinstance(error, (jax.errors.TracerBoolConversionError, jax.errors.ConcretizationTypeError)):
         hint = "; JAX traces the function, so its `if` and `float` cannot look at values: use jnp.where"
     return f"{type(error).__name__}: {reason}{hint}{place}"
-
-
-def _is_inner(filename: str) -> bool:
-    return filename.startswith("<") or filename.startswith(_INNER)

@@ -148,7 +148,7 @@ class Player:
         self.clock += 1
         self._steps += 1
         self._look()
-        failed, ended = self._failed, self._flag("done") or self._flag("terminal")
+        failed, ended = self._flag("failed"), self._flag("done") or self._flag("terminal")
         if failed or ended or self.clock == self.length:
             (self.own if self.is_own else self.episodes).add(self.success)
             self._held = self.game.steps(HOLD) if failed or ended or self.renew else 0
@@ -179,7 +179,7 @@ class Player:
         box = bounds(self.game.env, dragged)
         if box is not None and shape == (3,):
             position = np.clip(position, *np.transpose(box)).astype(np.float32)
-        if self._failed:  # only a reset helps
+        if self._flag("failed"):  # only a reset helps
             self.new_episode()
         self._state = move(self._state, position)
         self.clock, self._held, self.is_own, self.renew = 0, 0, True, False
@@ -223,10 +223,6 @@ class Player:
     def marks(self) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """Marks of the goal (`render.goal_marks`)."""
         return goal_marks(self.game.env, self.qpos, self.obs["desired_goal"])
-
-    @property
-    def _failed(self) -> bool:
-        return self._flag("failed")
 
     def _flag(self, name: str) -> bool:
         return bool(np.any(getattr(self._state, name, False)))
