@@ -18,7 +18,7 @@ from conftest import ROOT
 
 from mjx_dher.cli import sentence
 from mjx_dher.runs.folder import checkpoint
-from mjx_dher.runs.folder.locks import Claims
+from mjx_dher.runs.folder.results import Claims
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 

@@ -268,7 +268,6 @@ def _train(
     """Trains into `folder`, from its checkpoint if there is one."""
     from mjx_dher.parallel import processes
     from mjx_dher.runs import driver
-    from mjx_dher.runs.folder.locks import last_checkpoint
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}")
     begun = (folder / run_folder.CONFIG_FILE).exists()
@@ -307,7 +306,7 @@ def _train(
     signals.forget()
     if result.status == run_folder.FAILED:
         _draw(folder, curve, console)
-        raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {last_checkpoint(folder)}")
+        raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {results.last_checkpoint(folder)}")
     common.print_summary(result.content, console)
     console.print(f"run folder: {folder}")
     _draw(folder, curve, console)

@@ -23,8 +23,8 @@ from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import diagnostics
 from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
-from mjx_dher.runs.folder.locks import Claims, Run, named
 from mjx_dher.runs.folder.loggers import Sink
+from mjx_dher.runs.folder.results import Claims, Run, named
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.program import loop
