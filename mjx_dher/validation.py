@@ -103,16 +103,6 @@ def delay_problem(config: Config, delay: int) -> str | None:
     return None
 
 
-def _choice_problems(settings: Any) -> Iterator[str]:
-    """Problems of fields that take one of a fixed set of names (`Literal`)."""
-    for name, hint in get_type_hints(type(settings)).items():
-        if get_origin(hint) is Literal:
-            try:
-                check_name(name, getattr(settings, name), get_args(hint))
-            except ValueError as error:
-                yield str(error)
-
-
 def _field_problems(settings: Config | HParams) -> Iterator[str]:
     """Problems of single fields."""
     hints = get_type_hints(type(settings))
@@ -125,7 +115,12 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
                 yield from filter(None, (_number_problem(name, size, number, int) for size in value))
         elif not hasattr(value, "dtype") and (problem := _number_problem(name, value, number, hints[name])):
             yield problem
-    yield from _choice_problems(settings)
+    for name, hint in hints.items():
+        if get_origin(hint) is Literal:
+            try:
+                check_name(name, getattr(settings, name), get_args(hint))
+            except ValueError as error:
+                yield str(error)
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:

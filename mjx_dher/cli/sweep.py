@@ -116,14 +116,12 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
     default = SweepArgs(tyro.MISSING, changes=_Changes(), sweep=_Axes())
     args = parse(SweepArgs, argv, default=default)
     _check(args)
-    trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
-    args = _without_unread(args, trials, report)
-    trials = _trials(args, "cpu" if args.preset == "auto" else args.preset)
-    if args.fleet.ray is not None:
-        return args, trials  # the preset is known once the cluster is joined
-    if args.preset == "auto" and (preset := presets.machine_preset()) != "cpu":
-        trials = _trials(args, preset)
-    return args, trials
+    preset: str = "cpu" if args.preset == "auto" else args.preset
+    args = _without_unread(args, _trials(args, preset), report)
+    if args.preset == "auto" and args.fleet.ray is None:  # else the preset is known once the cluster is joined
+        _trials(args, preset)  # raises for invalid ones before CUDA starts
+        preset = presets.machine_preset()
+    return args, _trials(args, preset)
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:

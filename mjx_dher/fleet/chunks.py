@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_dher import __version__, import_paths
+from mjx_dher.lookup import require_extra
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, custom_components
@@ -55,7 +56,7 @@ class FleetOptions:
             is_url = ":" in str(self.storage).partition("/")[0]
             if is_url or (self.storage.exists() and not self.storage.is_dir()):
                 raise ValueError(f"storage must be a folder; got {str(self.storage)!r}")
-        lookup.require_extra("--ray", "ray", "ray")
+        require_extra("--ray", "ray", "ray")
 
 
 class Task(NamedTuple):
