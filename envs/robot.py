@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.task import MujocoTask
+from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.wrappers import ActionFilter, FrameStack, Wrapper
 from mjx_dher.types import Array, PyTree
 
@@ -22,7 +22,7 @@ class RobotLoop:
     has its own. The constructor compiles all, for the CPU.
 
     Args:
-      env: a `MujocoTask`, or wrappers around one, made as in training.
+      env: a `MujocoTask` or Fetch task, or wrappers around one, made as in training.
       policy: maps {"observation": [D], "desired_goal": [G]} to an action [A], such as `mjx_dher.load_policy(path)`.
 
     Raises:
@@ -36,8 +36,8 @@ class RobotLoop:
             if isinstance(task, ActionFilter | FrameStack):
                 self._wrappers.insert(0, task)  # the innermost first
             task = task.env
-        if not isinstance(task, MujocoTask):
-            raise ValueError(f"env must be a MujocoTask, or wrappers around one; got {type(task).__name__}")
+        if not isinstance(task, SimulatedTask):
+            raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
         model = task.model
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "sensors": model.nsensordata, "goal": task.goal_size}
