@@ -23,7 +23,6 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.context import Context
 from mjx_dher.contract import check_with_goal, env_spec, episode_template
 from mjx_dher.learners import Learner
-from mjx_dher.learners.updates import update_round
 from mjx_dher.parallel import split
 from mjx_dher.parallel.split import AxisName
 from mjx_dher.priorities import Priority, PriorityFn
@@ -310,7 +309,7 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
     config, weights = loop.config, replay.cumulative(ring)
     scores = samplers.score_episodes(loop.sampler, ring.episodes, context)
     shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
-    update = functools.partial(update_round, loop.learner, config.target_period, context.hparams)
+    update = functools.partial(learners.update_round, loop.learner, config.target_period, context.hparams)
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
         batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, scores, loop.priority)
