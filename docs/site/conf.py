@@ -10,21 +10,23 @@ import ast
 import functools
 import importlib
 import inspect
+import os
 import re
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from sphinx.pycode import ModuleAnalyzer
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 import mjx_dher  # noqa: E402
 
 project = "mjx-dher"
 release = mjx_dher.__version__
 author = "The mjx-dher authors"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "hosting"]
 root_doc = "docs/index"
 include_patterns = [
     "*.md",
@@ -39,8 +41,16 @@ html_theme = "furo"
 html_title = f"mjx-dher {release}"
 html_extra_path = ["index.html"]  # the front page's address: it leads to docs/index.html
 html_copy_source = False
+html_static_path, html_css_files, html_js_files = ["static"], ["site.css"], ["versions.js"]
+html_favicon = "static/icon.svg"
+ADDRESSES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"].get("urls", {})
+html_baseurl = os.environ.get("SITE", ADDRESSES.get("Documentation", "")).rstrip("/")
+html_baseurl += "/" if html_baseurl else ""
+if "Repository" in ADDRESSES:  # each page gets a link to its source
+    html_theme_options = {"source_repository": ADDRESSES["Repository"], "source_branch": "main", "source_directory": ""}
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # a test runs the notebook
+viewcode_follow_imported_members = False  # else the links back from a module's source name another module
 default_role = "py:obj"  # for text in backticks in a docstring
 autodoc_default_options = {
     "members": True,
