@@ -1,14 +1,17 @@
 """The site's own files: tags, sitemap, versions, and the check of its links. `.ci/run --docs` builds it and runs the check."""
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
 import pytest
+import yaml
 from conftest import ROOT
 
 sys.path.insert(0, str(ROOT / "docs" / "site"))
 import check
+import citations
 import hosting
 import versions
 
@@ -86,3 +89,24 @@ def test_links_that_lead_nowhere_are_listed(tmp_path):
     (tmp_path / "b.html").write_text('<p id="x y"><a href="a.html">A</a></p>')
     found = sorted(line.removeprefix("a.html links to ") for line in check.broken_links(tmp_path))
     assert found == ["#none", "b.html#none", "none.html", "none.png"]
+
+
+def test_the_paper_has_the_journals_form():
+    text, bib = (ROOT / f"{citations.PAPER}{suffix}" for suffix in (".md", ".bib"))
+    _, front, body = text.read_text().split("---\n", 2)
+    head = yaml.safe_load(front)
+    assert {"title", "tags", "authors", "affiliations", "date", "bibliography"} <= set(head)
+    assert (text.parent / head["bibliography"]) == bib
+    titles = re.findall(r"^# (.*)$", body, re.M)
+    assert titles == ["Summary", "Statement of need", "State of the field", "Software design", "References"]
+    assert len(body.split()) <= 700
+    cited = set(re.findall(r"@(\w+)", "".join(citations.CITATION.findall(body))))
+    assert cited == set(citations.entries(bib.read_text()))
+    pages = "".join((ROOT / name).read_text() for name in ("README.md", "docs/results.md", "docs/field.md"))
+    figures = re.findall(r"\d[\d,]*\.\d+|\d+(?:,\d{3})+", body)
+    assert len(figures) > 4
+    assert [figure for figure in figures if figure not in pages] == []
+    shown = citations.page(text.read_text(), bib.read_text())
+    assert shown.startswith(f"# {head['title']}\n")
+    assert "(Andrychowicz et al. 2017)" in shown
+    assert "@" not in shown

@@ -21,6 +21,8 @@ from sphinx.pycode import ModuleAnalyzer
 
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+import citations  # noqa: E402
+
 import mjx_dher  # noqa: E402
 
 project = "mjx-dher"
@@ -34,6 +36,7 @@ include_patterns = [
     "docs/*.ipynb",
     "docs/api/*.md",
     "docs/experiments/*.md",
+    "docs/joss/*.md",
     "bench/*.md",
     "mjx_dher/policy/bundled/*/*.md",
 ]
@@ -75,6 +78,8 @@ def expand(app: Any, docname: str, source: list[str]) -> None:
     del app
     if docname == root_doc:
         source[0] += contents(source[0])
+    elif docname == citations.PAPER:
+        source[0] = citations.page(source[0], (ROOT / citations.PAPER).with_suffix(".bib").read_text(encoding="utf-8"))
     elif docname.startswith("docs/api/"):
         for line in MODULE.finditer(source[0]):
             add_comments(line[1])
