@@ -65,8 +65,10 @@ def require_extra(feature: str, package: str, extra: str) -> None:
 
 
 def missing_extra(feature: str, package: str, extra: str) -> str:
-    """Message for a missing package of an optional extra."""
-    return f'{feature} needs {package}, which the extra "{extra}" installs: pip install -e ".[{extra}]"'
+    """Message for a missing package of an optional extra, with the command that installs it here."""
+    checkout = (Path(__file__).parents[1] / "pyproject.toml").is_file()
+    command = f'pip install -e ".[{extra}]"' if checkout else f'pip install "mjx-dher[{extra}]"'
+    return f'{feature} needs {package}, which the extra "{extra}" installs: {command}'
 
 
 def hint(value: str, allowed: Iterable[str], cutoff: float = 0.5) -> str:

@@ -43,5 +43,7 @@ def test_it_runs_and_its_policy_reaches():
     code = [cell for cell in notebook.cells if cell["cell_type"] == "code"]
     printed = texts(code)
     assert float(re.search(r"success ([\d.]+) in 500 fresh episodes", printed)[1]) >= 0.95
+    assert float(re.search(r"'success_rate': ([\d.]+)", printed)[1]) >= 0.95
+    assert float(re.search(r"actions within (\S+) of the policy's", printed)[1]) <= 1e-5
     assert len(re.findall(r"mean success over the run ([\d.]+)", printed)) == 2
     assert pictures(code) == 3

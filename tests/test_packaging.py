@@ -97,6 +97,8 @@ def test_the_wheel_works_away_from_any_checkout(distributions, tmp_path):
         sys.executable, "-P", "-c", "import mjx_dher.envs.push as push; print(push.__file__); push.Push(engine='native')"
     )
     assert where.startswith(str(tmp_path / "site"))
+    hint = run(sys.executable, "-P", "-c", "from mjx_dher import lookup; print(lookup.missing_extra('', '', 'view'))")
+    assert hint.endswith('pip install "mjx-dher[view]"\n')
 
 
 def test_the_version_is_the_same_everywhere():
@@ -108,7 +110,9 @@ def test_the_version_is_the_same_everywhere():
     metadata = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert metadata["authors"] == citation["authors"]
     assert metadata["license"] == citation["license"]
-    assert metadata.get("urls", {}).get("Repository") == citation.get("repository-code")
+    repository = metadata.get("urls", {}).get("Repository")
+    assert repository == citation.get("repository-code")
+    assert f'REPOSITORY = \\"{repository or ""}\\"' in (ROOT / "docs" / "notebook.ipynb").read_text()
 
 
 def test_a_release_uploads_nothing_until_someone_enables_it():

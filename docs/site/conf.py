@@ -49,7 +49,9 @@ html_favicon = "static/icon.svg"
 ADDRESSES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"].get("urls", {})
 html_baseurl = os.environ.get("SITE", ADDRESSES.get("Documentation", "")).rstrip("/")
 html_baseurl += "/" if html_baseurl else ""
-if "Repository" in ADDRESSES:  # each page gets a link to its source
+if html_baseurl and not html_baseurl.startswith(("https://", "http://")):
+    raise ValueError(f"SITE or Documentation must begin with https:// or http://; got {html_baseurl!r}")
+if ADDRESSES.get("Repository"):  # each page gets a link to its source
     html_theme_options = {"source_repository": ADDRESSES["Repository"], "source_branch": "main", "source_directory": ""}
 myst_heading_anchors = 4
 nb_execution_mode = "off"  # a test runs the notebook
