@@ -50,18 +50,24 @@ def _say(leaf: Any) -> Any:
 
 def episode_template(env: Env) -> Episode:
     """Shapes and dtypes of one episode, without running `env`. Raises ValueError if `env` is not an environment."""
+    return spec_and_template(env)[1]
+
+
+def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
+    """`env_spec` and `episode_template`, from one trace of `env`."""
     spec, first = _spec_and_shapes(env)
 
     def repeat(x: Any, times: int) -> Any:
         return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
 
     num_steps = spec.episode_length
-    return Episode(
+    template = Episode(
         observation=jax.tree.map(lambda x: repeat(x, num_steps + 1), first.obs["observation"]),
         achieved_goal=repeat(first.obs["achieved_goal"], num_steps + 1),
         desired_goal=first.obs["desired_goal"],
         action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
-    ).filled()
+    )
+    return spec, template.filled()
 
 
 def check_env_parts(env: Any) -> None:

@@ -18,18 +18,20 @@ from mjx_dher import rates
 from mjx_dher.contract import check_steps
 from mjx_dher.policy import TrainedPolicy
 from mjx_dher.rollout import Outcome, rollout
-from mjx_dher.types import Array, Env, GoalObs, PRNGKey
+from mjx_dher.types import Array, Env, EnvSpec, GoalObs, PRNGKey
 
 CHUNK = 500  # episodes at once
 
 
-def evaluate(env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int) -> Outcome:
+def evaluate(
+    env: Env, act: Callable[[GoalObs], Array], key: PRNGKey, num_episodes: int, spec: EnvSpec | None = None
+) -> Outcome:
     """Plays parallel episodes of a deterministic policy. Traceable. Returns outcomes [num_episodes].
 
     `act` maps observations, whose leaves lead with [num_episodes], to actions [num_episodes, A]. `key` draws the initial
-    states.
+    states. `spec` is as in `rollout.rollout`.
     """
-    return rollout(env, lambda _, obs: act(obs), key, num_episodes)[1]
+    return rollout(env, lambda _, obs: act(obs), key, num_episodes, spec=spec)[1]
 
 
 def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:

@@ -40,7 +40,13 @@ class _Playing(NamedTuple):
 
 
 def rollout(
-    env: Env, policy: PolicyFn, key: PRNGKey, num_envs: int, inputs: PyTree = None, goals: GoalsFn | None = None
+    env: Env,
+    policy: PolicyFn,
+    key: PRNGKey,
+    num_envs: int,
+    inputs: PyTree = None,
+    goals: GoalsFn | None = None,
+    spec: EnvSpec | None = None,
 ) -> tuple[Episode, Outcome]:
     """Plays episodes in parallel. An episode that ends early keeps its last state until the others have ended.
 
@@ -52,6 +58,7 @@ def rollout(
       inputs: other inputs of the policy, such as noise or keys; leaves lead with [T].
       goals: function from the initial observations to goals [N, G], which `env.with_goal` sets. Default: the goals of the
         resets.
+      spec: `contract.env_spec` of `env`, if it is known. It takes a trace of `env`.
 
     Returns:
       The episodes (leaves lead with [N]) and their outcomes.
@@ -60,7 +67,7 @@ def rollout(
       ValueError: actions are not [N, A], inputs do not lead with [T], `env` is not an environment, or its states violate
         `types.Env` or its spec.
     """
-    return record_rollout(env, policy, key, num_envs, lambda state: (), inputs, goals)[:2]
+    return record_rollout(env, policy, key, num_envs, lambda state: (), inputs, goals, spec)[:2]
 
 
 def record_rollout(
@@ -71,12 +78,13 @@ def record_rollout(
     record: Callable[[Any], PyTree],
     inputs: PyTree = None,
     goals: GoalsFn | None = None,
+    spec: EnvSpec | None = None,
 ) -> tuple[Episode, Outcome, PyTree]:
     """Plays episodes like `rollout`, and also returns `record(state)` of all states; leaves lead with [N, T+1].
 
     Arguments other than `record` are as in `rollout`.
     """
-    spec = env_spec(env)
+    spec = env_spec(env) if spec is None else spec
     check_size("num_envs", num_envs)
     _check_inputs(inputs, spec.episode_length)
     first = jax.vmap(env.reset)(_keys(key, num_envs))

@@ -21,7 +21,7 @@ from mjx_dher import config as config_lib
 from mjx_dher import context as context_lib
 from mjx_dher.config import Config, HParams
 from mjx_dher.context import Context
-from mjx_dher.contract import check_with_goal, env_spec, episode_template
+from mjx_dher.contract import check_with_goal, spec_and_template
 from mjx_dher.learners import Learner
 from mjx_dher.parallel import split
 from mjx_dher.parallel.split import AxisName
@@ -59,6 +59,9 @@ class Train(NamedTuple):
     init: Callable[[PRNGKey, HParams], TrainState]
     epoch: Callable[[TrainState], tuple[TrainState, Metrics]]
     add: Callable[[TrainState, Episode], TrainState]  # adds N demonstrations to the ring and the normalizers
+    # (state, key, number N) -> outcomes [N] of the deterministic policy on this device
+    evaluate: Callable[[TrainState, PRNGKey, int], evaluate.Outcome]
+    spec: EnvSpec
     learner: Learner
     replay_bytes: int  # size of one run's ring on a device
     axis_name: AxisName = None
@@ -138,7 +141,7 @@ def make_train(
     Raises:
       ValueError: invalid argument. `epoch` raises it for arrays of the wrong shape while it is traced.
     """
-    spec = env_spec(env)
+    spec, template = spec_and_template(env)
     if not isinstance(config, Config):
         raise ValueError(f"config must be a Config; got {config!r}")
     validation.validate(config, HParams(), spec.episode_length)
@@ -153,7 +156,7 @@ def make_train(
         priority=priorities.whole(priorities.make("eventful" if priority is None else priority)),
         generator=generator,
         learner=learner if axis_name is None else learners.over_axis(learner, axis_name),
-        template=episode_template(env),
+        template=template,
         axis_name=axis_name,
     )
     if problem := validation.delay_problem(config, loop.policy_delay):
@@ -162,14 +165,9 @@ def make_train(
         check_with_goal(env)
     if loop.uses_values:
         learners.check_values(loop.learner)
-    return Train(
-        init=functools.partial(_init, loop),
-        epoch=functools.partial(_epoch, loop),
-        add=functools.partial(_add_episodes, loop),
-        learner=loop.learner,
-        replay_bytes=replay.nbytes(loop.template, loop.num_episodes),
-        axis_name=axis_name,
-    )
+    init, epoch, add = functools.partial(_init, loop), functools.partial(_epoch, loop), functools.partial(_add_episodes, loop)
+    nbytes = replay.nbytes(loop.template, loop.num_episodes)
+    return Train(init, epoch, add, functools.partial(_evaluate, loop), spec, loop.learner, nbytes, axis_name)
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
@@ -198,7 +196,7 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     state, cycles = jax.lax.scan(lambda state, _: _cycle(loop, state), state, length=loop.config.cycles_per_epoch)
     key, eval_key = jax.random.split(state.key)
     discarded = split.total(jnp.sum(cycles.pop("discarded_episodes")), loop.axis_name)
-    outcome = evaluate_state(loop.env, loop.learner, state, eval_key, loop.config.eval_episodes, loop.axis_name)
+    outcome = _evaluate(loop, state, eval_key, loop.config.eval_episodes)
     means = split.mean(jax.tree.map(lambda x: replay.mean(x, len(x)), cycles), loop.axis_name)
     evaluated = split.mean((evaluate.summary(outcome), evaluate.faults(outcome)), loop.axis_name)
     faults = {name: jnp.maximum(means[name], share) for name, share in evaluated[1].items()}
@@ -222,7 +220,8 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     learners.check_noise(noise, env.episode_length, config.num_envs)
     updates = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle
     before = _context(loop, state.learner, hparams, updates)
-    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, _goals(loop, state, before))
+    goals = _goals(loop, state, before)
+    episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, goals, loop.spec)
     weights = priorities.weights(loop.priority, episodes, before)
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
     learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
@@ -320,15 +319,11 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
     return learner, jax.tree.map(jnp.mean, losses)
 
 
-def evaluate_state(
-    env: Env, learner: Learner, state: TrainState, key: PRNGKey, num_episodes: int, axis_name: AxisName = None
-) -> evaluate.Outcome:
-    """Outcomes [num_episodes] of the learner's deterministic policy on this device."""
-
+def _evaluate(loop: Loop, state: TrainState, key: PRNGKey, num_episodes: int) -> evaluate.Outcome:
     def act(obs: GoalObs) -> Array:
-        return learner.act(state.learner, obs, state.hparams)
+        return loop.learner.act(state.learner, obs, state.hparams)
 
-    return evaluate.evaluate(env, act, split.own_key(key, axis_name), num_episodes)
+    return evaluate.evaluate(loop.env, act, split.own_key(key, loop.axis_name), num_episodes, loop.spec)
 
 
 def anneal(hparams: HParams, progress: Array | float) -> HParams:

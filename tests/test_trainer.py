@@ -230,7 +230,7 @@ def test_bfloat16_is_for_learning_alone():
     moved = jax.tree.map(lambda new, old: float(jnp.abs(new - old).max()), learned.params, first.learner.params)
     assert min(jax.tree.leaves(moved)) > 0.001
     assert ["bf16" in str(jax.make_jaxpr(p.epoch)(first)) for p in (program, other)] == [False, True]
-    play = lambda state, key: trainer.evaluate_state(ENV, other.learner, state, key, 8)  # noqa: E731
+    play = lambda state, key: other.evaluate(state, key, 8)  # noqa: E731
     assert "bf16" not in str(jax.make_jaxpr(play)(first, jax.random.key(1)))
 
 

@@ -129,8 +129,8 @@ def compile_runs(
         if available is None or compiled.nbytes <= available or lanes == 1:
             loop.check_program(compiled, spec.config, layout.sharers)
             beside = available is not None and compiled.nbytes <= available / 2
-            evaluate = _compile_evaluation(env, train, keys, hparams, final_episodes, beside, layout)
-            return Program(lanes * layout.lanes, layout, choices, train.learner, env_spec(env), compiled, evaluate)
+            evaluate = _compile_evaluation(train, keys, hparams, final_episodes, beside, layout)
+            return Program(lanes * layout.lanes, layout, choices, train.learner, train.spec, compiled, evaluate)
         lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
 
 
@@ -168,14 +168,13 @@ def _compile(
 
 
 def _compile_evaluation(
-    env: Env, train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
+    train: Train, keys: PRNGKey, hparams: Any, final_episodes: int, beside: bool, layout: Layout = ONE
 ) -> concurrent.futures.Future[EvaluateFn]:
     """Compiles the final evaluation. With `beside`, a thread does so during training, which takes memory."""
     episodes = math.ceil(min(final_episodes, evaluate_lib.CHUNK) / layout.shards)
 
     def evaluate(state: TrainState, key: PRNGKey) -> Outcome:
-        outcome = trainer.evaluate_state(env, train.learner, state, key, episodes, train.axis_name)
-        return split.gather(outcome, train.axis_name)
+        return split.gather(train.evaluate(state, key, episodes), train.axis_name)
 
     init, evaluate_all = (jax.vmap(train.init), jax.vmap(evaluate)) if keys.ndim else (train.init, evaluate)
     arguments: tuple[Any, Any] = keys, hparams
