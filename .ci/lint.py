@@ -28,7 +28,9 @@ EMPTY_NAMES = {"found", "said", "there", "thing", "stuff", "tmp"}
 NAMES_PAGE = ROOT / "docs" / "api" / "names.md"
 NAMES_HEAD = """# API: index of names
 
-Every public name of the algorithm's modules. `python .ci/lint.py --write-names` makes this table.
+Every public name of the algorithm's modules. The module's link leads to its docstrings, with shapes and errors. The package
+itself has the names in `mjx_dher.__all__`, such as `Config`, `HParams`, `RunSpec`, `preset`, `train_runs`, `make_train` and
+`load_policy`. [Environments](environments.md) has those of `mjx_dher.envs`. `python .ci/lint.py --write-names` makes this table.
 
 | name | module | description |
 |---|---|---|
@@ -119,7 +121,7 @@ def check_public_names(trees: dict[Path, ast.Module], add: Add) -> str:
         if not is_type and not any(name in used for other, used in words.items() if other != path):
             add(path, node.lineno, f"no other file uses the public name {name}: make it private")
     listed, expected = (
-        re.findall(r"^\| `\w+` \| `[\w.]+` \|", page, re.M) for page in (NAMES_PAGE.read_text(), names_page(names))
+        re.findall(r"^\| `\w+` \| \[`[\w.]+`\]", page, re.M) for page in (NAMES_PAGE.read_text(), names_page(names))
     )
     if listed != expected:
         add(NAMES_PAGE, 1, "it lists other names than there are: run `python .ci/lint.py --write-names`")
@@ -137,7 +139,8 @@ def names_page(names: list[tuple[Path, ast.stmt, str]]) -> str:
         else:
             value = ast.unparse(node).split(" = ", 1)[-1]
             text = f"`{value if len(value) <= MAX_VALUE else value[:MAX_VALUE] + '...'}`"
-        lines.append(f"| `{name}` | `{module}` | {text} |".replace("\\", "\\\\"))
+        link = f"[`{module}`](../../{path.relative_to(ROOT)})"
+        lines.append(f"| `{name}` | {link} | {text} |".replace("\\", "\\\\"))
     return NAMES_HEAD + "\n".join(re.sub(r"(?<=\w) *\|(?= *\w)", " or ", line) for line in lines) + "\n"
 
 

@@ -101,6 +101,14 @@ def test_the_page_s_custom_environment_is_made():
     assert made["envs"].num_envs == 8
 
 
+@pytest.mark.slow
+def test_the_loop_of_the_page_on_policies_reaches_the_goal(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "policies.md").read_text(), re.S)
+    (loop,) = [block for block in blocks if "gymnasium.make" in block]
+    exec(compile(loop, "policies.md", "exec"), {"mjx_dher": mjx_dher})
+    assert capsys.readouterr().out == "1.0\n"
+
+
 def test_the_environment_says_how_long_a_step_takes():
     assert gymnasium.make(ENV, name="test_gym_use:Slowed").metadata["render_fps"] == 50
     assert gymnasium.make(ENV, name="test_gym_use:Slowed", dt=np.float32(0.5)).metadata["render_fps"] == 2
