@@ -12,9 +12,11 @@ from conftest import ROOT, names, refuses
 
 import mjx_dher
 from mjx_dher import cli
+from mjx_dher.cli import common
 from mjx_dher.cli.train import parse_train_args
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools.transfer import ORIGINALS
 
@@ -64,6 +66,14 @@ def test_the_documents_have_every_policy():
         card = f"../mjx_dher/policy/bundled/{name}/README.md"
         assert f"| `{name}` | {rates} | {result['env_steps']:,} | [card]({card}) |\n" in page
         assert f"[{name}]({card})" in index
+
+
+@pytest.mark.parametrize(("engine", "made"), [("warp", "auto"), ("jax", None), ("auto", None)])
+def test_a_run_of_warp_plays_on_a_machine_without_a_gpu(monkeypatch, engine, made):
+    monkeypatch.setattr(common, "make_env", lambda run, engine: engine)
+    run = RunSpec(env="push", engine=engine)
+    assert common.played_env(run, None) == made
+    assert common.played_env(run, "warp") == "warp"  # typed: an error says that there is no GPU
 
 
 def test_every_setting_can_be_told_by_a_command():

@@ -34,7 +34,9 @@ CURVE_WIDTH = 24  # characters of the live curve
 # Types of options.
 Devices = int | Literal["all"]
 EnvKwargs = Annotated[tuple[str, ...], Doc("Arguments of the environment as NAME=VALUE, which override the run's.")]
-Physics = Annotated[str | None, Doc("Physics: native, jax, warp or auto. Default: the run's.")]
+Physics = Annotated[
+    str | None, Doc("Physics: native, jax, warp or auto. Default: the run's, or native for warp without a GPU.")
+]
 Trust = Annotated[
     bool, Doc("Use code and data that the run folder names even if you have not trained with them on this machine.")
 ]
@@ -67,6 +69,13 @@ def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Seq
 def make_env(run: RunSpec, engine: str | None = None) -> Any:
     """Makes the environment of a run, with `engine` instead of the run's if given."""
     return envs.make(run.env, engine=engine or run.engine, **run.env_arguments)
+
+
+def played_env(run: RunSpec, engine: str | None) -> Any:
+    """Makes the environment to play a run's policy in. A run of warp plays on native where JAX has no GPU."""
+    import jax
+
+    return make_env(run, "auto" if engine is None and run.engine == "warp" and jax.default_backend() == "cpu" else engine)
 
 
 def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:

@@ -64,7 +64,7 @@ def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Co
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits
 
-    env = common.make_env(run, args.engine)
+    env = common.played_env(run, args.engine)
     check_fits(policy, env)
     physics = run_folder.engine_name(env)
     if args.json:
@@ -135,7 +135,7 @@ def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> N
     render.ffmpeg()
     gl = render.choose_gl()
     check_platform()
-    env: Any = common.make_env(played, args.engine)  # Any: a GoalEnv need not have a model
+    env: Any = common.played_env(played, args.engine)  # Any: a GoalEnv need not have a model
     if policy is not None:
         check_fits(policy, env)
     import jax
@@ -176,7 +176,7 @@ class TransferArgs:
     python: Path | None = None
     """Python of an environment that has the original tasks. Default: the one from --set-up."""
     engine: str | None = None
-    """Physics here: native, jax, warp or auto. Default: the run's."""
+    """Physics here: native, jax, warp or auto. Default: the run's, or native for warp without a GPU."""
 
 
 def transfer_command(argv: list[str], console: Console) -> int:
@@ -202,7 +202,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     keep_compiled_programs()
     if run.env_kwargs:
         console.print(f"trained with {' '.join(run.env_kwargs)}; played without them in both tasks", soft_wrap=True)
-    env = common.make_env(dataclasses.replace(run, env_kwargs=()), args.engine)
+    env = common.played_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
     theirs = transfer.play_apart(folder, python, args.episodes, args.seed, workers=usable_cores())
