@@ -1,14 +1,17 @@
-"""`Simulator` with few states of small models, compared with a plain loop over `mj_step`, on one core or more.
+"""`Simulator` with few states, compared with a plain loop over `mj_step`, on one core.
 
-    python bench/few_states.py [--states 1 2 4] [--hz 25] [--cpu-time]
+    taskset -c 0 python bench/few_states.py [--states 1 2 4 8] [--timesteps 1 10]
 
-Environment steps a second in the fastest of many short trials, which take turns. On a busy machine, count seconds of the CPU
-(--cpu-time) and simulate on one core (taskset -c 0).
+The loop has an MjData for each state. Before each step it writes `ctrl`, then it calls `mj_step(model, data, timesteps)`, and
+then it copies `qpos` and `qvel`. `step` and `advance` run in a compiled `scan` of equal length, from the same states and with
+the same `ctrl`. Each figure is the median time of many short trials, which take turns in one process, in µs of one core's time
+for each state and step.
 """
 
 from __future__ import annotations
 
 import argparse
+import statistics
 import time
 from pathlib import Path
 
@@ -18,75 +21,76 @@ import mujoco
 import numpy as np
 from timing import print_table
 
+from mjx_dher import envs
 from mjx_dher.envs import Simulator
 from mjx_dher.envs.engines import Controls, Physics
 
-MAZE = """
-<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/><body pos="0 0 .1">
-<joint name="x" type="slide" axis="1 0 0" damping="1"/><joint name="y" type="slide" axis="0 1 0" damping="1"/><geom size=".1"/>
-</body><geom type="box" size=".1 1 .2" pos="1 0 .2"/></worldbody><actuator><motor joint="x"/><motor joint="y"/></actuator>
-</mujoco>"""
-PENDULUM = '<mujoco><worldbody><body><joint axis="0 1 0"/><geom size="0.1" pos="0.3 0 0"/></body></worldbody></mujoco>'
 ARM = Path(__file__).parent.parent / "docs" / "examples" / "arm.xml"
-SECONDS, TRIALS = 0.01, 30  # of a trial, and how many
+SECONDS, TRIALS = 0.005, 41  # of a trial, and how many
 
 
-def runs(model: mujoco.MjModel, states: int, substeps: int, length: int):
+def runs(model: mujoco.MjModel, states: int, timesteps: int, length: int):
     """Functions that simulate `length` steps: a loop, `step` and `advance`."""
-    sim = Simulator(model, substeps=substeps)
-    ctrl = np.random.default_rng(0).uniform(-1, 1, (length, states, model.nu)).astype(np.float32)
+    sim, rng = Simulator(model, substeps=timesteps), np.random.default_rng(0)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-1, 1)).T
+    ctrl = rng.uniform(low, high, (length, states, model.nu)).astype(np.float32)
     datas = [mujoco.MjData(model) for _ in range(states)]
+    data = sim.make_data(0 if model.nkey else None)
+    parts = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    start = np.zeros(mujoco.mj_stateSize(model, parts))
 
     def loop():
+        seen = []
+        for each in datas:
+            mujoco.mj_setState(model, each, start, parts)
         for row in ctrl:
-            for data, each in zip(datas, row):
-                data.ctrl[:] = each
-                for _ in range(substeps):
-                    mujoco.mj_step(model, data)
+            for each, inputs in zip(datas, row):
+                each.ctrl = inputs
+                mujoco.mj_step(model, each, timesteps)
+                seen.append((each.qpos.copy(), each.qvel.copy()))
+
+    mujoco.mj_resetDataKeyframe(model, datas[0], 0) if model.nkey else mujoco.mj_resetData(model, datas[0])
+    mujoco.mj_getState(model, datas[0], start, parts)
+    mocap = jnp.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
+
+    def scan(step):
+        return jax.jit(lambda x: jax.lax.scan(lambda x, u: ((x := jax.vmap(step)(x, u)), (x.qpos, x.qvel)), x, ctrl)[1])
 
     many = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (states, *x.shape)), tree)  # noqa: E731
-    data = sim.make_data()
-    physics = Physics(data.qpos, data.qvel, data.qacc_warmstart, data.act)
-    mocap = jnp.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
-    step = jax.jit(lambda x: jax.lax.scan(lambda x, u: (jax.vmap(sim.step)(x, u), None), x, ctrl)[0])
-    advance = jax.jit(
-        lambda x: jax.lax.scan(
-            lambda x, u: (jax.vmap(lambda x, u: sim.advance(x, Controls(u, mocap)))(x, u), None), x, jnp.asarray(ctrl)
-        )[0]
-    )
-    data, physics = many(data), many(physics)
+    step, advance = scan(sim.step), scan(lambda x, u: sim.advance(x, Controls(u, mocap)))
+    data, physics = many(data), many(Physics(data.qpos, data.qvel, data.qacc_warmstart, data.act))
     return [loop, lambda: jax.block_until_ready(step(data)), lambda: jax.block_until_ready(advance(physics))]
 
 
-def fastest(functions, clock) -> list[float]:
-    """Seconds of each function, the least of trials that take turns."""
-    seconds = [np.inf] * len(functions)
+def medians(functions) -> list[float]:
+    """Seconds of this process that each function takes, the median of trials that take turns."""
+    seconds: list[list[float]] = [[] for _ in functions]
     for _ in range(TRIALS):
-        for number, function in enumerate(functions):
-            begun = clock()
+        for taken, function in zip(seconds, functions):
+            begun = time.process_time()
             function()
-            seconds[number] = min(seconds[number], clock() - begun)
-    return seconds
+            taken.append(time.process_time() - begun)
+    return [statistics.median(taken[1:]) for taken in seconds]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--states", type=int, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--hz", type=float, default=25)
-    parser.add_argument("--cpu-time", action="store_true")
+    parser.add_argument("--states", type=int, nargs="+", default=[1, 2, 4, 8])
+    parser.add_argument("--timesteps", type=int, nargs="+", default=[1, 10])
     args = parser.parse_args()
-    clock = time.process_time if args.cpu_time else time.perf_counter
-    models = {"pendulum": mujoco.MjModel.from_xml_string(PENDULUM), "point maze": mujoco.MjModel.from_xml_string(MAZE)}
-    models["guide's arm"] = mujoco.MjModel.from_xml_path(str(ARM))
+    models = {"guide's arm": mujoco.MjModel.from_xml_path(str(ARM))}
+    models |= {name: envs.make(name, engine="native").model for name in ("push", "block_rotate_z")}
     rows = []
     for name, model in models.items():
-        substeps = max(1, round(1 / (args.hz * model.opt.timestep)))
-        for states in args.states:
-            (alone,) = fastest(runs(model, states, substeps, 5)[:1], clock)
-            length = int(np.clip(5 * SECONDS / alone, 5, 1000))
-            rates = [f"{states * length / each:,.0f}" for each in fastest(runs(model, states, substeps, length), clock)]
-            rows.append((name, substeps, states, *rates))
-    print_table(("model", "timesteps a step", "states", "loop over mj_step", "Simulator.step", "Simulator.advance"), rows)
+        for timesteps in args.timesteps:
+            for states in args.states:
+                (alone,) = medians(runs(model, states, timesteps, 5)[:1])
+                length = int(np.clip(5 * SECONDS / max(alone, 1e-6), 5, 1000))
+                taken = [1e6 * each / states / length for each in medians(runs(model, states, timesteps, length))]
+                rows.append((name, timesteps, states, *(f"{each:,.1f}" for each in taken), f"{taken[0] / taken[1]:.2f}"))
+                rows[-1] += (f"{taken[0] / taken[2]:.2f}",)
+    head = ("model", "timesteps a step", "states", "loop, µs", "step, µs", "advance, µs", "loop / step", "loop / advance")
+    print_table(head, rows)
 
 
 if __name__ == "__main__":

@@ -141,6 +141,27 @@ def test_few_states_are_stepped_by_one_thread_if_that_is_faster():
     np.testing.assert_array_equal(seen[0].qpos, seen[1].qpos)
 
 
+def test_mujoco_s_clock_stands_still_only_during_a_call(monkeypatch):
+    model = mujoco.MjModel.from_xml_string(FIGURE)
+    sim, data = Simulator(model, derived=["xpos"]), mujoco.MjData(model)
+    seen = []
+    run = batches.Batch.step
+    monkeypatch.setattr(batches.Batch, "step", lambda *args, **kw: (seen.append(clock.value), run(*args, **kw)))
+    clock = batches.UNTIMED._clock
+    before = clock.value
+    assert before is not None  # the bindings export it on this system
+    jax.block_until_ready(sim.step(sim.make_data()))
+    with batches.UNTIMED:  # a second simulator, in another thread
+        jax.block_until_ready(sim.step(sim.make_data()))
+        assert clock.value is None
+    assert (seen, clock.value) == ([None, None], before)
+    mujoco.mj_step(model, data)
+    assert data.timer[int(mujoco.mjtTimer.mjTIMER_STEP)].duration > 0
+    with batches.UNTIMED:
+        clock.value = other = before + 0  # as set_mjcb_time does meanwhile
+    assert clock.value == other
+
+
 def test_what_blows_up_is_not_reset_behind_one_s_back():
     sim = Simulator(mujoco.MjModel.from_xml_string(FIGURE))
     data = sim.make_data()
@@ -299,7 +320,7 @@ def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
     data, program = sim.make_data(), jax.jit(sim.step)
     expected = program(data)
     compiled = program.lower(data).compile()
-    row = np.concatenate([np.ravel(getattr(data, name)) for name in (*STATE, "residue")])
+    row = np.concatenate([np.ravel(getattr(data, name)) for name in ("residue", *STATE)])
     for size in range(1, 3 + batches._KEPT):
         sim._on_step(np.tile(row, (size, 1)), np.empty((size, len(row)), np.float32))
     assert len(sim._batches[True].kept) == batches._KEPT

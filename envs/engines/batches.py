@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import mujoco
@@ -15,18 +17,19 @@ from mjx_dher.envs.engines.fields import LATE
 EXACT = ("time", "history")  # float64 between steps too, because a float32 time would stop advancing
 FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 _KEPT = 8  # batches to keep, of the last sizes
+_Place = tuple[slice, slice]  # in rows
 _FEW = 64  # most simulations that one thread may step faster than several, which must wake up
 
 
 class Rows:
-    """Simulations in a batch, and views [nsim, n] of the batch's memory.
+    """Simulations in a batch, and rows [nsim, n] of numbers that go into the batch's memory and come out of it.
 
     Args:
       batch: it must be persistent if some of `derived` are `LATE`.
       inputs: fields of the state that `write` sets.
       outputs: fields of the state that `read` returns.
       derived: other fields that it returns.
-      exact: whether rows also have the digits of `EXACT` that float32 omits.
+      digits: numbers at the start of a row: the digits of `EXACT` that float32 omits, or 0 if rows do not have them.
       variation: numbers of the model that vary (`base.variation_of`). Their factors end a row that goes in.
     """
 
@@ -36,28 +39,49 @@ class Rows:
         inputs: Sequence[str],
         outputs: Sequence[str],
         derived: Sequence[str],
-        exact: bool,
+        digits: int,
         variation: Any,
     ):
         self.batch, self.seconds = batch, 0.0  # that a call takes
-        self._inputs, self._outputs = _joined(batch, inputs), _joined(batch, outputs)
-        views = {name: batch.bind(name).reshape(batch.nsim, -1) for name in derived if _size(batch.bind(name))}
-        self._derived = list(views.items())
-        self._late: dict[str, Callable[..., Any]] = {name: LATE[name] for name in views if name in LATE}
-        self._exact = [view for name in EXACT for view in _joined(batch, [name])] if exact else []
+        self._inputs = _placed(batch, inputs, digits, EXACT if digits else ())
+        self._outputs = _placed(batch, outputs, digits)
+        begin = digits + sum(_size(batch.bind(name)) for name in outputs)
+        self._late: dict[str, _Place] = {}
+        for name in derived:
+            view = batch.bind(name).reshape(batch.nsim, -1)
+            place, begin = np.s_[:, begin : begin + view.shape[1]], begin + view.shape[1]
+            if view.shape[1] and name in LATE:
+                self._late[name] = place
+            elif view.shape[1]:
+                self._outputs.append((view, place))
+        # Exact numbers in memory, the places of what float32 has of them and of two parts of the rest, and a buffer.
+        self._exact: list[tuple[np.ndarray, _Place, _Place, _Place, np.ndarray]] = []
+        begin = 0
+        for name in EXACT if digits else ():
+            for view, place in _placed(batch, inputs, digits, set(inputs) - {name}):
+                end, half = begin + view.shape[1], digits // 2
+                high, low = np.s_[:, begin:end], np.s_[:, half + begin : half + end]
+                self._exact.append((view, place, high, low, np.empty(view.shape)))
+                begin = end
+        # All of them in a row: the digits, and the time that follows.
+        self._exact_places = [np.s_[:, : digits + 1], *(place for _, place, *_ in self._exact[1:])]
+        self._known: list[bytes] | None = None  # the exact numbers in memory, as rows have them
         self._variation, self._factors = variation, np.full((batch.nsim, variation.size), np.nan)
         self._varied = {name: batch.expand(name) for name in variation.fields}
-        self._warnings = batch.warning[..., 1]
-        self._warnings[...] = 1  # MuJoCo writes MUJOCO_LOG.TXT when a number of warnings leaves 0
+        batch.warning[..., 1] = 1  # MuJoCo writes MUJOCO_LOG.TXT when a number of warnings leaves 0
+        self._warned = batch.warning.tobytes()
 
     def write(self, rows: np.ndarray) -> None:
         """Sets the state to `rows` [nsim, n]."""
-        begin = 0
-        for view in self._inputs:
-            begin, end = begin + view.shape[1], begin
-            view[...] = rows[:, end:begin]
-        if self._exact:
-            _add(self._exact, rows[:, begin:])
+        for view, place in self._inputs:
+            view[...] = rows[place]
+        if self._exact and self._known != self._exact_bytes(rows):
+            for view, place, high, low, whole in self._exact:
+                view[...] = rows[place]
+                np.add(view, rows[high], out=whole)
+                np.add(whole, rows[low], out=whole)
+                np.copyto(view, whole, where=whole.astype(np.float32) == view)
+        self._known = None
         if self._varied and not np.array_equal(factors := rows[:, -self._variation.size :], self._factors):
             self._factors[...] = factors
             for name, value in self._variation.values(self._factors).items():
@@ -65,35 +89,70 @@ class Rows:
 
     def read(self, results: np.ndarray) -> None:
         """Puts the state and derived fields into `results` [nsim, n]."""
-        parts = self._outputs
+        for view, place in self._outputs:
+            results[place] = view
+        if self._late:
+            self._compute_late(results)
+        for view, place, high, low, rest in self._exact:
+            np.subtract(view, results[place], out=rest)
+            results[high] = rest
+            np.subtract(rest, results[high], out=rest)
+            results[low] = rest
         if self._exact:
-            late = self._compute_late() if self._late else {}
-            exact = np.concatenate(self._exact, axis=1) if len(self._exact) > 1 else self._exact[0]
-            derived = [late.get(name, view) for name, view in self._derived]
-            parts = [*parts, *derived, residue(exact).reshape(len(exact), -1)]
-        begin = 0
-        for part in parts:
-            begin, end = begin + part.shape[1], begin
-            results[:, end:begin] = part
+            self._known = self._exact_bytes(results)
 
     def lost(self) -> int:
         """Timesteps that left out contacts since the last call."""
-        if np.add.reduce(self._warnings, axis=None) == self._warnings.size:
+        warning = self.batch.warning
+        if warning.tobytes() == self._warned:
             return 0
-        lost = int((self._warnings[:, FULL] - 1).sum())
-        self._warnings[...] = 1
+        lost = int((warning[:, FULL, 1] - 1).sum())
+        warning[..., 1] = 1
+        self._warned = warning.tobytes()
         return lost
 
-    def _compute_late(self) -> dict[str, np.ndarray]:
-        data, filled = mujoco.MjData(self.batch.model), {name: np.empty_like(dict(self._derived)[name]) for name in self._late}
+    def _exact_bytes(self, rows: np.ndarray) -> list[bytes]:
+        return [rows[place].tobytes() for place in self._exact_places]
+
+    def _compute_late(self, results: np.ndarray) -> None:
+        data = mujoco.MjData(self.batch.model)
         for index in range(self.batch.nsim):
             self.batch.get_data(index, data)
             model = self.batch.get_model(index) if self._varied else self.batch.model
-            for compute in dict.fromkeys(self._late.values()):
+            for compute in dict.fromkeys(LATE[name] for name in self._late):
                 compute(model, data)
-            for name, rows in filled.items():
-                rows[index] = np.ravel(getattr(data, name))
-        return filled
+            for name, place in self._late.items():
+                results[index, place[1]] = np.ravel(getattr(data, name))
+
+
+class Untimed:
+    """A block in which MuJoCo does not read its clock, which it does some 25 times a timestep to fill `MjData.timer`.
+
+    In a model of few bodies this takes half of the time. The clock is MuJoCo's global `mjcb_time`, which the last block to end
+    restores. Where a library does not export it, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self._blocks: list[None] = []  # one for each open block; a list needs no lock
+        self._before: int | None = None
+        try:
+            bindings = sys.modules[mujoco.mj_step.__module__].__file__
+            self._clock: Any = ctypes.c_void_p.in_dll(ctypes.CDLL(bindings), "mjcb_time")
+        except (OSError, ValueError):
+            self._clock = ctypes.c_void_p()  # stands for it
+
+    def __enter__(self) -> None:
+        self._blocks.append(None)
+        if (clock := self._clock.value) is not None:
+            self._before, self._clock.value = clock, None
+
+    def __exit__(self, *_: object) -> None:
+        self._blocks.pop()
+        if not self._blocks and self._clock.value is None:  # else somebody set a clock
+            self._clock.value = self._before
+
+
+UNTIMED = Untimed()
 
 
 class Choice:
@@ -107,11 +166,13 @@ class Choice:
         """Rows for `nsim` simulations. `made(nsim, threads, *options)` makes them for the first call."""
         rows = self.kept.pop(nsim, None)
         if rows is None:
-            few = 1 if nsim <= _FEW else self._num_threads
-            rows = [made(nsim, threads, *options) for threads in sorted({few, self._num_threads})]
+            most = min(nsim, self._num_threads)
+            rows = [made(nsim, threads, *options) for threads in sorted({1 if nsim <= _FEW else most, most})]
         self.kept[nsim] = rows
         if len(self.kept) > _KEPT:
             del self.kept[next(iter(self.kept))]
+        if len(rows) == 1:
+            return rows[0]
         chosen = min(rows, key=lambda each: each.seconds)
         for other in rows:
             if other is not chosen:
@@ -127,26 +188,21 @@ def residue(values: np.ndarray) -> np.ndarray:
     return parts
 
 
-def _add(exact: list[np.ndarray], residue: np.ndarray) -> None:
-    """Adds `residue` [nsim, 2 n] to the fields [nsim, n in total] whose values it belongs to."""
-    size = sum(view.shape[1] for view in exact)
-    parts = np.add(residue[:, :size], residue[:, size : 2 * size], dtype=np.float64)
-    for view in exact:
-        part, parts = parts[:, : view.shape[1]], parts[:, view.shape[1] :]
-        whole = view + part
-        np.copyto(view, whole, where=whole.astype(np.float32) == view)
+def _placed(batch: Batch, names: Sequence[str], begin: int, skipped: Container[str] = ()) -> list[tuple[np.ndarray, _Place]]:
+    """Views [nsim, n] of fields of the state, and their places in a row that has `names` from `begin` on.
 
-
-def _joined(batch: Batch, names: Sequence[str]) -> list[np.ndarray]:
-    """Views [nsim, n] of fields of the state. Those that are neighbours in memory are one."""
-    spans: list[list[int]] = []
+    Fields that are neighbours in memory are one.
+    """
+    spans: list[list[int]] = []  # begin and end in memory, and end in the row
     for name in names:
         view = batch.bind(name)
-        begin = (view.ctypes.data - batch.state.ctypes.data) // batch.state.itemsize
-        if not spans or spans[-1][1] != begin:
-            spans.append([begin, begin])
-        spans[-1][1] += view.size // batch.nsim
-    return [batch.state[:, begin:end] for begin, end in spans if begin < end]
+        column, size = (view.ctypes.data - batch.state.ctypes.data) // batch.state.itemsize, _size(view)
+        if size and name not in skipped:
+            if not spans or spans[-1][1:] != [column, begin]:
+                spans.append([column, column, begin])
+            spans[-1] = [spans[-1][0], column + size, begin + size]
+        begin += size
+    return [(batch.state[:, first:last], np.s_[:, end - (last - first) : end]) for first, last, end in spans]
 
 
 def _size(view: np.ndarray) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import copy
 import dataclasses
 import hashlib
@@ -20,7 +21,7 @@ from mujoco.batch import Batch
 
 from mjx_dher.envs.engines import host_call
 from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes, variation_of
-from mjx_dher.envs.engines.batches import EXACT, FULL, Choice, Rows, residue
+from mjx_dher.envs.engines.batches import EXACT, FULL, UNTIMED, Choice, Rows, residue
 from mjx_dher.envs.engines.fields import LATE, derived_fields
 from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
@@ -114,13 +115,17 @@ class Simulator:
         # `advance` has separate batches, because its other fields must stay at defaults.
         self._batches = {whole: Choice(self._num_threads) for whole in (True, False)}
         self._lock = threading.Lock()  # a Batch is not thread-safe
+        self._quiet = contextvars.copy_context()  # without warnings about the numbers of diverged simulations
+        self._quiet.run(np.seterr, over="ignore", invalid="ignore")
         self._lost, self._warned = 0, False  # timesteps that left out contacts since the last `check`
         for function, method in (("step", self._on_step), ("forward", self._on_forward), ("advance", self._on_advance)):
             host_call.register(f"{self._name}_{function}", method)
 
     def __getstate__(self) -> dict[str, Any]:
         """State of a copy or pickle, without locks and batches, which cannot be copied."""
-        return {name: value for name, value in vars(self).items() if name not in ("_batches", "_lock", "_lost", "_warned")}
+        return {
+            name: value for name, value in vars(self).items() if name not in ("_batches", "_lock", "_quiet", "_lost", "_warned")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -205,7 +210,7 @@ class Simulator:
         """Names of the fields that a function takes and returns, in the order of a packed row."""
         if function == "advance":
             return (*_PHYSICS, *_CONTROLS, "factors"), tuple(_PHYSICS)
-        return (*_STATE, "residue", "factors"), (*_STATE, *self._derived, "residue")
+        return ("residue", *_STATE, "factors"), ("residue", *_STATE, *self._derived)
 
     def _call(self, function: str, values: dict[str, Array]) -> dict[str, Array]:
         """Calls a function of the host, with one array in and one out, because each costs some microseconds."""
@@ -226,30 +231,35 @@ class Simulator:
 
     def _on_host(self, function: str, rows: np.ndarray, results: np.ndarray) -> None:
         """Computes a function for `rows` [..., n] into `results` [..., m]."""
-        rows, results = rows.reshape(-1, rows.shape[-1]), results.reshape(-1, results.shape[-1])
-        with self._lock, np.errstate(over="ignore", invalid="ignore"):  # from diverged simulations
-            begun = time.perf_counter()
-            whole = function != "advance"
-            chosen = self._batches[whole].choose(len(rows), self._made, whole)
-            chosen.write(rows)
+        if rows.ndim != 2:
+            rows, results = rows.reshape(-1, rows.shape[-1]), results.reshape(-1, results.shape[-1])
+        with self._lock:
+            self._quiet.run(self._compute, function, rows, results)
+
+    def _compute(self, function: str, rows: np.ndarray, results: np.ndarray) -> None:
+        begun = time.perf_counter()
+        whole = function != "advance"
+        chosen = self._batches[whole].choose(len(rows), self._made, whole)
+        chosen.write(rows)
+        with UNTIMED:
             if function == "forward":
                 chosen.batch.forward()
             else:
                 chosen.batch.step(nstep=self._substeps)
-            if lost := chosen.lost():
-                self._note_lost(lost)
-            chosen.read(results)
-            seconds = time.perf_counter() - begun
-            chosen.seconds = min(
-                seconds, 1.1 * chosen.seconds or seconds
-            )  # a call that waited for other processes does not count
+        if lost := chosen.lost():
+            self._note_lost(lost)
+        chosen.read(results)
+        seconds = time.perf_counter() - begun
+        if chosen.seconds:  # a call that waited for other processes does not count
+            seconds = min(seconds, 1.1 * chosen.seconds)
+        chosen.seconds = seconds
 
     def _made(self, nsim: int, num_threads: int, whole: bool) -> Rows:
         """Makes a batch for `advance`, or for functions of the whole state."""
-        derived = self._derived if whole else ()
+        derived, digits = (self._derived, math.prod(self._shapes["residue"])) if whole else ((), 0)
         batch = Batch(self._model, nsim, num_threads, persistent=any(name in LATE for name in derived))
         inputs = _STATE if whole else (*_PHYSICS, *_CONTROLS)
-        return Rows(batch, inputs, _STATE if whole else tuple(_PHYSICS), derived, whole, self._variation)
+        return Rows(batch, inputs, _STATE if whole else tuple(_PHYSICS), derived, digits, self._variation)
 
     def _note_lost(self, lost: int) -> None:
         """Counts timesteps that left out contacts, and warns the first time."""
