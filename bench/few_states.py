@@ -4,8 +4,8 @@
 
 The loop has an MjData for each state. Before each step it writes `ctrl`, then it calls `mj_step(model, data, timesteps)`, and
 then it copies `qpos` and `qvel`. `step` and `advance` run in a compiled `scan` of equal length, from the same states and with
-the same `ctrl`. Each figure is the median time of many short trials, which take turns in one process, in µs of one core's time
-for each state and step.
+the same `ctrl`. A cell has the loop's µs of one core's time for each state and step, and how many times as fast `step` and
+`advance` are: medians of many short trials, which take turns in one process.
 """
 
 from __future__ import annotations
@@ -79,18 +79,18 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, nargs="+", default=[1, 10])
     args = parser.parse_args()
     models = {"guide's arm": mujoco.MjModel.from_xml_path(str(ARM))}
-    models |= {name: envs.make(name, engine="native").model for name in ("push", "block_rotate_z")}
+    models |= {f"`{name}`": envs.make(name, engine="native").model for name in ("push", "block_rotate_z")}
     rows = []
     for name, model in models.items():
         for timesteps in args.timesteps:
+            row = [name, timesteps]
             for states in args.states:
                 (alone,) = medians(runs(model, states, timesteps, 5)[:1])
                 length = int(np.clip(5 * SECONDS / max(alone, 1e-6), 5, 1000))
-                taken = [1e6 * each / states / length for each in medians(runs(model, states, timesteps, length))]
-                rows.append((name, timesteps, states, *(f"{each:,.1f}" for each in taken), f"{taken[0] / taken[1]:.2f}"))
-                rows[-1] += (f"{taken[0] / taken[2]:.2f}",)
-    head = ("model", "timesteps a step", "states", "loop, µs", "step, µs", "advance, µs", "loop / step", "loop / advance")
-    print_table(head, rows)
+                loop, *ours = (1e6 * each / states / length for each in medians(runs(model, states, timesteps, length)))
+                row.append(f"{loop:.0f}: {loop / ours[0]:.2f}, {loop / ours[1]:.2f}")
+            rows.append(row)
+    print_table(("model", "timesteps", *(f"states: {states}" for states in args.states)), rows)
 
 
 if __name__ == "__main__":

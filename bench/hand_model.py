@@ -11,9 +11,9 @@ Differences: meshes that nothing touches, the drawn target's body, and two boxes
 actions never touch, are left out. The forearm's convex mesh is a capsule. The hand does not touch the floor: random actions
 never made it do so in 480,000 timesteps.
 
-Two things are written otherwise, because MuJoCo computes the same from them in less time. Contacts with the object are listed as pairs, so that
-MuJoCo does not search for geoms that are near. And 38 of 44 tendons are left out, which have only a limit: their joints'
-limits keep them 0.4 rad away from it. Random extremes of the controls exceed a joint's limit by 0.04 rad at most.
+Two things are written otherwise, because MuJoCo computes the same from them in less time. Contacts with the object are listed
+as pairs, so that MuJoCo does not search for geoms that are near. And 38 of 44 tendons are left out, which have only a limit:
+their joints' limits keep them 0.4 rad away from it. Random extremes of the controls exceed a joint's limit by 0.04 rad at most.
 """
 
 from __future__ import annotations
@@ -107,8 +107,9 @@ def geom(model, i):
     size = it.size if kind == "box" else it.size[:2]
     turned = f' quat="{numbers(it.quat)}"' if abs(it.quat[0] - 1) > 1e-9 else ""
     color = SKIN if condim else SHELL
+    name = shown(model, i)
     return [
-        f'  <geom name="{shown(model, i)}" type="{kind}" size="{numbers(size)}" pos="{numbers(it.pos)}"{turned}{condim} rgba="{color}"/>'
+        f'  <geom name="{name}" type="{kind}" size="{numbers(size)}" pos="{numbers(it.pos)}"{turned}{condim} rgba="{color}"/>'
     ]
 
 
