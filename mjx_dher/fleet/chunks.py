@@ -18,6 +18,7 @@ from mjx_dher.lookup import require_extra
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, custom_components
+from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.validation import check_count, host_and_port
 
@@ -105,10 +106,7 @@ def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, s
     """
     chunks: list[tuple[RunSpec, ...]] = []
     most = (lanes or MOST_RUNS["gpu"]) if task.gpus else MOST_RUNS["cpu"] * (lanes or 1)
-    groups: dict[RunSpec, list[RunSpec]] = {}
-    for spec in specs:
-        groups.setdefault(spec.program, []).append(spec)
-    for group in groups.values():
+    for group in grid.by_program(specs):
         share = math.ceil(len(group) / max(1, slots))
         own = size or math.ceil(share / math.ceil(share / most))
         chunks += [tuple(group[start : start + own]) for start in range(0, len(group), own)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from typing import Any
 
 from mjx_dher.validation import check_number
@@ -76,11 +75,8 @@ def check(content: Any, form: Form, name: str = "content") -> None:
             check(entry, form[0], name)
     else:
         check(content, dict, name)
-        _check_entries(content, form, "" if name == "content" else f"{name}.")
-
-
-def _check_entries(content: Mapping[str, Any], forms: Mapping[str, Form], prefix: str) -> None:
-    for key, form in forms.items():
-        for field in content if key == "*" else (key.removesuffix("?"),):
-            if field in content or not key.endswith("?"):
-                check(content[field], form, f"{prefix}{field}")
+        prefix = "" if name == "content" else f"{name}."
+        for key, entry in form.items():
+            for field in content if key == "*" else (key.removesuffix("?"),):
+                if field in content or not key.endswith("?"):
+                    check(content[field], entry, f"{prefix}{field}")
