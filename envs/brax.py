@@ -46,13 +46,7 @@ class BraxEnv:
     """An environment of another library as a goal-conditioned one; see `from_brax`."""
 
     def __init__(
-        self,
-        env: Any,
-        parts: tuple[Part, Part, Part],
-        threshold: float,
-        episode_length: int,
-        distance: DistanceFn,
-        ends: bool,
+        self, env: Any, parts: tuple[Part, Part, Part], threshold: float, episode_length: int, distance: DistanceFn, ends: bool
     ):
         self.env, self.goal_distance, self._ends = env, distance, ends
         self._achieved, self._goal, self._observe = parts

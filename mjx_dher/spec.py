@@ -36,8 +36,7 @@ class RunSpec:
         Engine, Doc("Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto.")
     ] = "auto"
     env_kwargs: Annotated[
-        tuple[str, ...],
-        Doc("Arguments of the environment as NAME=VALUE, such as reward_type=dense distance_threshold=0.03."),
+        tuple[str, ...], Doc("Arguments of the environment as NAME=VALUE, such as reward_type=dense distance_threshold=0.03.")
     ] = ()
     sampler: Annotated[str, _doc("sampler", "Sampler of hindsight goals")] = "future"
     weight_kernel: Annotated[str, _doc("weight_kernel", "Kernel that maps distances to weights")] = "linear"

@@ -33,11 +33,7 @@ def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:
 
 
 def bootstrap_interval(
-    scores: ArrayLike,
-    statistic: Statistic = interquartile_mean,
-    level: float = 0.95,
-    repeats: int = 10_000,
-    seed: int = 0,
+    scores: ArrayLike, statistic: Statistic = interquartile_mean, level: float = 0.95, repeats: int = 10_000, seed: int = 0
 ) -> tuple[float, float]:
     """Stratified percentile bootstrap interval: seeds are resampled within each task.
 

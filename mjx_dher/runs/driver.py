@@ -221,13 +221,7 @@ def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
 
 
 def _open(
-    stack: contextlib.ExitStack,
-    session: _Session,
-    lanes: int,
-    ended: int,
-    spec: RunSpec,
-    folder: Path,
-    run: dict[str, Any],
+    stack: contextlib.ExitStack, session: _Session, lanes: int, ended: int, spec: RunSpec, folder: Path, run: dict[str, Any]
 ) -> list[Sink]:
     """Writes config.json of a run that starts, or resumes with other settings or options, and opens its metrics' sinks.
 

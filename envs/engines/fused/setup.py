@@ -206,9 +206,7 @@ def dofs_of(model: mujoco.MjModel) -> Any:
             [
                 np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, everything),
                 np.where(
-                    model.actuator_forcelimited[:, None],
-                    np.sort(model.actuator_forcerange * gear[:, None], axis=1),
-                    everything,
+                    model.actuator_forcelimited[:, None], np.sort(model.actuator_forcerange * gear[:, None], axis=1), everything
                 ),
             ],
             axis=1,

@@ -124,8 +124,12 @@ def compile_runs(
         chunks = math.ceil(len(specs) / (lanes * layout.lanes))
         lanes = math.ceil(len(specs) / (chunks * layout.lanes))  # chunks of equal size
         keys, hparams = stack(specs, choices, lanes * layout.lanes)
-        title = _title(env, specs, train, lanes * layout.lanes, layout)
-        compiled = _compile(env, spec, train, keys, hparams, title, report, layout)
+        report(f"{spec.env}: compiling for {_title(env, specs, train, lanes * layout.lanes, layout)} ...")
+        started = time.perf_counter()
+        compiled = loop.compile_program(train, keys, hparams, config_lib.num_updates(spec.config, env.episode_length), layout)
+        check_steps(env)
+        seconds, needed = time.perf_counter() - started, memory.format_bytes(compiled.nbytes)
+        report(f"{spec.env}: compiled in {seconds:.1f} s; {needed} of memory")
         if available is None or compiled.nbytes <= available or lanes == 1:
             loop.check_program(compiled, spec.config, layout.sharers)
             beside = available is not None and compiled.nbytes <= available / 2
@@ -145,26 +149,6 @@ def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout:
         f"{'one run' if len(specs) == 1 else together}; physics {physics}, learner on"
         f" {number}{jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
     )
-
-
-def _compile(
-    env: Env,
-    spec: RunSpec,
-    train: Train,
-    keys: PRNGKey,
-    hparams: Any,
-    title: str,
-    report: Callable[[str], None],
-    layout: Layout,
-) -> Compiled:
-    report(f"{spec.env}: compiling for {title} ...")
-    started = time.perf_counter()
-    updates = config_lib.num_updates(spec.config, env.episode_length)
-    compiled = loop.compile_program(train, keys, hparams, updates, layout)
-    check_steps(env)
-    seconds = time.perf_counter() - started
-    report(f"{spec.env}: compiled in {seconds:.1f} s; {memory.format_bytes(compiled.nbytes)} of memory")
-    return compiled
 
 
 def _compile_evaluation(
@@ -212,12 +196,7 @@ def lane_of(tree: Any, lane: int, lanes: int) -> Any:
 
 
 def evaluate(
-    env: Env,
-    program: Program,
-    state: TrainState,
-    keys: PRNGKey,
-    episodes: int,
-    fetch: Callable[[Any], Any] = jax.device_get,
+    env: Env, program: Program, state: TrainState, keys: PRNGKey, episodes: int, fetch: Callable[[Any], Any] = jax.device_get
 ) -> Outcome:
     """Outcomes [lanes, episodes] of the final evaluation of each lane, as NumPy arrays.
 
