@@ -109,9 +109,7 @@ def plan(args: argparse.Namespace, console: Console) -> None:
             console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} done; learner {runs[0].learner}")
     if not args.toy:
         minutes = args.experiment.minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
-        console.print(
-            f"about {minutes:.0f} minutes of one H200 by the experiment's estimate, which was not measured for these arms"
-        )
+        console.print(f"about {minutes:.0f} minutes by the experiment's estimate, which was not measured for these arms")
 
 
 def train(args: argparse.Namespace, console: Console) -> bool:
@@ -218,10 +216,10 @@ def report(args: argparse.Namespace, console: Console) -> int:
 def main(argv: Sequence[str] | None = None, experiment: Experiment = BAKEOFF, about: str | None = __doc__) -> int:
     """Plans, trains and reports. Returns 0 (all done), 2 (an error, which is printed) or 3 (run again for the rest)."""
     args, console = parse(argv, experiment, about), Console(highlight=False, markup=False, soft_wrap=True)
-    if args.plan:
-        plan(args, console)
-        return 0
     try:
+        if args.plan:
+            plan(args, console)
+            return 0
         done = args.report or train(args, console)
         report(args, console)
     except Exception as error:

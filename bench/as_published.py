@@ -1,0 +1,150 @@
+"""Published methods with their authors' numbers: first one claim of each, then all of them with a tuned k.
+
+    python bench/as_published.py cher --out published/cher --seeds 10     FetchReach with one worker, batches of 64
+    python bench/as_published.py next_future --out published/next_future  tolerances of 5 and 2 cm
+    python bench/as_published.py ebp --out published/ebp                  PickAndPlace with 19 workers
+    python bench/as_published.py tune --out published/tune --first-seed 900 --seeds 5
+    python bench/as_published.py test --out published/test                k of each method by the runs of `tune`
+
+Each is bench/bakeoff.py with other arms, and has its options. docs/experiments/as_published.md is the plan. `tune` writes
+tune_runs.csv; its copy docs/as_published_tune_runs.csv is what `test` reads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import sys
+from pathlib import Path
+
+import bakeoff
+import bakeoff_arms
+import numpy as np
+from bakeoff_arms import COMPILE_SECONDS, SIZES, TASKS, TOY, Arm, Experiment
+from bakeoff_runs import load
+
+from mjx_dher import presets
+from mjx_dher.spec import RunSpec
+
+TUNED = Path(__file__).resolve().parents[1] / "docs" / "as_published_tune_runs.csv"
+KS = (4, 8, 16)
+_SHARED = ("future", "next_future", "max_entropy", "dpp", "td_error", "curriculum", "not_misleading", "hgg", "archer")
+CLIPPED = Arm("energy_clipped", "plain", {"priority": "energy_clipped"})
+METHODS = (*(arm for arm in bakeoff_arms.ARMS if arm.name in _SHARED), CLIPPED)
+_BY_NAME = {arm.name: arm for arm in (*bakeoff_arms.ARMS, CLIPPED)}
+
+
+def _arms(*names: str) -> tuple[Arm, ...]:
+    return tuple(_BY_NAME[name] for name in names)
+
+
+def _workers(number: int, batch: int, cycles: int, epochs: int, task: str, arm: Arm, toy: bool) -> RunSpec:
+    """Run with openai/baselines' settings, which both authors use: two episodes for each of `number` workers."""
+    run = presets.preset("paper", task, networks="mlp", **arm.parts)
+    steps = 2 * number * 50 * cycles * epochs
+    sizes = {"num_envs": 2 * number, "batch_size": number * batch, "cycles_per_epoch": cycles}
+    numbers = {"random_noise": 0.0, "adam_eps": 1e-8 / number, "priority_fraction": float(arm.prioritized)}  # all of a batch
+    config = dataclasses.replace(run.config, **(TOY if toy else {**sizes, "total_steps": steps, "replay_size": steps}))
+    return dataclasses.replace(run, config=config, hparams=run.hparams._replace(**numbers))
+
+
+def cher(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of FetchReach as in the README of CHER's code, with one worker. Success is 1 after 4,000 steps."""
+    del learner
+    return _workers(1, 64, 2, 20, task, arm, toy)
+
+
+def ebp(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of PickAndPlace as in the README of EBP's code: 19 workers, 50 epochs of 50 cycles."""
+    del learner
+    return _workers(19, 256, 50, 50, task, arm, toy)
+
+
+def next_future(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of the bake-off's `paper` at a tolerance: `5cm` or `2cm`."""
+    run = bakeoff_arms.spec_of("paper", task, arm, toy)
+    return dataclasses.replace(run, env_kwargs=("distance_threshold=0.02",)) if learner == "2cm" else run
+
+
+def with_k(task: str, arm: Arm, k: int, toy: bool) -> RunSpec:
+    """Run of the bake-off's `paper` with another k."""
+    run = bakeoff_arms.spec_of("paper", task, arm, toy)
+    return dataclasses.replace(run, hparams=run.hparams._replace(her_k=float(k)))
+
+
+def tune(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of an arm that is named after a method and its k."""
+    del learner
+    return with_k(task, arm, int(arm.name.rpartition("_k")[2]), toy)
+
+
+@functools.cache
+def best_k(task: str, method: str) -> int:
+    """k with the largest mean success of a method's tuning runs. Raises FolderError if there are none."""
+    scores: dict[int, list[float]] = {}
+    for run in load(TUNED):
+        name, _, k = run.arm.rpartition("_k")
+        if (run.task, name) == (task, method):
+            scores.setdefault(int(k), []).append(run.mean_success)
+    if set(scores) != set(KS):
+        raise bakeoff.files.FolderError(f"{TUNED} lacks runs of {method} on {task} with some k of {KS}")
+    return max(KS, key=lambda k: float(np.mean(scores[k])))
+
+
+def tuned(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of a method with the best k of its tuning runs."""
+    del learner
+    return with_k(task, arm, KS[0] if toy else best_k(task, arm.name), toy)
+
+
+def _minutes(
+    seconds: dict[str, float], learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int
+) -> float:
+    """Minutes from the seconds of a run of `future` by task. Other groups than "plain" take half as long again."""
+    programs = len(learners) * len(tasks) * len({arm.group for arm in arms})
+    runs = sum(1.0 if arm.group == "plain" else 1.5 for arm in arms) * seeds * len(learners)
+    return (runs * sum(seconds[task] for task in tasks) + COMPILE_SECONDS * programs) / 60
+
+
+_PAPER = {task: SIZES["paper", task].seconds for task in TASKS}
+_in_paper = functools.partial(_minutes, _PAPER)
+TUNED_ARMS = tuple(
+    dataclasses.replace(arm, name=f"{arm.name}_k{k}", numbers={**arm.numbers, "her_k": float(k)}) for arm in METHODS for k in KS
+)
+EXPERIMENTS = {
+    # Seconds: of two CPU cores, measured; and of PickAndPlace with 16 workers, 33 s on an H100, scaled to 19.
+    "cher": Experiment(
+        _arms("future", "curriculum"),
+        ("one_worker",),
+        ("reach",),
+        cher,
+        functools.partial(_minutes, {"reach": 20.0}),
+        "cher.csv",
+    ),
+    "ebp": Experiment(
+        _arms("future", "energy_clipped", "energy"),
+        ("workers",),
+        ("pick_and_place",),
+        ebp,
+        functools.partial(_minutes, {"pick_and_place": 40.0}),
+        "ebp.csv",
+    ),
+    "next_future": Experiment(
+        _arms("future", "next_future"), ("5cm", "2cm"), TASKS[:2], next_future, _in_paper, "next_future.csv"
+    ),
+    "tune": Experiment(TUNED_ARMS, ("paper",), TASKS, tune, _in_paper, "tune.csv"),
+    "test": Experiment(METHODS, ("paper",), TASKS, tuned, _in_paper, "test.csv"),
+}
+
+
+def main() -> int:
+    """Runs the experiment that the first argument names, with bench/bakeoff.py's options after it."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in EXPERIMENTS:
+        print(f"{__doc__}\nthe first argument must be one of {', '.join(EXPERIMENTS)}; got {name!r}", file=sys.stderr)
+        return 2
+    return bakeoff.main(sys.argv[2:], EXPERIMENTS[name], __doc__)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

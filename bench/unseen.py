@@ -1,0 +1,53 @@
+"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609.
+
+    python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --minutes 9
+    python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --report
+
+It is bench/bakeoff.py with a preset in place of a learner and one arm, and has its options. The report's unseen_runs.csv has
+one row per seed. docs/experiments/presets.md has the order of the runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import bakeoff
+from bakeoff_arms import COMPILE_SECONDS, TOY, Arm, Experiment
+
+from mjx_dher import presets
+from mjx_dher.presets import is_hand
+from mjx_dher.spec import RunSpec
+
+TASKS = ("reach", "push", "pick_and_place", "slide", "hand_reach", "block_rotate_z", "block_rotate_xyz", "egg_rotate")
+# Seconds of one run among those that train together, from docs/experiments/presets.md and preset_hands.md.
+SECONDS = {
+    ("cpu", "reach"): 20.0,
+    ("cpu", "push"): 117.0,
+    ("cpu", "pick_and_place"): 360.0,
+    ("cpu", "slide"): 1020.0,
+    ("gpu", "push"): 4.4,
+    ("gpu", "pick_and_place"): 7.8,
+    ("gpu", "slide"): 107.0,
+    ("gpu", "block_rotate_z"): 50.0,
+}
+
+
+def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of a preset, seed 0, with README's sampler on the Fetch tasks."""
+    del arm
+    run = presets.preset(learner, task, **({} if is_hand(task) else {"sampler": "weighted"}))
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **TOY, n_step=1)) if toy else run
+
+
+def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
+    """Minutes of the runs with a known time, compilation included: `cpu` of two cores, the others of one GPU."""
+    del arms
+    each = [SECONDS.get((learner, task), 0.0) for learner in learners for task in tasks]
+    return (sum(each) * seeds + COMPILE_SECONDS * len(each)) / 60
+
+
+UNSEEN = Experiment((Arm("preset", "plain"),), ("cpu", "gpu", "frugal"), TASKS, spec_of, minutes, "unseen.csv")
+
+if __name__ == "__main__":
+    sys.exit(bakeoff.main(None, UNSEEN, __doc__))
