@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import ROOT, names, refuses
+from conftest import ROOT, names
 
 from mjx_dher.components import COMPONENTS
 from mjx_dher.runs.folder import fingerprint
@@ -118,54 +118,6 @@ def test_the_arms_of_contrastive_rl_and_her_share_all_but_what_their_names_say(m
             assert len({specs[arm.name].program for arm in crl.ARMS if arm.group == group}) == 1
         validate(crl.spec_of("equal", task, crl.ARMS[0], True))
     assert 8 < crl.minutes(("equal",), ("push", "pick_and_place", "arm_push_easy"), crl.ARMS, 10) < 14
-
-
-def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
-    """Each group is one program, arms differ, and numbers are those of the plan."""
-    monkeypatch.syspath_prepend(ROOT / "bench")
-    import as_published
-    import td_controls
-    import unseen
-
-    k_of = dict.fromkeys([arm.name for arm in as_published.METHODS], 8)
-    monkeypatch.setattr(as_published, "best_k", lambda task, method: k_of[method])
-    for experiment in (*as_published.EXPERIMENTS.values(), td_controls.CONTROLS):
-        learner = experiment.learners[0]
-        for task in experiment.tasks:
-            specs = [experiment.spec_of(learner, task, arm, False) for arm in experiment.arms]
-            assert len(set(specs)) == len(specs)
-            for arm, spec in zip(experiment.arms, specs):
-                validate(spec)
-                validate(experiment.spec_of(learner, "reach", arm, True))
-                own = {own.program for other, own in zip(experiment.arms, specs) if other.group == arm.group}
-                assert own == {spec.program}
-    controls = {arm.name: td_controls.spec_of("best", "slide", arm) for arm in td_controls.ARMS}
-    assert controls["more_updates"].config.updates_per_cycle == 1.75 * controls["future"].config.updates_per_cycle
-    strict = as_published.next_future("2cm", "push", as_published.METHODS[0])
-    assert strict.env_arguments == {"distance_threshold": 0.02}
-    cher, ebp = (as_published.EXPERIMENTS[name] for name in ("cher", "ebp"))
-    one, many = (e.spec_of("", e.tasks[0], e.arms[1], False) for e in (cher, ebp))
-    assert (one.config.num_envs, one.config.batch_size, one.hparams.priority_fraction) == (2, 64, 1.0)
-    assert (many.config.num_envs, many.config.batch_size, many.config.total_steps) == (38, 4864, 4_750_000)
-    assert unseen.spec_of("cpu", "push", unseen.UNSEEN.arms[0]).sampler == "weighted"
-
-
-def test_the_tuned_k_has_the_largest_mean_success(monkeypatch, tmp_path):
-    monkeypatch.syspath_prepend(ROOT / "bench")
-    import as_published
-    import bakeoff_runs
-
-    path = tmp_path / "runs.csv"
-    monkeypatch.setattr(as_published, "TUNED", path)
-    runs = [
-        bakeoff_runs.Run("paper", "push", f"hgg_k{k}", seed, f"{k}-{seed}", 0, success, 0.5, 1.0)
-        for k, scores in {4: (0.5, 0.5), 8: (0.1, 0.95), 16: (0.6, 0.4)}.items()
-        for seed, success in enumerate(scores)
-    ]
-    bakeoff_runs.save(path, runs)
-    assert as_published.best_k.__wrapped__("push", "hgg") == 8
-    with refuses("hgg", "slide"):
-        as_published.best_k.__wrapped__("slide", "hgg")
 
 
 def test_every_arm_of_the_ablation_is_a_toy_too(ablation):
