@@ -7,7 +7,7 @@ mu N + T <= 0, and otherwise W / 2 (N - mu T)^2 / (1 + mu^2): https://mujoco.rea
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused.constraints import asked
-from mjx_dher.envs.engines.fused.model import Contacts, Dofs, Memory
+from mjx_dher.envs.engines.fused.model import Contacts, Dofs, Floats, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
@@ -46,7 +46,7 @@ def press_cones(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, thr
 
 
 @wp.func
-def _times(memory: Memory, row: int, x: wp.array(dtype=float), nv: int) -> float:
+def _times(memory: Memory, row: int, x: Floats, nv: int) -> float:
     sum = float(0.0)
     for i in range(nv):
         sum += memory.jacobian[row * nv + i] * x[i]

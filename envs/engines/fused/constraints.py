@@ -193,13 +193,7 @@ def _past_limit(dofs: Dofs, memory: Memory, k: int) -> float:
 
 
 @wp.func
-def limit(
-    dofs: Dofs,
-    contacts: Contacts,
-    memory: Memory,
-    thread: int,
-    threads: int,
-):
+def limit(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Sets the rows of joints at their limits."""
     for k in range(thread, dofs.limits, threads):
         row = memory.limited[k]

@@ -1,14 +1,12 @@
 """Contacts of a substep: a thread for each pair of geoms."""
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
-from mjx_dher.envs.engines.fused.model import BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CAPSULE, PLANE_CYLINDER, Contacts, Memory
+from mjx_dher.envs.engines.fused.model import Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import wp
 
-_BOX_BOX, _CYLINDER_BOX, _PLANE_BOX, _PLANE_CYLINDER, _PLANE_CAPSULE = (
-    wp.constant(kind) for kind in (BOX_BOX, CYLINDER_BOX, PLANE_BOX, PLANE_CYLINDER, PLANE_CAPSULE)
-)
 _TILT = wp.constant(1e-3)  # rad
 _APART = wp.constant(1e-3)  # least distance of two contacts, relative to the smaller shape
 FAR = wp.constant(1.0e10)  # m, the distance of a slot without a contact
@@ -25,7 +23,7 @@ def collide_with_planes(contacts: Contacts, memory: Memory, thread: int, threads
         for i in range(contacts.most[p]):
             memory.distance[first + i] = FAR
         kind = contacts.kind[p]
-        if kind == _PLANE_BOX or kind == _PLANE_CYLINDER:
+        if kind == kinds.PLANE_BOX or kind == kinds.PLANE_CYLINDER:
             geom1 = contacts.geom1[p]
             geom2 = contacts.geom2[p]
             mat1 = _mat(contacts, memory, geom1)
@@ -36,7 +34,7 @@ def collide_with_planes(contacts: Contacts, memory: Memory, thread: int, threads
             if wp.dot(pos2 - pos1, normal) <= contacts.geom_reach[geom2] + margin:
                 mat2 = _mat(contacts, memory, geom2)
                 size2 = contacts.geom_size[geom2]
-                if kind == _PLANE_BOX:
+                if kind == kinds.PLANE_BOX:
                     _corners(memory, first, margin, pos1, normal, pos2, mat2, size2)
                 else:
                     _rim(memory, first, pos1, normal, pos2, mat2, size2)
@@ -47,7 +45,7 @@ def collide_with_planes(contacts: Contacts, memory: Memory, thread: int, threads
 def collide_boxes(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of two boxes."""
     for p in range(thread, contacts.pairs, threads):
-        if contacts.kind[p] == _BOX_BOX:
+        if contacts.kind[p] == kinds.BOX_BOX:
             geom1, geom2 = contacts.geom1[p], contacts.geom2[p]
             pos1, mat1, size1 = geom_of(contacts, memory, geom1)
             pos2, mat2, size2 = geom_of(contacts, memory, geom2)
@@ -73,7 +71,7 @@ def collide_cylinders(contacts: Contacts, memory: Memory, thread: int, threads: 
     for round in range(contacts.rounds):  # not twice in the code, which is long
         for at in range(thread, wp.where(round == 0, 1, 4) * contacts.pairs, threads):
             p = wp.where(round == 0, at, at // 4)
-            if contacts.kind[p] == _CYLINDER_BOX:
+            if contacts.kind[p] == kinds.CYLINDER_BOX:
                 _meet(contacts, memory, p, round, at % 4)
         sync(threads)
     _thin(contacts, memory, thread, threads)
@@ -124,7 +122,7 @@ def _thin(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Drops contacts of a cylinder and a box that are close to another one."""
     for p in range(thread, contacts.pairs, threads):
         first = contacts.first[p]
-        if contacts.kind[p] == _CYLINDER_BOX:
+        if contacts.kind[p] == kinds.CYLINDER_BOX:
             least = _APART * wp.min(contacts.geom_reach[contacts.geom1[p]], contacts.geom_reach[contacts.geom2[p]])
             for i in range(1, 5):
                 for j in range(i):
@@ -146,7 +144,7 @@ def tangent(normal: wp.vec3) -> wp.vec3:
 @wp.func
 def tangent_of(contacts: Contacts, memory: Memory, pair: int, normal: wp.vec3) -> wp.vec3:
     """First tangent of a contact: of a plane and a capsule, as in MuJoCo C, along the capsule unless it stands."""
-    if contacts.kind[pair] == _PLANE_CAPSULE:
+    if contacts.kind[pair] == kinds.PLANE_CAPSULE:
         mat = _mat(contacts, memory, contacts.geom2[pair])
         axis = wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
         along = axis - wp.dot(axis, normal) * normal

@@ -4,12 +4,11 @@ R. Featherstone, Rigid Body Dynamics Algorithms (2008): composite rigid bodies a
 the bodies of a subtree: a walk along the tree would leave all threads but one idle.
 """
 
-from mjx_dher.envs.engines.fused.model import FREE, HINGE, MOCAP, SLIDE, STILL, Bodies, Dofs, Memory, World
+from mjx_dher.envs.engines.fused import model as kinds
+from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Floats, Memory, World
 from mjx_dher.envs.engines.fused.tendons import actuation, pull
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
-
-_FREE, _HINGE, _MOCAP, _SLIDE, _STILL = (wp.constant(kind) for kind in (FREE, HINGE, MOCAP, SLIDE, STILL))
 
 
 @wp.func
@@ -46,31 +45,25 @@ def _matrix(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def kinematics(
-    bodies: Bodies,
-    memory: Memory,
-    inputs: wp.array(dtype=float),
-    thread: int,
-    threads: int,
-):
+def kinematics(bodies: Bodies, memory: Memory, inputs: Floats, thread: int, threads: int):
     """Computes the pose of every body: relative to its parent in parallel, then along the tree."""
     for b in range(thread, bodies.number, threads):
         pos = bodies.pos[b]
         quat = bodies.quat[b]
         first = bodies.qpos[b]
         kind = bodies.kind[b]
-        if kind == _HINGE:
+        if kind == kinds.HINGE:
             bent = times(quat, about(bodies.axis[b], memory.qpos[first] - bodies.rest[b]))
             pos = pos + turned(quat, bodies.anchor[b]) - turned(bent, bodies.anchor[b])
             quat = bent
-        elif kind == _SLIDE:
+        elif kind == kinds.SLIDE:
             pos = pos + turned(quat, bodies.axis[b]) * (memory.qpos[first] - bodies.rest[b])
-        elif kind == _FREE:
+        elif kind == kinds.FREE:
             pos = wp.vec3(memory.qpos[first], memory.qpos[first + 1], memory.qpos[first + 2])
             quat = wp.normalize(
                 wp.vec4(memory.qpos[first + 3], memory.qpos[first + 4], memory.qpos[first + 5], memory.qpos[first + 6])
             )
-        elif kind == _MOCAP:
+        elif kind == kinds.MOCAP:
             at = 7 * bodies.dof[b]
             pos = wp.vec3(inputs[at], inputs[at + 1], inputs[at + 2])
             quat = wp.normalize(wp.vec4(inputs[at + 3], inputs[at + 4], inputs[at + 5], inputs[at + 6]))
@@ -117,12 +110,12 @@ def com_pos(bodies: Bodies, memory: Memory, thread: int, threads: int):
         dof = bodies.dof[b]
         kind = bodies.kind[b]
         none = wp.vec3(0.0)
-        if kind == _HINGE:
+        if kind == kinds.HINGE:
             axis = mat * bodies.axis[b]
             memory.motion[dof] = wp.spatial_vector(axis, wp.cross(at + mat * bodies.anchor[b], axis))
-        elif kind == _SLIDE:
+        elif kind == kinds.SLIDE:
             memory.motion[dof] = wp.spatial_vector(none, mat * bodies.axis[b])
-        elif kind == _FREE:
+        elif kind == kinds.FREE:
             for i in range(3):
                 unit = wp.vec3(wp.where(i == 0, 1.0, 0.0), wp.where(i == 1, 1.0, 0.0), wp.where(i == 2, 1.0, 0.0))
                 memory.motion[dof + i] = wp.spatial_vector(none, unit)
@@ -143,9 +136,9 @@ def com_vel(bodies: Bodies, memory: Memory, thread: int, threads: int):
         memory.velocity[b] = velocity
         dof = bodies.dof[b]
         kind = bodies.kind[b]
-        if kind == _HINGE or kind == _SLIDE:
+        if kind == kinds.HINGE or kind == kinds.SLIDE:
             memory.turning[dof] = _crossed(velocity, memory.motion[dof])
-        elif kind == _FREE:
+        elif kind == kinds.FREE:
             for i in range(3):
                 memory.turning[dof + i] = wp.spatial_vector()
                 memory.turning[dof + 3 + i] = _crossed(velocity, memory.motion[dof + 3 + i])
@@ -193,15 +186,7 @@ def rne(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, thread: int, t
 
 
 @wp.func
-def smooth_forces(
-    bodies: Bodies,
-    dofs: Dofs,
-    memory: Memory,
-    inputs: wp.array(dtype=float),
-    has_tendons: bool,
-    thread: int,
-    threads: int,
-):
+def smooth_forces(bodies: Bodies, dofs: Dofs, memory: Memory, inputs: Floats, has_tendons: bool, thread: int, threads: int):
     """Computes `smooth`, all forces except constraint forces, and `momentum` of each degree of freedom."""
     for i in range(thread, dofs.number, threads):
         motion = memory.motion[i]
@@ -248,7 +233,7 @@ def _passive(dofs: Dofs, memory: Memory, i: int) -> float:
 
 
 @wp.func
-def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> float:
+def damping(dofs: Dofs, memory: Memory, inputs: Floats, i: int) -> float:
     """Minus the derivative of forces by the velocity of a degree of freedom, for the integrator."""
     all_of_it = dofs.implicit_damping[i]
     if dofs.implicit == 1:
@@ -263,22 +248,16 @@ def damping(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -
 
 
 @wp.func
-def integrate(
-    world: World,
-    bodies: Bodies,
-    memory: Memory,
-    thread: int,
-    threads: int,
-):
+def integrate(world: World, bodies: Bodies, memory: Memory, thread: int, threads: int):
     """Advances positions by the velocities at the substep's end."""
     h = world.timestep
     for b in range(thread, bodies.number, threads):
         first = bodies.qpos[b]
         dof = bodies.dof[b]
         kind = bodies.kind[b]
-        if kind == _HINGE or kind == _SLIDE:
+        if kind == kinds.HINGE or kind == kinds.SLIDE:
             memory.qpos[first] = memory.qpos[first] + h * memory.qvel[dof]
-        elif kind == _FREE:
+        elif kind == kinds.FREE:
             for i in range(3):
                 memory.qpos[first + i] = memory.qpos[first + i] + h * memory.qvel[dof + i]
             omega = wp.vec3(memory.qvel[dof + 3], memory.qvel[dof + 4], memory.qvel[dof + 5])

@@ -8,22 +8,13 @@ Source: D. Bertsekas, Projected Newton methods for optimization problems with si
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of, put
-from mjx_dher.envs.engines.fused.model import (
-    CAPSULE_ELLIPSOID,
-    ELLIPSOID_BOX,
-    PLANE_ELLIPSOID,
-    SPHERE_ELLIPSOID,
-    Contacts,
-    Memory,
-)
+from mjx_dher.envs.engines.fused.model import Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import wp
 
-_PLANE, _SPHERE, _CAPSULE, _BOX = (
-    wp.constant(kind) for kind in (PLANE_ELLIPSOID, SPHERE_ELLIPSOID, CAPSULE_ELLIPSOID, ELLIPSOID_BOX)
-)
 _plane_ellipsoid = private_api.mujoco_warp_shapes().plane_ellipsoid
 _STEPS, _HALVINGS = wp.constant(60), wp.constant(12)  # most steps of Newton's method, and halvings of a step
 _FLAT = wp.constant(1.0e-5)  # slope at which the search ends
@@ -36,21 +27,21 @@ def collide_ellipsoids(contacts: Contacts, memory: Memory, thread: int, threads:
     """Computes distance, place and normal of the slots of ellipsoids."""
     for i in range(thread, contacts.pairs, threads):
         kind = contacts.kind[i]
-        if kind >= _PLANE and kind <= _BOX:
+        if kind >= kinds.PLANE_ELLIPSOID and kind <= kinds.ELLIPSOID_BOX:
             geom1, geom2 = contacts.geom1[i], contacts.geom2[i]
             pos1, mat1, size1 = geom_of(contacts, memory, geom1)
             pos2, mat2, size2 = geom_of(contacts, memory, geom2)
             margin = contacts.margin[i]
             slot = contacts.first[i]
-            if kind == _PLANE:
+            if kind == kinds.PLANE_ELLIPSOID:
                 plane = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
                 distance, place, normal = _plane_ellipsoid(plane, pos1, pos2, mat2, size2)
                 put(memory, slot, distance, place, normal)
             elif wp.length(pos2 - pos1) <= contacts.geom_reach[geom1] + contacts.geom_reach[geom2] + margin:
-                if kind == _BOX:
+                if kind == kinds.ELLIPSOID_BOX:
                     distance, place, normal = _shape(pos1, mat1, size1, pos2, mat2, size2, 0.0)
                 else:
-                    half = wp.vec3(0.0, 0.0, wp.where(kind == _CAPSULE, size1[1], 0.0))
+                    half = wp.vec3(0.0, 0.0, wp.where(kind == kinds.CAPSULE_ELLIPSOID, size1[1], 0.0))
                     distance, place, normal = _shape(pos2, mat2, size2, pos1, mat1, half, size1[0])
                     normal = -normal
                 put(memory, slot, distance, place, normal)

@@ -3,29 +3,14 @@
 import functools
 from typing import Any, NamedTuple
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.cone import press_cones
 from mjx_dher.envs.engines.fused.constraints import connect, limit, number, press, touch, weld
 from mjx_dher.envs.engines.fused.contacts import collide_boxes, collide_cylinders, collide_with_planes
 from mjx_dher.envs.engines.fused.dynamics import com_pos, com_vel, crb, integrate, kinematics, rne, smooth_forces
 from mjx_dher.envs.engines.fused.ellipsoid import collide_ellipsoids
 from mjx_dher.envs.engines.fused.memory import carve, copy
-from mjx_dher.envs.engines.fused.model import (
-    BOX_BOX,
-    CAPSULE_CYLINDER,
-    CYLINDER_BOX,
-    ELLIPSOID_BOX,
-    PLANE_CAPSULE,
-    PLANE_ELLIPSOID,
-    PLANE_SPHERE,
-    SPHERE_CYLINDER,
-    Bodies,
-    Contacts,
-    Dofs,
-    Layout,
-    Memory,
-    Sparse,
-    World,
-)
+from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Floats, Floats2d, Ints, Layout, Memory, Sparse, World
 from mjx_dher.envs.engines.fused.near import keep, memory_of, near_pairs
 from mjx_dher.envs.engines.fused.round import collide_round
 from mjx_dher.envs.engines.fused.round_cylinder import collide_cylinders_with_round
@@ -37,14 +22,7 @@ from mjx_dher.system.warp_setup import wp
 
 
 @wp.func
-def _begin(
-    memory: Memory,
-    qpos: wp.array(dtype=float),  # type: ignore[valid-type]
-    qvel: wp.array(dtype=float),  # type: ignore[valid-type]
-    guess: wp.array(dtype=float),  # type: ignore[valid-type]
-    thread: int,
-    threads: int,
-):
+def _begin(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: int, threads: int):
     """Copies an environment's state into its memory."""
     copy(qpos, memory.qpos, thread, threads)
     copy(qvel, memory.qvel, thread, threads)
@@ -53,14 +31,7 @@ def _begin(
 
 
 @wp.func
-def _end(
-    memory: Memory,
-    qpos: wp.array(dtype=float),  # type: ignore[valid-type]
-    qvel: wp.array(dtype=float),  # type: ignore[valid-type]
-    guess: wp.array(dtype=float),  # type: ignore[valid-type]
-    thread: int,
-    threads: int,
-):
+def _end(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: int, threads: int):
     """Copies an environment's state out of its memory."""
     copy(memory.qpos, qpos, thread, threads)
     copy(memory.qvel, qvel, thread, threads)
@@ -73,7 +44,7 @@ def _forces(
     bodies: Bodies,
     dofs: Dofs,
     memory: Memory,
-    given: wp.array(dtype=float),  # type: ignore[valid-type]
+    given: Floats,
     has_tendons: bool,
     warps: int,
     thread: int,
@@ -110,16 +81,7 @@ def _ending(traits: Traits, nv: int, warps: int) -> Any:
     has_sparse, has_tendons, elliptic = traits.has_sparse, traits.has_tendons, traits.elliptic
 
     @wp.func
-    def end(
-        world: World,
-        bodies: Bodies,
-        dofs: Dofs,
-        sparse: Sparse,
-        memory: Memory,
-        given: wp.array(dtype=float),  # type: ignore[valid-type]
-        thread: int,
-        threads: int,
-    ):
+    def end(world: World, bodies: Bodies, dofs: Dofs, sparse: Sparse, memory: Memory, given: Floats, thread: int, threads: int):
         if wp.static(has_sparse):
             gather(wp.static(warps))
             ask_sparse(sparse, memory, thread, threads)
@@ -147,22 +109,16 @@ def _ending(traits: Traits, nv: int, warps: int) -> Any:
     return end
 
 
-def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
+def _collision(present: tuple[int, ...], few: bool, warps: int) -> Any:
     """Returns the function that finds contacts, for kinds of geom pairs. See `make`."""
-    boxes, cylinders = BOX_BOX in kinds, CYLINDER_BOX in kinds
-    round_ones = any(PLANE_SPHERE <= kind < PLANE_ELLIPSOID for kind in kinds)
-    ellipsoids = any(PLANE_ELLIPSOID <= kind <= ELLIPSOID_BOX for kind in kinds)
-    round_cylinders = SPHERE_CYLINDER in kinds or CAPSULE_CYLINDER in kinds
+    boxes, cylinders = kinds.BOX_BOX in present, kinds.CYLINDER_BOX in present
+    round_ones = any(kinds.PLANE_SPHERE <= kind < kinds.PLANE_ELLIPSOID for kind in present)
+    ellipsoids = any(kinds.PLANE_ELLIPSOID <= kind <= kinds.ELLIPSOID_BOX for kind in present)
+    round_cylinders = kinds.SPHERE_CYLINDER in present or kinds.CAPSULE_CYLINDER in present
 
     @wp.func
     def collide(
-        contacts: Contacts,
-        memory: Memory,
-        layout: Layout,
-        spare: wp.array(dtype=float),  # type: ignore[valid-type]
-        lost: wp.array(dtype=int),  # type: ignore[valid-type]
-        thread: int,
-        threads: int,
+        contacts: Contacts, memory: Memory, layout: Layout, spare: Floats, lost: Ints, thread: int, threads: int
     ) -> Contacts:
         """Finds contacts, and returns `contacts` with their pairs."""
         near, scratch = contacts, memory
@@ -198,7 +154,7 @@ def _collision(kinds: tuple[int, ...], few: bool, warps: int) -> Any:
 
 def _constraining(traits: Traits, warps: int) -> Any:
     """Returns the function that finds contacts and computes the rows of constraints. See `make`."""
-    capsules, collide = PLANE_CAPSULE in traits.kinds, _collision(traits.kinds, traits.few, warps)
+    capsules, collide = kinds.PLANE_CAPSULE in traits.kinds, _collision(traits.kinds, traits.few, warps)
     elliptic, edges, rolling = traits.elliptic, traits.edges, traits.elliptic or traits.edges > 6
 
     @wp.func
@@ -209,8 +165,8 @@ def _constraining(traits: Traits, warps: int) -> Any:
         contacts: Contacts,
         memory: Memory,
         layout: Layout,
-        spare: wp.array(dtype=float),  # type: ignore[valid-type]
-        lost: wp.array(dtype=int),  # type: ignore[valid-type]
+        spare: Floats,
+        lost: Ints,
         thread: int,
         threads: int,
     ):
@@ -252,16 +208,16 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits)
         contacts: Contacts,
         sparse: Sparse,
         layout: Layout,
-        spare: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        spare: Floats2d,
         substeps: int,
-        lost: wp.array(dtype=int),  # type: ignore[valid-type]
-        inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        old_qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        old_qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        old_guess: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        guess: wp.array2d(dtype=float),  # type: ignore[valid-type]
+        lost: Ints,
+        inputs: Floats2d,
+        old_qpos: Floats2d,
+        old_qvel: Floats2d,
+        old_guess: Floats2d,
+        qpos: Floats2d,
+        qvel: Floats2d,
+        guess: Floats2d,
     ):
         """Advances coordinates, velocities and the solver's first guess by `substeps` timesteps.
 

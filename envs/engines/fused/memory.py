@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.fused.model import Layout, Memory
+from mjx_dher.envs.engines.fused.model import Floats, Layout, Memory
 from mjx_dher.envs.engines.fused.near import PAIR_WORDS, SLOT_WORDS
 from mjx_dher.envs.engines.fused.setup import fill, links_of
 from mjx_dher.envs.engines.fused.threads import floats, ints, matrices, quats, spatials, vec3s
@@ -55,7 +55,7 @@ def layout_of(model: mujoco.MjModel, world: Any, contacts: Any, dofs: Any, spars
 
 
 @wp.func
-def carve(layout: Layout, spare: wp.array(dtype=float), threads: int) -> Memory:
+def carve(layout: Layout, spare: Floats, threads: int) -> Memory:
     """Returns the fields of an environment's memory, in the places that `layout` gives them.
 
     Args:
@@ -105,7 +105,7 @@ def carve(layout: Layout, spare: wp.array(dtype=float), threads: int) -> Memory:
 
 
 @wp.func
-def copy(source: wp.array(dtype=float), target: wp.array(dtype=float), thread: int, threads: int):
+def copy(source: Floats, target: Floats, thread: int, threads: int):
     """Copies one array into another of the same length."""
     for i in range(thread, target.shape[0], threads):
         target[i] = source[i]

@@ -14,6 +14,8 @@ Polynomial = wp.types.vector(length=5, dtype=float)
 Softness = wp.types.vector(length=7, dtype=float)  # stiffness k, damping b; impedance: at 0, at the end, width, middle, power
 
 _ints, _floats, _vec3s, _quats = wp.array(dtype=int), wp.array(dtype=float), wp.array(dtype=wp.vec3), wp.array(dtype=wp.vec4)
+# Arguments of functions that Warp compiles.
+Ints, Floats, Floats2d = _ints, _floats, wp.array2d(dtype=float)
 _mat33s, _soft = wp.array(dtype=wp.mat33), wp.array(dtype=Softness)
 
 

@@ -6,35 +6,21 @@ the rows of constraints, and keeps those that touch. All lists are in the order 
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of
-from mjx_dher.envs.engines.fused.model import (
-    PLANE_BOX,
-    PLANE_CAPSULE,
-    PLANE_CYLINDER,
-    PLANE_ELLIPSOID,
-    PLANE_SPHERE,
-    Contacts,
-    Layout,
-    Memory,
-)
+from mjx_dher.envs.engines.fused.model import Contacts, Floats, Ints, Layout, Memory
 from mjx_dher.envs.engines.fused.threads import all_of, earlier, floats, ints, sync, vec3s
 from mjx_dher.system.warp_setup import wp
 
 PAIR_WORDS, SLOT_WORDS = 7, 7  # memory of a pair, and of a slot, in floats
-_PLANES = (PLANE_BOX, PLANE_CYLINDER, PLANE_SPHERE, PLANE_CAPSULE, PLANE_ELLIPSOID)
+_PLANES = (kinds.PLANE_BOX, kinds.PLANE_CYLINDER, kinds.PLANE_SPHERE, kinds.PLANE_CAPSULE, kinds.PLANE_ELLIPSOID)
 _OF_PLANES = wp.constant(sum(1 << kind for kind in _PLANES))  # mask of kinds
 _SLOTS = wp.constant(1 << 16)  # one pair, in a number that also counts its slots
 
 
 @wp.func
 def near_pairs(
-    contacts: Contacts,
-    memory: Memory,
-    layout: Layout,
-    spare: wp.array(dtype=float),
-    lost: wp.array(dtype=int),
-    thread: int,
-    threads: int,
+    contacts: Contacts, memory: Memory, layout: Layout, spare: Floats, lost: Ints, thread: int, threads: int
 ) -> Contacts:
     """Returns the pairs whose bounding boxes meet, with slots for their contacts.
 
@@ -90,7 +76,7 @@ def near_pairs(
 
 
 @wp.func
-def memory_of(contacts: Contacts, memory: Memory, layout: Layout, spare: wp.array(dtype=float), threads: int) -> Memory:
+def memory_of(contacts: Contacts, memory: Memory, layout: Layout, spare: Floats, threads: int) -> Memory:
     """Returns the memory in which contacts of the pairs that are near are found."""
     scratch = Memory()
     scratch.pos = memory.pos
@@ -109,8 +95,8 @@ def keep(
     scratch: Memory,
     memory: Memory,
     layout: Layout,
-    spare: wp.array(dtype=float),
-    lost: wp.array(dtype=int),
+    spare: Floats,
+    lost: Ints,
     thread: int,
     threads: int,
 ) -> Contacts:

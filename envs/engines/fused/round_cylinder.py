@@ -7,12 +7,12 @@ for the circle, so its two contacts are up to a twentieth of the radius further 
 """
 # Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of, put
-from mjx_dher.envs.engines.fused.model import CAPSULE_CYLINDER, SPHERE_CYLINDER, Contacts, Memory
+from mjx_dher.envs.engines.fused.model import Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
-_SPHERE, _CAPSULE = wp.constant(SPHERE_CYLINDER), wp.constant(CAPSULE_CYLINDER)
 _HALVINGS = wp.constant(22)
 _FLAT = wp.constant(1.0e-6)  # slope that counts as none
 _LYING = wp.constant(0.0887)  # sine of the angle up to which a capsule lies on an end, measured in MuJoCo C
@@ -23,7 +23,7 @@ def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int
     """Computes distance, place and normal of the slots of spheres and capsules with cylinders."""
     for i in range(thread, contacts.pairs, threads):
         kind = contacts.kind[i]
-        if kind == _SPHERE or kind == _CAPSULE:
+        if kind == kinds.SPHERE_CYLINDER or kind == kinds.CAPSULE_CYLINDER:
             geom1, geom2 = contacts.geom1[i], contacts.geom2[i]
             pos1, mat1, size1 = geom_of(contacts, memory, geom1)
             pos2, mat2, size2 = geom_of(contacts, memory, geom2)
@@ -33,7 +33,7 @@ def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int
                 middle = back * (pos1 - pos2)
                 axis = back * wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
                 at = float(0.0)
-                if kind == _CAPSULE:
+                if kind == kinds.CAPSULE_CYLINDER:
                     low = _end(middle, axis, -size1[1], size1[1], -_FLAT, size2)
                     at = 0.5 * (low + _end(middle, axis, -size1[1], size1[1], _FLAT, size2))
                 point = middle + at * axis
@@ -44,7 +44,7 @@ def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int
                 along = axis[0] * axis[0] + axis[1] * axis[1]
                 middling = axis[0] * middle[0] + axis[1] * middle[1]
                 inside = middling * middling - along * (middle[0] * middle[0] + middle[1] * middle[1] - size2[0] * size2[0])
-                if kind == _CAPSULE and wp.abs(axis[2]) < _LYING and wp.abs(normal[2]) == 1.0 and inside > 0.0:
+                if kind == kinds.CAPSULE_CYLINDER and wp.abs(axis[2]) < _LYING and wp.abs(normal[2]) == 1.0 and inside > 0.0:
                     for end in range(2):
                         at = (wp.where(end == 0, -1.0, 1.0) * wp.sqrt(inside) - middling) / along
                         point = middle + wp.clamp(at, -size1[1], size1[1]) * axis

@@ -5,16 +5,16 @@ other forces. This is convex and piecewise quadratic, so Newton's step from a po
 Todorov, Convex and analytically-invertible dynamics with contacts and constraints (2014). Each environment stops individually.
 """
 
+from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.cone import add_cones, begin_cones, change_cones, slopes_cones, take_cones
 from mjx_dher.envs.engines.fused.dynamics import damping
 from mjx_dher.envs.engines.fused.linear import direction
 from mjx_dher.envs.engines.fused.memory import copy
-from mjx_dher.envs.engines.fused.model import FREE, Bodies, Dofs, Memory, Sparse, World
+from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Floats, Memory, Sparse, World
 from mjx_dher.envs.engines.fused.sparse import add_sparse, begin_sparse, change_sparse, slopes_sparse, take_sparse
 from mjx_dher.envs.engines.fused.threads import sync, total
 from mjx_dher.system.warp_setup import wp
 
-_FREE = wp.constant(FREE)
 _SLOPE = wp.constant(1e-4)  # of the cost along the search direction, relative to that at its start, at which a search ends
 _ROUNDING = wp.constant(1e-10)  # a step's energy relative to that of the accelerations: what single precision leaves unsure
 _UNSURE = wp.constant(6e-14)  # the square of four roundings of single precision
@@ -28,7 +28,7 @@ def _pull(world: World, row: int, residual: float, weight: float) -> float:
 
 
 @wp.func
-def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size: int) -> float:
+def _dot(matrix: Floats, row: int, x: Floats, size: int) -> float:
     """Row of a matrix [.., size] times a vector [size]."""
     sum = float(0.0)
     for i in range(size):
@@ -37,7 +37,7 @@ def _dot(matrix: wp.array(dtype=float), row: int, x: wp.array(dtype=float), size
 
 
 @wp.func
-def _times_mass(memory: Memory, row: int, x: wp.array(dtype=float), size: int) -> float:
+def _times_mass(memory: Memory, row: int, x: Floats, size: int) -> float:
     """Row of the mass matrix, of which memory holds the lower half, times a vector [size]."""
     sum = float(0.0)
     at = row * (row + 1) // 2
@@ -255,7 +255,7 @@ def accelerate(
     dofs: Dofs,
     sparse: Sparse,
     memory: Memory,
-    inputs: wp.array(dtype=float),
+    inputs: Floats,
     has_sparse: bool,
     elliptic: bool,
     nv: int,
@@ -301,7 +301,7 @@ def accelerate(
 def _gyrate(world: World, bodies: Bodies, memory: Memory, nv: int, thread: int, threads: int):
     """Makes accelerations of free bodies that stand alone implicit in gyroscopic forces, as MuJoCo's implicitfast does."""
     for b in range(thread, bodies.number, threads):
-        if bodies.kind[b] == _FREE and bodies.last[b] == b:
+        if bodies.kind[b] == kinds.FREE and bodies.last[b] == b:
             dof = bodies.dof[b] + 3
             omega, alpha, mass = wp.vec3(), wp.vec3(), wp.mat33()
             for i in range(3):

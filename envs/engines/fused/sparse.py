@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines.fused.constraints import asked
-from mjx_dher.envs.engines.fused.model import Memory, Sparse
+from mjx_dher.envs.engines.fused.model import Floats, Memory, Sparse
 from mjx_dher.envs.engines.fused.setup import JOINT, TENDON, fill, is_sparse, softness
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
@@ -148,7 +148,7 @@ def _pull(sparse: Sparse, memory: Memory, row: int, residual: float) -> wp.vec2:
 
 
 @wp.func
-def _times(sparse: Sparse, memory: Memory, row: int, x: wp.array(dtype=float)) -> float:
+def _times(sparse: Sparse, memory: Memory, row: int, x: Floats) -> float:
     """A row's coefficients times a vector [nv]."""
     sum = float(0.0)
     for term in range(sparse.begin[row], sparse.begin[row + 1]):

@@ -1,6 +1,6 @@
 """Springs and dampers of fixed tendons, and actuators on them."""
 
-from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Memory, World
+from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Floats, Memory, World
 from mjx_dher.system.warp_setup import wp
 
 
@@ -14,7 +14,7 @@ def actuation(dofs: Dofs, a: int, control: float, length: float, velocity: float
 
 
 @wp.func
-def tension(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), t: int) -> wp.vec3:
+def tension(dofs: Dofs, memory: Memory, inputs: Floats, t: int) -> wp.vec3:
     """Force of a tendon's spring and damper, force of its actuators, and minus their derivative by the tendon's velocity."""
     tendons = dofs.tendons
     length, velocity = float(0.0), float(0.0)
@@ -34,7 +34,7 @@ def tension(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), t: int) -
 
 
 @wp.func
-def pull(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> wp.vec2:
+def pull(dofs: Dofs, memory: Memory, inputs: Floats, i: int) -> wp.vec2:
     """Forces of tendons on a degree of freedom: of springs and dampers, and of actuators."""
     tendons = dofs.tendons
     forces = wp.vec2()
@@ -46,7 +46,7 @@ def pull(dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), i: int) -> w
 
 
 @wp.func
-def soften(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, inputs: wp.array(dtype=float), thread: int, threads: int):
+def soften(world: World, bodies: Bodies, dofs: Dofs, memory: Memory, inputs: Floats, thread: int, threads: int):
     """Makes velocities implicit in the forces of tendons, as implicitfast does: adds to the mass matrix.
 
     As in MuJoCo C, one joint of a tendon is implicit in another's velocity only if one of them moves the other.
