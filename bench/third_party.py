@@ -1,9 +1,10 @@
 """Third-party models on each engine, compared with a loop over `mj_step`.
 
-    python bench/third_party.py ant=ant.xml ur5e=ur5e.xml [--engines native warp jax] [--allow-cpu]
+    python bench/third_party.py ant=ant.xml ur5e=ur5e.xml [--engines native warp jax] [--actions 2 50] [--allow-cpu]
 
-Prints the largest distance of any coordinate after 20 timesteps from `mj_step`, of 4 environments under random controls. A
-model that an engine does not support has the reason instead. --allow-cpu runs warp without a GPU.
+Prints the largest distance of any coordinate from `mj_step` after each of these numbers of random controls, which are held for
+10 timesteps each, of 4 environments. A model that an engine does not support has the reason instead. --allow-cpu runs warp
+without a GPU.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from timing import machine
 
 from mjx_dher.envs.engines import Controls, Physics, make_engine
 
-ENVS, STEPS, SUBSTEPS = 4, 2, 10
+ENVS, SUBSTEPS = 4, 10
 
 
-def inputs(model: mujoco.MjModel) -> tuple[mujoco.MjData, np.ndarray]:
-    """The start, and controls [ENVS, STEPS, nu] within their ranges.
+def inputs(model: mujoco.MjModel, actions: int) -> tuple[mujoco.MjData, np.ndarray]:
+    """The start, and controls [ENVS, actions, nu] within their ranges.
 
     The start is the first keyframe, or else the default, with joints that are out of range in the middle of their range.
     """
@@ -35,40 +36,42 @@ def inputs(model: mujoco.MjModel) -> tuple[mujoco.MjData, np.ndarray]:
         if not lowest <= data.qpos[at] <= highest:
             data.qpos[at] = 0.5 * (lowest + highest)
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
-    return data, np.random.default_rng(0).uniform(low, high, (ENVS, STEPS, model.nu)).astype(np.float32)
+    return data, np.random.default_rng(0).uniform(low, high, (ENVS, actions, model.nu)).astype(np.float32)
 
 
-def looped(model: mujoco.MjModel) -> np.ndarray:
-    """Coordinates [ENVS, nq] of a loop over `mj_step`."""
-    ends = []
+def looped(model: mujoco.MjModel, actions: int) -> np.ndarray:
+    """Coordinates [actions, ENVS, nq] of a loop over `mj_step`."""
+    qpos = np.zeros((actions, ENVS, model.nq))
     for env in range(ENVS):
-        data, ctrl = inputs(model)
-        for row in ctrl[env]:
-            data.ctrl[:] = row
+        data, ctrl = inputs(model, actions)
+        for action in range(actions):
+            data.ctrl[:] = ctrl[env, action]
             mujoco.mj_step(model, data, SUBSTEPS)
-        ends.append(data.qpos.copy())
-    return np.stack(ends)
+            qpos[action, env] = data.qpos
+    return qpos
 
 
-def played(model: mujoco.MjModel, engine: str, **options: bool) -> tuple[str, np.ndarray]:
-    """The engine, or the path of warp, and its coordinates [ENVS, nq]."""
+def played(model: mujoco.MjModel, engine: str, actions: int, **options: bool) -> tuple[str, np.ndarray]:
+    """The engine, or the path of warp, and its coordinates [actions, ENVS, nq]."""
     made = make_engine(engine, model, SUBSTEPS, **options)
-    data, ctrl = inputs(model)
+    data, ctrl = inputs(model, actions)
     arrays = (jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act))
     mocap = jnp.asarray(np.concatenate([data.mocap_pos, data.mocap_quat], axis=1), jnp.float32)
     physics = jax.tree.map(lambda x: jnp.broadcast_to(x, (ENVS, *x.shape)), Physics(*arrays))
     advance = jax.jit(jax.vmap(lambda state, u: made.advance(state, Controls(u, mocap))))
-    for step in range(STEPS):
-        physics = advance(physics, jnp.asarray(ctrl[:, step]))
-    qpos = np.asarray(physics.qpos)
+    qpos = []
+    for action in range(actions):
+        physics = advance(physics, jnp.asarray(ctrl[:, action]))
+        qpos.append(np.asarray(physics.qpos))
     made.check()
-    return getattr(made, "path", engine), qpos
+    return getattr(made, "path", engine), np.stack(qpos)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", nargs="+", help="NAME=MJCF")
     parser.add_argument("--engines", nargs="+", default=["native", "warp", "jax"])
+    parser.add_argument("--actions", nargs="+", type=int, default=[2])
     parser.add_argument("--allow-cpu", action="store_true")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -76,11 +79,13 @@ def main() -> None:
     for text in args.models:
         name, _, path = text.partition("=")
         model = mujoco.MjModel.from_xml_path(path)
-        expected, cells = looped(model), []
+        expected, cells = looped(model, max(args.actions)), []
         for engine in args.engines:
             try:
-                seen, qpos = played(model, engine, **({"allow_cpu": True} if engine == "warp" and args.allow_cpu else {}))
-                cells.append(f"{np.abs(qpos - expected).max():.0e}{', ' + seen if engine == 'warp' else ''}")
+                options = {"allow_cpu": True} if engine == "warp" and args.allow_cpu else {}
+                seen, qpos = played(model, engine, max(args.actions), **options)
+                apart = np.abs(qpos - expected).max(axis=(1, 2))
+                cells.append(", ".join([*(f"{apart[n - 1]:.0e}" for n in args.actions), *([seen] if engine == "warp" else [])]))
             except ValueError as error:
                 cells.append(f"no: {error}")
         print(f"| {name} | {model.nv} | {' | '.join(cells)} |", flush=True)

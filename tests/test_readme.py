@@ -10,9 +10,9 @@ README = (ROOT / "README.md").read_text()
 # What commands and engines are made of; some of it has a place among the API pages, too.
 INNER = (
     "__main__ cli system envs.engines.fused envs.engines.warp envs.engines.graph envs.engines.features"
-    " envs.engines.fields envs.engines.pairs envs.engines.sensors envs.engines.batches envs.engines.explain runs sweeps testing"
-    " tools lookup import_paths rates trust viewer fleet check parallel policy.learner_policy"
-    " policy.numpy_policy"
+    " envs.engines.fields envs.engines.pairs envs.engines.sensors envs.engines.batches envs.engines.corrections"
+    " envs.engines.explain runs sweeps testing tools lookup import_paths rates trust viewer fleet check parallel"
+    " policy.learner_policy policy.numpy_policy"
 )
 
 

@@ -12,6 +12,7 @@ _NATIVE = "use engine native"
 # Fixes in the MJCF, by words of the reason.
 _CURES = {
     "integrator": 'integrator="Euler"',
+    "disable springs": "set stiffness and damping to 0 in place of the flags",
     "noslip": 'noslip_iterations="0"',
     "solver": 'solver="Newton"',
     "without nativeccd": '<flag nativeccd="disable"/>',

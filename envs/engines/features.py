@@ -75,6 +75,12 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
     return list(dict.fromkeys(features))
 
 
+def stand_alone(model: mujoco.MjModel) -> np.ndarray:
+    """Whether each joint [njnt] is of a free body without other joints on it."""
+    tree = model.body_treeid[model.jnt_bodyid]
+    return (model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)) & (model.tree_dofnum[np.maximum(tree, 0)] == 6)
+
+
 def with_names(what: str, model: mujoco.MjModel, kind: str, indices: Any) -> str:
     """`what`, followed by names of elements, or by their numbers if they have none."""
     if kind == "dof":

@@ -8,17 +8,16 @@ import dataclasses
 import io
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.envs.engines import pairs
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
-from mjx_dher.envs.engines.features import beyond_defaults, with_names
+from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
@@ -27,6 +26,7 @@ from mjx_dher.validation import check_count
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx
 
+    from mjx_dher.envs.engines.corrections import Equality, equalities_of, implicit
 
 # Fields of MjModel that MJX 3.17 ignores without an error.
 _IGNORED = (
@@ -34,6 +34,16 @@ _IGNORED = (
     *("actuator_actearly", "dof_dampingpoly", "jnt_stiffnesspoly", "tendon_dampingpoly", "tendon_stiffnesspoly"),
     *("geom_surfacevel", "geom_adhesion", "geom_fluid", "geom_gap", "pair_gap", "pair_adhesion"),
 )
+
+
+def _ignored(model: mujoco.MjModel) -> Iterator[str]:
+    """Features of a model that MJX 3.17 ignores without an error."""
+    yield from beyond_defaults(model, _IGNORED.__contains__)
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
+        yield "flags that disable springs or dampers"
+    muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+    if len(muscles) and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+        yield with_names("damping of muscles with the integrator implicitfast", model, "actuator", muscles)
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -59,59 +69,6 @@ def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
                 both = f"{names[ends[pair]]!r}, a cylinder, and {names[others[pair]]!r}, a box,"
                 raise ValueError(f"geoms {both} meet; one of them needs another to stand in for it, called NAME_stand_in")
     return model
-
-
-class _Weld:
-    """The velocity term of a weld's acceleration, which MJX omits and MuJoCo C and Warp include.
-
-    With the weld's residual r, MuJoCo solves for r'' = aref, where r'' = J qacc + J' qvel. MJX 3.17 drops J' qvel: an arm that
-    moves at 1 m/s then pulls its gripper aside by 1 mm in half a second. Only welds between a mocap body (which counts as at
-    rest) and a moving body with coinciding frames are corrected.
-    """
-
-    def __init__(self, model: mujoco.MjModel, index: int):
-        self._target, self._body = int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
-        self._root = int(model.body_rootid[self._body])
-        body = self._body
-        while not model.body_dofnum[body]:
-            body = int(model.body_parentid[body])
-        dofs = [int(model.body_dofadr[body] + model.body_dofnum[body] - 1)]
-        while model.dof_parentid[dofs[-1]] >= 0:
-            dofs.append(int(model.dof_parentid[dofs[-1]]))
-        self._dofs = np.array(dofs)
-
-    def bias(self, data: mjx.Data) -> Array:
-        """J' qvel [6]: three rows of position in m/s^2, three of orientation in 1/s^2."""
-        # Spatial vectors (angular, linear) at the centre of mass of the whole arm.
-        acceleration = data.qvel[self._dofs] @ data.cdof_dot[self._dofs]
-        velocity, arm = data.cvel[self._body], data.xpos[self._body] - data.subtree_com[self._root]
-        omega, alpha = velocity[:3], acceleration[:3]
-        at_body = velocity[3:] + jnp.cross(omega, arm)
-        position = acceleration[3:] + jnp.cross(alpha, arm) + jnp.cross(omega, at_body)
-        # The residual is the vector part of q^-1 p (q the body's orientation, p the target's), and q' = omega q / 2.
-        inverse = data.xquat[self._body] * jnp.array([1.0, -1.0, -1.0, -1.0])
-        turn = jnp.concatenate([0.25 * jnp.dot(omega, omega)[None], 0.5 * alpha])
-        orientation = quat_multiply(quat_multiply(inverse, turn), data.xquat[self._target])[1:]
-        return -jnp.concatenate([position, orientation])
-
-
-def _welds(model: mujoco.MjModel) -> list[int | _Weld]:
-    """First rows of a model's constraints in order: welds to correct, and numbers of other rows."""
-    disabled = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    connect, weld = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
-    if model.opt.disableflags & disabled or model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
-        return []
-
-    def to_correct(index: int) -> bool:
-        bodies = model.eq_objtype[index] == int(mujoco.mjtObj.mjOBJ_BODY) and model.eq_active0[index]
-        plain = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
-        if not bodies or not plain or model.body_mocapid[model.eq_obj1id[index]] < 0:
-            return False
-        return bool(model.body_weldid[model.eq_obj2id[index]])  # otherwise it is fixed to the world
-
-    rows: list[int | _Weld] = [3 * int(np.count_nonzero(model.eq_type == connect))]
-    rows += [_Weld(model, index) if to_correct(index) else 6 for index in np.flatnonzero(model.eq_type == weld).tolist()]
-    return rows if any(isinstance(row, _Weld) for row in rows) else []
 
 
 def _grow_for_margins(model: mujoco.MjModel) -> None:
@@ -181,7 +138,7 @@ class MjxEngine:
     ):
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
-        if ignored := beyond_defaults(model, _IGNORED.__contains__):
+        if ignored := [*_ignored(model)]:
             raise ValueError(f"engine jax: MJX ignores features of the model: {', '.join(ignored)}; use engine native")
         self._variation = Variation(model, varied)
         model = with_stand_ins(model)
@@ -190,7 +147,8 @@ class MjxEngine:
         model.opt.ls_iterations = ls_iterations
         if not sensors:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-        self._mujoco_model, self._substeps, self._welds = model, substeps, _welds(model)
+        self._mujoco_model, self._substeps, self._equalities = model, substeps, equalities_of(model)
+        self._alone = np.flatnonzero(stand_alone(model))
         try:
             self._model = mjx.put_model(model, impl="jax")
             # NumPy leaves become constants of the program that traces them, on any device.
@@ -211,7 +169,7 @@ class MjxEngine:
         def substep(_, p: Physics) -> Physics:
             data = _loaded(start, p, controls)
             with private_api.bodies_computed_once() if jax.default_backend() == "cpu" else contextlib.nullcontext():
-                data = self._step(model, data) if self._welds else mjx.step(model, data)
+                data = self._step(model, data)
             # MJX's precision depends on jax_enable_x64; between substeps it is float32, as between steps.
             qpos, qvel, warmstart, act = (x.astype(jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.act))
             return Physics(qpos, qvel, warmstart, act, factors=p.factors)
@@ -237,11 +195,20 @@ class MjxEngine:
         pass  # there is memory for all contacts
 
     def _step(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        """Computes `mjx.step` with the welds corrected, and without sensors."""
+        """Computes `mjx.step` with equalities and implicitfast corrected, without sensors."""
+        integrator = mujoco.mjtIntegrator(self._mujoco_model.opt.integrator)
+        if integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            return mjx.step(model, data)
+        data = self._with_equalities(model, data) if self._equalities else mjx.forward(model, data)
+        return (
+            mjx.euler(model, data)
+            if integrator == mujoco.mjtIntegrator.mjINT_EULER
+            else implicit(self._mujoco_model, self._alone, model, data)
+        )
+
+    def _with_equalities(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        """Computes `mjx.forward` with equalities corrected, without sensors."""
         data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
-        shifts = [-weld.bias(data) if isinstance(weld, _Weld) else jnp.zeros(weld) for weld in self._welds]
+        shifts = [-row.bias(data) if isinstance(row, Equality) else jnp.zeros(row) for row in self._equalities]
         data = private_api.shift_reference_acceleration(data, jnp.concatenate(shifts))
-        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-        euler = int(mujoco.mjtIntegrator.mjINT_EULER)
-        integrate = mjx.euler if self._mujoco_model.opt.integrator == euler else mjx.implicit
-        return integrate(model, mjx.solve(model, data))
+        return mjx.solve(model, mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data)))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.features import beyond_defaults, with_names
+from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
 from mjx_dher.envs.engines.fused import setup
 from mjx_dher.envs.engines.pairs import all_pairs
 
@@ -120,10 +120,9 @@ def _not_fixed(model: mujoco.MjModel) -> np.ndarray:
 def _off_centre(model: mujoco.MjModel) -> np.ndarray:
     """Free joints [njnt] for which the kernel leaves out what implicitfast does with gyroscopic forces."""
     body = model.jnt_bodyid
-    alone = (model.jnt_type == _FREE) & (model.tree_dofnum[np.maximum(model.body_treeid[body], 0)] == 6)
     parts = np.array([np.count_nonzero(model.body_rootid == each) > 1 for each in body], bool)
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    return alone & implicit & (parts | np.any(model.body_ipos[body] != 0, axis=1))
+    return stand_alone(model) & implicit & (parts | np.any(model.body_ipos[body] != 0, axis=1))
 
 
 def _is_known(model: mujoco.MjModel, eq: int) -> bool:

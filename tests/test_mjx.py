@@ -1,0 +1,136 @@
+"""Timesteps of the engine jax on random models, against MuJoCo C: servos, force limits, damping and free bodies."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from conftest import refuses
+
+from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines.corrections import gyroscopic
+
+NUM = 64
+BOX = '<geom type="box" size=".1 .2 .3" pos="{}" contype="0"/>'
+FREE = f"""
+<body pos="0 0 1"><freejoint/>{BOX.format("0 0 0")}</body>
+<body pos="0 0 2"><joint type="free" damping="0.3" armature="0.2"/>{BOX.format("0.1 -0.2 0.05")}
+  <body pos="0 0.1 0" quat="1 2 3 4">{BOX.format("0 0.2 0.1")}</body></body>
+<body pos="0 0 3"><freejoint/>{BOX.format("0.1 0 0")}
+  <body><joint axis="0 1 1" damping="0.1"/>{BOX.format("0.1 0 0")}</body></body>"""
+
+
+def servos(seed, integrator):
+    """Six arms of one or two joints with actuators of all kinds, and three free bodies: with parts, and with a joint."""
+    rng = np.random.default_rng(seed)
+
+    def some(name, *values):
+        return f'{name}="{" ".join(f"{value:.2f}" for value in values)}"' if rng.random() < 0.5 else ""
+
+    arms, actuators = "", ""
+    for arm in range(6):
+        for link in range(1 + arm % 2):
+            name, gain, kv = f"j{arm}{link}", *rng.uniform(0, 5, 2)
+            joint = f"{some('damping', rng.uniform(0, 2))} {some('actuatorfrcrange', -2, 3)}"
+            arms += f'<body pos="0.1 0 0.2"><joint name="{name}" axis="0 1 0.2" {joint}/>{BOX.format("0.1 0 0.05")}'
+            limits = f"{some('forcerange', -rng.uniform(0, 3), 2)} {some('ctrlrange', 0, 0.7)}"
+            affine = f'gaintype="affine" gainprm="3 1 -{gain}" biastype="affine" biasprm="0 -1 -1"'
+            actuators += rng.choice(
+                [
+                    f'<position joint="{name}" kp="20" kv="{kv}" gear="{rng.uniform(-2, 2)}" {limits}/>',
+                    f'<velocity joint="{name}" kv="{kv}" {limits}/>',
+                    f'<damper joint="{name}" kv="{kv}" ctrlrange="0 1"/>',
+                    f'<general joint="{name}" {affine} {limits}/>',
+                    f'<general joint="{name}" dyntype="filter" dynprm="0.1" {affine} {limits}/>',
+                ]
+            )
+        arms += "</body>" * (1 + arm % 2)
+    bodies = f'<option integrator="{integrator}"/><worldbody>{FREE}{arms}</worldbody>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{bodies}<actuator>{actuators}</actuator></mujoco>")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "integrator"), [(0, "Euler"), (1, "implicitfast"), (2, "implicitfast"), (3, "implicitfast")])
+def test_a_timestep_of_random_servos_and_free_bodies_is_mujoco_c_s(seed, integrator):
+    model, rng = servos(seed, integrator), np.random.default_rng(seed)
+    qpos, qvel = np.tile(model.qpos0, (NUM, 1)), 3 * rng.normal(size=(NUM, model.nv))
+    for joint, at in enumerate(model.jnt_qposadr):
+        if model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE):
+            quat = rng.normal(size=(NUM, 4))
+            qpos[:, at + 3 : at + 7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        else:
+            qpos[:, at] = rng.normal(size=NUM)
+    act, ctrl = rng.uniform(0, 1, (NUM, model.na)), rng.uniform(0, 1, (NUM, model.nu))
+    qpos, qvel, act, ctrl = (x.astype(np.float32) for x in (qpos, qvel, act, ctrl))
+    advance = jax.jit(jax.vmap(make_engine("jax", model, 1).advance))
+    here = advance(Physics(qpos, qvel, np.zeros_like(qvel), act), Controls(ctrl, jnp.zeros((NUM, 0, 7))))
+    data, at_limit = mujoco.MjData(model), 0
+    for i in range(NUM):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.act[:], data.ctrl[:] = qpos[i], qvel[i], act[i], ctrl[i]
+        mujoco.mj_step(model, data)
+        at_limit += np.count_nonzero(model.actuator_forcelimited & np.isin(data.actuator_force, model.actuator_forcerange))
+        changed = np.abs(data.qvel - qvel[i])
+        assert np.all(np.abs(here.qvel[i] - data.qvel) <= 2e-6 + 2e-5 * changed)
+        np.testing.assert_allclose(here.qpos[i], data.qpos, atol=1e-6)
+        np.testing.assert_allclose(here.act[i], data.act, atol=1e-6)
+    assert at_limit > NUM / 2
+
+
+CONNECTED = f"""
+<mujoco><worldbody>
+<body name="a" pos="0 0 1"><joint axis="0 1 0.3"/>{BOX.format("0 0 0")}
+  <body name="b" pos="0.3 0 0"><joint type="ball"/>{BOX.format("0 0.1 0")}</body></body>
+<body name="c" pos="0.6 0 1"><freejoint/>{BOX.format("0 0 0")}
+  <body name="d" pos="0 0.3 0"><joint axis="0 0 1"/>{BOX.format("0.1 0 0")}</body>
+  <body name="e" pos="0 -0.3 0">{BOX.format("0 0 0")}</body></body></worldbody>
+<equality><connect body1="b" body2="c" anchor="0.1 0.05 0"/><connect body1="d" anchor="0 0 0.1"/>
+<connect body1="e" body2="a" anchor="0 0 0.1"/></equality></mujoco>"""
+
+
+@pytest.mark.slow
+def test_a_timestep_of_connected_bodies_is_mujoco_c_s():
+    """The first one holds bodies of two trees, the second one a body and the world, the third one a part of a free body."""
+    model, rng = mujoco.MjModel.from_xml_string(CONNECTED), np.random.default_rng(0)
+    qpos, qvel = np.tile(model.qpos0, (NUM, 1)).astype(np.float32), (2 * rng.normal(size=(NUM, model.nv))).astype(np.float32)
+    advance = jax.jit(jax.vmap(make_engine("jax", model, 1, iterations=20, ls_iterations=20).advance))
+    none = Controls(jnp.zeros((NUM, 0)), jnp.zeros((NUM, 0, 7)))
+    here, data = advance(Physics(qpos, qvel, np.zeros_like(qvel), np.zeros((NUM, 0), np.float32)), none), mujoco.MjData(model)
+    for i in range(NUM):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        mujoco.mj_step(model, data)
+        np.testing.assert_allclose(here.qvel[i], data.qvel, atol=5e-4)  # 0.2 without the velocity term
+
+
+def test_free_bodies_are_implicit_in_gyroscopic_forces_as_in_mujoco_c():
+    """Without other forces, one timestep of bodies with and without a part, off their centres of mass."""
+    for body, damping in enumerate((0.0, 0.3)):
+        text = f'<mujoco><option integrator="{{}}" gravity="0 0 0"/><worldbody>{FREE}</worldbody></mujoco>'
+        model, explicit = (mujoco.MjModel.from_xml_string(text.format(name)) for name in ("implicitfast", "Euler"))
+        qvel, dofs = np.random.default_rng(0).normal(size=model.nv) * 10, slice(6 * body, 6 * body + 6)
+        data, before = mujoco.MjData(model), mujoco.MjData(explicit)
+        data.qvel[:] = before.qvel[:] = qvel
+        mujoco.mj_step(model, data)
+        mujoco.mj_forward(explicit, before)
+        mass = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(explicit, before, mass)
+        block, frame, force = mass[dofs, dofs], before.xmat[1 + body].reshape(3, 3), before.qfrc_smooth[dofs]
+        numbers = (np.full(6, damping), model.dof_armature[dofs], frame, qvel[dofs][3:], force)
+        shift = gyroscopic(model.opt.timestep, *map(jnp.asarray, (block, *numbers)))
+        implicit = block + model.opt.timestep * damping * np.eye(6)
+        moved = qvel[dofs] + model.opt.timestep * np.linalg.solve(implicit, force + shift)
+        assert np.abs(np.linalg.solve(implicit, shift)).max() > 0.01
+        np.testing.assert_allclose(data.qvel[dofs], moved, rtol=1e-6, atol=1e-5)
+
+
+def test_what_mjx_computes_otherwise_is_rejected():
+    joint = '<mujoco><option integrator="{}">{}</option><worldbody><body><joint name="a" damping="1"/><geom size="1"/></body>'
+    joint += '</worldbody><actuator><muscle name="biceps" joint="a" lengthrange="-1 1"/></actuator></mujoco>'
+    with refuses("muscles", "implicitfast", "biceps"):
+        make_engine("jax", mujoco.MjModel.from_xml_string(joint.format("implicitfast", "")), 1)
+    for flag in ("spring", "damper"):
+        model = mujoco.MjModel.from_xml_string(joint.format("Euler", f'<flag {flag}="disable"/>'))
+        with refuses("flags", "springs", "dampers"):
+            make_engine("jax", model, 1)
+    assert make_engine("jax", mujoco.MjModel.from_xml_string(joint.format("Euler", "")), 1).name == "jax"
