@@ -58,7 +58,7 @@ class Context(NamedTuple):
         return self.compute_reward(achieved_goal, desired_goal) >= self.reward_range[1]
 
     def bounds(self) -> tuple[Array | float, Array | float]:
-        """Lowest and highest return (`return_bounds`)."""
+        """Lowest and highest return [] (`return_bounds`)."""
         return return_bounds(self.reward_range, self.hparams.gamma)
 
     def td_error(self, batch: Batch) -> Array:
@@ -85,7 +85,7 @@ def reached_fn(env: Any) -> ReachedFn:
 
 
 def return_bounds(reward_range: tuple[float, float], gamma: Array | float) -> tuple[Array | float, Array | float]:
-    """Lowest and highest discounted return of rewards in `reward_range`, for episodes of any length.
+    """Lowest and highest discounted return [] of rewards in `reward_range`, for episodes of any length.
 
     The bounds include 0, because a return that ends early counts as if rewards of 0 followed.
     """

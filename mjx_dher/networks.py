@@ -175,7 +175,14 @@ _PARAMETERS = ("action_size", "hidden_sizes", "dtype")
 
 
 def mlp(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
-    """The default networks."""
+    """The default networks: linear layers and ReLU for actor and critic.
+
+    Args:
+      action_size: A.
+      hidden_sizes: units of each hidden layer.
+      dtype: of the hidden layers' products and activations. Parameters and outputs are float32.
+      heads: outputs that the learner needs.
+    """
     return _styled(action_size, hidden_sizes, dtype, heads, Style(), Style())
 
 

@@ -121,7 +121,7 @@ def improvement_interval(
     """Stratified percentile bootstrap interval of `probability_of_improvement`.
 
     Args:
-      a: scores [S] or [S, K].
+      a, b: scores [S] or [S, K]. Their numbers of seeds may differ.
 
     Raises:
       ValueError: as in `probability_of_improvement`, or `level` does not lie between 0 and 1.
@@ -148,7 +148,7 @@ def paired_p_value(a: ArrayLike, b: ArrayLike, repeats: int = 100_000, seed: int
     `repeats`; otherwise that many random sign flips are drawn.
 
     Args:
-      a: scores [S].
+      a, b: scores [S] of the same seeds.
       repeats: largest number of sign flips.
 
     Raises:

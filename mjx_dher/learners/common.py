@@ -104,7 +104,7 @@ class ActorCriticBase(Learner):
         return dataclasses.replace(batch, observation=observation, next_observation=next_observation, desired_goal=goal)
 
     def return_bounds(self, hparams: HParams) -> tuple[Array | float, Array | float]:
-        """Lowest and highest return of the task, to which targets are clipped."""
+        """Lowest and highest return [] of the task, to which targets are clipped."""
         return return_bounds(self.spec.reward_range, hparams.gamma)
 
     def act(self, state: State, obs: GoalObs, hparams: HParams) -> Array:
