@@ -30,6 +30,7 @@ MORE, SLOWER = "more_updates", 1.75  # seconds of an update with `td_error` over
 ARMS = (
     Arm("future", "plain", {"sampler": "future"}),
     Arm("uniform", "plain", {"sampler": "future"}, {"priority_fraction": 0.0}),
+    Arm("weighted", "plain", {"sampler": "weighted"}),
     Arm(MORE, "more", {"sampler": "future"}),
     Arm("td_error", "errors", {"priority": "td_error"}, {"priority_fraction": 0.5}),
     Arm("td_error_whole", "errors", {"priority": "td_error"}, {"priority_fraction": 1.0}),
