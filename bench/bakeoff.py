@@ -32,7 +32,7 @@ from mjx_dher import stats
 from mjx_dher.cli import sentence
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
@@ -164,7 +164,7 @@ def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
     wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
     trials: dict[str, list[dict[str, Any]]] = {}
     for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
-        _, spec = run_folder.read_run(trial["folder"])
+        _, spec = reading.read_run(trial["folder"])
         if (arm := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
             trials.setdefault(arm, []).append(trial)
     own = [run for arm in wanted.values() if arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]

@@ -39,7 +39,7 @@ from peers_worker import EPISODE_LENGTH, FIRST_SEED, PEERS, ZOO, usable_cores
 
 from mjx_dher.components import COMPONENTS
 from mjx_dher.lookup import check_name, require_extra
-from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.folder import reading, results, run_folder
 from mjx_dher.stats import wilson_interval
 from mjx_dher.system import subprocesses
 from mjx_dher.system.caches import user_cache
@@ -143,10 +143,10 @@ def train_ours(args: argparse.Namespace, seed: int, python: Path) -> Run:
         running = True
         while running:
             running = process.poll() is None  # polled before reading rows, so that none is missed
-            for row in loggers.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
+            for row in results.read_rows(folder / run_folder.METRICS_FILE)[len(run.rows) :]:
                 if not run.rows:
                     first = time.perf_counter() - row["wall_seconds"]  # when training began
-                    spec = run_folder.read_spec(folder)
+                    spec = reading.read_spec(folder)
                     run.who, run.startup = f"mjx-dher {spec.learner} {spec.sampler}", first - began
                 run.add(**{name: row["wall_seconds" if name == "seconds" else name] for name in (*COLUMNS[3:], "updates")})
             if running and not stopped and time.perf_counter() - first >= 60 * args.minutes:

@@ -35,7 +35,7 @@ import reliability_splices
 from timing import print_table
 
 from mjx_dher import Config, HParams, envs, make_train
-from mjx_dher.runs.folder import checkpoint, run_folder
+from mjx_dher.runs.folder import checkpoint, restoring, run_folder
 from mjx_dher.runs.program import loop
 
 ROOT = Path(__file__).parent.parent
@@ -100,7 +100,7 @@ class Runs:
         if not run_folder.checkpoints(out):
             expect(done <= lost, f"{done} epochs without a checkpoint")
             return 0
-        found = checkpoint.restore(out, self.template)
+        found = restoring.restore(out, self.template)
         expect(not found.refused, f"a checkpoint is not whole: {found.refused}")
         expect(digest(found.state) == self.right[found.epoch], f"the state of epoch {found.epoch} is another")
         # An epoch's line is written before its checkpoint, and may be truncated by the kill.
@@ -165,7 +165,7 @@ def flips(runs, count, rng):
         damaged[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
         path.write_bytes(damaged)
         try:
-            found = checkpoint.restore(out, runs.template)
+            found = restoring.restore(out, runs.template)
             expect(digest(found.state) == runs.right[found.epoch], f"restored silently wrong: {path}")
             harmless += 1
         except checkpoint.CheckpointError:
@@ -186,14 +186,14 @@ def damage(runs, count, rng):
             if len(whole) == 0 and path.exists():
                 continue  # cutting an empty file changes nothing
             harm(path, whole)
-            found = checkpoint.restore(out, runs.template)
+            found = restoring.restore(out, runs.template)
             expect((found.epoch, len(found.refused)) == (expected, 1), f"{path}: epoch {found.epoch}, {found.refused}")
             expect(digest(found.state) == runs.right[found.epoch], "the older one is another")
             path.write_bytes(whole)
             tried += 1
     manifest = newest / run_folder.MANIFEST
     manifest.write_text(manifest.read_text().replace(f'"schema": {checkpoint.SCHEMA}', '"schema": 0'))
-    expect("schema" in checkpoint.restore(out, runs.template).refused[newest], "an older schema is not named")
+    expect("schema" in restoring.restore(out, runs.template).refused[newest], "an older schema is not named")
     shutil.rmtree(older)
     process = runs.start(out)
     _, stderr = process.communicate()

@@ -13,7 +13,7 @@ from pathlib import Path
 from reliability_pairs import ROOT, SHAPES, of_run, of_sweep
 
 from mjx_dher import Options, cli, envs, train_runs
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading
 
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "docs" / "examples")]
 TOLD = ("total_steps", "final_episodes")  # fields that `resume` accepts changed, with a message
@@ -58,7 +58,7 @@ def edits(folder):
     flags = [*SHAPES, "--total-steps", "80", "--checkpoint-every", "2"]
     assert call(*flags, "--out", folder / "whole")[0] == 0
     assert call("sweep", *flags, "--sampler", "future", "--seeds", "2", "--out", folder / "sweep")[0] == 0
-    stop_after(2, run_folder.read_spec(folder / "whole"), folder / "stopped")
+    stop_after(2, reading.read_spec(folder / "whole"), folder / "stopped")
     (cell, *_) = sorted((folder / "sweep" / "cells").glob("*-s0-*"))
     commands = {
         "stopped": (".", lambda copy: ("resume", copy)),
@@ -152,7 +152,7 @@ def calls(folder):
     flags = [*wrong_calls.TINY, "--total-steps", "200", "--final-episodes", "2", "--eval-episodes", "2"]
     assert call(*flags, "--out", folder / "run")[0] == 0
     assert call("sweep", *flags, "--seeds", "1", "--sampler", "future", "--out", folder / "sweep")[0] == 0
-    stop_after(1, run_folder.read_spec(folder / "run"), folder / "stopped")
+    stop_after(1, reading.read_spec(folder / "run"), folder / "stopped")
     (folder / "places").mkdir()
     (folder / "here").mkdir()
     made = [folder / name for name in ("run", "stopped", "sweep")]

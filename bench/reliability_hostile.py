@@ -25,7 +25,7 @@ from reliability_pairs import ROOT, SHAPES
 
 from mjx_dher import cli
 from mjx_dher.components import COMPONENTS
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, reading
 
 SECONDS = 60  # time limit of a case
 SERVED = 12  # seconds until a served page is closed
@@ -107,7 +107,7 @@ class Case:
         before = content["digest"]
         content |= changes
         file.write_text(json.dumps(content))
-        identity = run_folder.identity_of(content, run_folder.to_spec(file, content))
+        identity = reading.identity_of(content, reading.to_spec(file, content))
         now = fingerprint.digest(identity)
         for name in ("config.json", "result.json", "metrics.csv"):
             with contextlib.suppress(OSError):

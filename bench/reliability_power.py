@@ -17,7 +17,7 @@ from pathlib import Path
 import power_recorder
 from reliability_pairs import ROOT, SHAPES, ended, faults_of, of_run, of_sweep, same, start
 
-from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.folder import results, run_folder
 
 INTERVAL = 5  # epochs between checkpoints
 TRAIN = [*SHAPES, "--total-steps", "3000", "--checkpoint-every", str(INTERVAL)]  # 150 epochs
@@ -73,7 +73,7 @@ def run_cut(folder, right, rng, disk_rng):
     disk, store, after = folder / "disk", folder / "store", folder / "after"
     process = start_recorded(disk, store, *TRAIN, "--out", disk / "run")
     cut(process, (disk / "run" / "metrics.csv").exists, rng)
-    done = len(loggers.read_rows(disk / "run" / run_folder.METRICS_FILE))
+    done = len(results.read_rows(disk / "run" / run_folder.METRICS_FILE))
     power_recorder.rebuild(disk, store, after, disk_rng)
     run = after / "run"
     if (run / run_folder.RESULT_FILE).exists():

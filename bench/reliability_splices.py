@@ -7,7 +7,7 @@ import shutil
 from reliability_calls import call, differing, everything, stop_after
 from reliability_pairs import SHAPES, of_run, rows, same
 
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 
 LENGTH, LONGER = 120, 160  # environment steps: 6 epochs, and 8
 FILES = ("config.json", "policy.npz", "result.json", "metrics.csv")
@@ -46,7 +46,7 @@ def make(folder):
     for name, more in {"mine": [], **others}.items():
         whole, stopped = folder / f"{name}_whole", folder / f"{name}_stopped"
         assert call(*flags, "--total-steps", LENGTH, *more, "--out", whole)[0] == 0
-        stop_after(4, run_folder.read_spec(whole, trusted=True), stopped)
+        stop_after(4, reading.read_spec(whole, trusted=True), stopped)
         runs[name] = {"whole": whole, "stopped": stopped}
     goal = folder / "longer"
     shutil.copytree(runs["mine"]["whole"], goal)

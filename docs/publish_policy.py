@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 
 from mjx_dher import envs, presets, spec  # noqa: E402
 from mjx_dher.policy import bundled  # noqa: E402
-from mjx_dher.runs.folder import results, run_folder  # noqa: E402
+from mjx_dher.runs.folder import reading, results, run_folder  # noqa: E402
 from mjx_dher.spec import RunSpec  # noqa: E402
 from mjx_dher.system import files  # noqa: E402
 
@@ -60,7 +60,7 @@ def _text(value: Any) -> str:
 
 def card(folder: Path) -> str:
     """Card of the policy in `folder`, from its config.json, result.json and card.json."""
-    content, run = run_folder.read_run(folder)
+    content, run = reading.read_run(folder)
     result, facts = results.read_result(folder), bundled.facts(folder)
     versions = content["versions"]
     sizes = ", ".join(map(str, run.config.hidden_sizes))
@@ -187,7 +187,7 @@ def main(argv: Sequence[str]) -> None:
         return
     if None in (args.run, args.machine, args.commit):
         raise ValueError("a run, --machine and --commit are needed")
-    run = run_folder.read_spec(args.run)
+    run = reading.read_spec(args.run)
     check(args.run, run)
     facts = {"machine": args.machine, "commit": args.commit, "date": datetime.date.today().isoformat()}
     facts |= measure(args.run, run, args.episodes, args.seed, args.python)

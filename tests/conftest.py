@@ -76,12 +76,12 @@ def refuses(*parts, error=ValueError):
 def save_policy(folder, policy=None):
     """Writes the policy of the run in `folder`, as training does: with the settings in config.json. None: of three numbers."""
     from mjx_dher.policy import Policy
-    from mjx_dher.runs.folder import run_folder
+    from mjx_dher.runs.folder import reading, run_folder
 
     ones = np.ones(1, np.float32)
     policy = policy or Policy(((np.ones((2, 1), np.float32), ones),), ones, ones, ones, ones, 5.0, 200.0)
-    content = run_folder.read_config(folder)
-    run_folder.save_policy(folder, policy, run_folder.identity_of(content, run_folder.to_spec(folder, content)))
+    content = reading.read_config(folder)
+    run_folder.save_policy(folder, policy, reading.identity_of(content, reading.to_spec(folder, content)))
 
 
 def load_recorded(task):

@@ -15,7 +15,7 @@ from mjx_dher.contract import env_spec
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel import split as split_lib
 from mjx_dher.runs import driver
-from mjx_dher.runs.folder import loggers
+from mjx_dher.runs.folder import results
 from mjx_dher.runs.program import loop
 from mjx_dher.system.files import FolderError
 from mjx_dher.types import Batch
@@ -142,7 +142,7 @@ def train(folder, number=1, epoch=None, env=ENV, **options):
         **options,
     )
     times = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
-    rows = [loggers.read_rows(folder / str(seed) / "metrics.csv") for seed in range(number)]
+    rows = [results.read_rows(folder / str(seed) / "metrics.csv") for seed in range(number)]
     return [[{k: v for k, v in row.items() if k not in times} for row in run] for run in rows], states[-1]
 
 

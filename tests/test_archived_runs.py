@@ -12,7 +12,7 @@ from conftest import ROOT, refuses
 
 import mjx_dher
 from mjx_dher import cli
-from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.runs.folder import reading, results
 from mjx_dher.sweeps import grid, sweep, tables
 
 sys.path.append(str(ROOT / "tests" / "data"))
@@ -69,7 +69,7 @@ def test_an_evaluation_gives_the_same_numbers(archive, capsys):
 @pytest.mark.parametrize("name", ["tqc", pytest.param("ddpg", marks=pytest.mark.slow)])
 def test_a_stopped_run_resumes(archive, name):
     folder = archive / f"{name}_stopped"
-    assert run_folder.read_spec(folder) == made.RUNS[name]
+    assert reading.read_spec(folder) == made.RUNS[name]
     assert cli.main(["resume", str(folder), "--no-curve"]) == 0
     compare(folder, archive / "expected" / folder.name)
 
@@ -105,8 +105,8 @@ def test_a_setting_of_earlier_versions_is_read_and_cannot_be_resumed_with_anothe
     shutil.copytree(archive / "ddpg_ended", folder)
     content = json.loads((folder / "config.json").read_text())
     assert content["config"]["learner_kernels"] == "auto"
-    spec = run_folder.to_spec(folder, content)
+    spec = reading.to_spec(folder, content)
     content["config"]["learner_kernels"] = "xla"
     (folder / "config.json").write_text(json.dumps(content))
     with refuses("learner_kernels", "xla", "auto"):
-        run_folder.check_same(folder, spec)
+        reading.check_same(folder, spec)

@@ -21,7 +21,7 @@ from conftest import ROOT, refuses
 
 from mjx_dher import HParams, RunSpec, cli, trainer
 from mjx_dher.learners import ddpg
-from mjx_dher.runs.folder import checkpoint, fingerprint, run_folder
+from mjx_dher.runs.folder import checkpoint, fingerprint, reading, restoring, run_folder
 from mjx_dher.runs.folder.checkpoint import CheckpointError
 from mjx_dher.runs.program import loop
 from mjx_dher.system import files
@@ -69,7 +69,7 @@ def copy(saved, tmp_path):
 
 
 def restore(folder, program):
-    return checkpoint.restore(folder, loop.state_template(program[0]))
+    return restoring.restore(folder, loop.state_template(program[0]))
 
 
 def test_a_resumed_run_is_the_uninterrupted_one_to_the_bit(program, saved):
@@ -177,14 +177,14 @@ def test_a_damaged_checkpoint_is_refused_by_name_and_the_one_before_it_is_used(p
 def test_the_state_of_another_run_is_refused(saved, config, parts):
     other = trainer.make_train(ENV, config)
     with refuses(*parts, error=CheckpointError):
-        checkpoint.restore(saved[0], loop.state_template(other))
+        restoring.restore(saved[0], loop.state_template(other))
 
 
 def test_another_dtype_is_refused(saved, program):
     template = loop.state_template(program[0])
     template = dataclasses.replace(template, env_steps=jax.ShapeDtypeStruct((), "float32"))
     with refuses("env_steps", "int32[]", "float32[]", error=CheckpointError):
-        checkpoint.restore(saved[0], template)
+        restoring.restore(saved[0], template)
 
 
 @pytest.mark.parametrize("use_ocdbt", [False, True])
@@ -196,15 +196,15 @@ def test_a_checkpoint_that_was_written_with_orbax_is_read(copy, program, use_ocd
         checkpointer.save(path / "state", arrays)
     assert bool(list(path.rglob("manifest.ocdbt"))) == use_ocdbt
     inside = [file for file in files_of(path) if file.name != "manifest.json"]
-    change_manifest(path, files={file.relative_to(path).as_posix(): checkpoint._digest(file) for file in inside})
+    change_manifest(path, files={file.relative_to(path).as_posix(): checkpoint.digest_of(file) for file in inside})
     found = restore(copy, program)
     assert (found.epoch, found.refused) == (3, {})
     assert bits(found.state) == [array.tobytes() for array in arrays.values()]
 
 
 def test_arrays_that_come_back_as_others_are_refused(saved, program, monkeypatch):
-    read = checkpoint._read_arrays
-    monkeypatch.setattr(checkpoint, "_read_arrays", lambda *args: [x.astype(np.float64) for x in read(*args)])
+    read = restoring._read_arrays
+    monkeypatch.setattr(restoring, "_read_arrays", lambda *args: [x.astype(np.float64) for x in read(*args)])
     with refuses("float64", error=CheckpointError):
         restore(saved[0], program)
 
@@ -331,7 +331,7 @@ def test_what_cannot_be_resumed_is_refused_at_once(saved, tmp_path, capsys):
     assert "checkpoint_every must lie in" in refusal(capsys, "--env", "push", "--checkpoint-every", "-1")
     rates = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate", "return_mean"), 0.5)
     ended = {"status": "finished", "epochs": 4, "env_steps": 40, "wall_seconds": 1.0, "lanes": 1, "episodes": 4, **rates}
-    write_json(tmp_path / "run" / "result.json", {**ended, "digest": run_folder.read_config(tmp_path / "run")["digest"]})
+    write_json(tmp_path / "run" / "result.json", {**ended, "digest": reading.read_config(tmp_path / "run")["digest"]})
     assert "has ended" in refusal(capsys, "resume", tmp_path / "run")
 
 

@@ -17,7 +17,7 @@ from mjx_dher.cli import train as cli_train
 from mjx_dher.cli.commands import COMMANDS
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, reading
 
 EPISODES = ["--final-episodes", "4"]
 FLAGS = [*flags(SHORT), *EPISODES, "--no-curve"]
@@ -105,7 +105,7 @@ def test_the_other_shells_get_theirs(capsys):
 
 def test_a_config_gives_the_same_settings_again(trained, capsys):
     args = cli_train.parse_train_args(["--config", str(trained)])
-    assert args.spec == run_folder.read_spec(trained)
+    assert args.spec == reading.read_spec(trained)
     assert (args.options.final_episodes, args.spec.seed, args.spec.env_kwargs) == (4, 3, ("episode_length=6",))
     changed = cli_train.parse_train_args(
         ["--config", str(trained / "config.json"), "--gamma", "0.5", "--seed", "9", "--keep", "1"]
@@ -251,7 +251,7 @@ def test_arguments_that_cannot_be_are_refused(command, tmp_path, capsys):
 def test_a_run_has_its_arguments_wherever_it_is_played_again(trained, tmp_path, capsys):
     assert json.loads((trained / "config.json").read_text())["env_kwargs"] == ["episode_length=6"]
     # 2 environments x 2 cycles x 6 steps
-    assert run_folder.read_run(trained)[1].env_arguments == {"episode_length": 6}
+    assert reading.read_run(trained)[1].env_arguments == {"episode_length": 6}
     assert (trained / "metrics.csv").read_text().splitlines()[1].startswith("1,24,")
     assert cli.main(["eval", str(trained), str(trained), "--episodes", "5", "--json"]) == 0
     captured = capsys.readouterr()
@@ -280,7 +280,7 @@ def test_trials_of_a_sweep_have_their_arguments(tmp_path, capsys):
     header, line = (tmp_path / "sweep" / "finals.csv").read_text().splitlines()
     assert dict(zip(header.split(","), line.split(",")))["env_kwargs"] == "episode_length=6"
     (config,) = (tmp_path / "sweep" / "cells").glob("*/config.json")
-    assert run_folder.read_spec(config.parent).env_kwargs == ("episode_length=6",)
+    assert reading.read_spec(config.parent).env_kwargs == ("episode_length=6",)
 
 
 def test_python_does_not_look_for_cycles_at_the_end():

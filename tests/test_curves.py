@@ -13,7 +13,7 @@ from conftest import refuses, save_policy
 from test_plotting import texts
 
 from mjx_dher import Config, RunSpec, cli
-from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, reading, run_folder
 from mjx_dher.sweeps import grid, report
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -26,7 +26,7 @@ PNG = b"\x89PNG"
 def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", columns=("q_mean", "critic_loss")):
     """A run folder as `train` leaves it after so many epochs; status None: it has not ended."""
     run_folder.write_config(folder, spec, "native", {"lanes": 1})
-    digest = run_folder.read_config(folder)["digest"]
+    digest = reading.read_config(folder)["digest"]
     sink = loggers.CsvSink(folder / "metrics.csv", digest=digest)
     for epoch in range(1, epochs + 1):
         rate = min(1.0, epoch / 10)

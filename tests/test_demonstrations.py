@@ -16,7 +16,7 @@ from mjx_dher import HParams, Options, RunSpec, cli, trainer
 from mjx_dher.contract import env_spec
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
 from mjx_dher.rollout import rollout
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, reading
 from mjx_dher.spec import validate
 from point_mass import PointMass, PointState
 
@@ -131,7 +131,7 @@ def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, m
     monkeypatch.syspath_prepend(str(EXAMPLES))
     command = [*flags(TINY), "--final-episodes", "4", "--no-curve", "--demonstrations", str(file)]
     assert cli.main([*command, "--total-steps", "80", "--out", str(tmp_path / "run")]) == 0
-    content, spec = run_folder.read_run(tmp_path / "run")
+    content, spec = reading.read_run(tmp_path / "run")
     assert spec.demonstrations == str(file)
     assert content["sources"]["demonstrations"].startswith("demos.npz ")
     (tmp_path / "moved").mkdir()

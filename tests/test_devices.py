@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from mjx_dher.runs.folder import checkpoint
+from mjx_dher.runs.folder import restoring
 
 
 def run_on_four_devices(marker, seconds):
@@ -51,7 +51,7 @@ def test_lanes_of_a_checkpoint_are_filled_up_or_left_out():
         (four, three, 4, four),  # of other runs: who restores them refuses them
         (three, one, 3, three),
     ):
-        found = checkpoint._fit_lanes(before, after, runs)
+        found = restoring._fit_lanes(before, after, runs)
         assert found.keys() == expected.keys()
         for name in expected:
             np.testing.assert_array_equal(found[name], expected[name], err_msg=name)

@@ -15,7 +15,7 @@ import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
 from mjx_dher.learners import ddpg
 from mjx_dher.runs import driver
-from mjx_dher.runs.folder import checkpoint, fingerprint, lane_checkpoints, run_folder
+from mjx_dher.runs.folder import checkpoint, fingerprint, lane_checkpoints, reading
 from mjx_dher.runs.folder.lane_checkpoints import Schedule
 from mjx_dher.sweeps import comparison, tables
 from mjx_dher.system.files import FolderError
@@ -51,7 +51,7 @@ def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, mo
     with np.load(trial / "policy.npz") as ours, np.load(tmp_path / "run" / "policy.npz") as other:
         assert set(ours.files) == set(other.files)
         assert all(np.array_equal(ours[name], other[name]) for name in ours.files)
-    assert run_folder.read_spec(trial) == run_folder.read_spec(tmp_path / "run")
+    assert reading.read_spec(trial) == reading.read_spec(tmp_path / "run")
 
 
 def breaking():
@@ -94,7 +94,7 @@ def test_a_library_call_trains_runs_side_by_side(trained):
     assert [result.status for result in results] == ["finished", "failed", "finished"]
     assert seen == [1, 2, 3]
     assert "compiling for 3 parallel runs of 3" in said[0]
-    assert run_folder.read_spec(results[2].folder) == specs[2]
+    assert reading.read_spec(results[2].folder) == specs[2]
     assert len((results[0].folder / "metrics.jsonl").read_text().splitlines()) == 3
     assert mjx_dher.load_policy(results[0].folder)({"observation": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
     assert not (folder / "cells" / "unfinished").exists()

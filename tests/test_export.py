@@ -15,7 +15,7 @@ from safetensors.numpy import load_file
 import mjx_dher
 from mjx_dher import RunSpec, cli, contract, envs
 from mjx_dher.policy import Policy
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.tools import export
 
 D, G, A = 7, 3, 4
@@ -150,8 +150,8 @@ def test_a_file_carries_what_a_robot_needs(name, tmp_path):
     started = RunSpec(env="my_arm:Reach", env_kwargs=("obs_noise=0.01",))
     path, out = tmp_path / "run", tmp_path / f"policy.{name}"
     run_folder.write_config(path, started, "native", {})
-    content = run_folder.read_config(path)
-    identity = run_folder.identity_of(content, run_folder.to_spec(path, content))
+    content = reading.read_config(path)
+    identity = reading.identity_of(content, reading.to_spec(path, content))
     run_folder.save_policy(path, random_policy(), identity, contract.robot_interface(env))
     assert mjx_dher.load_policy(path / "policy.npz").interface == contract.robot_interface(env)  # without the folder, too
     assert cli.main(["export", str(path), "--format", name, "--out", str(out)]) == 0
@@ -262,7 +262,7 @@ def test_a_file_that_is_not_the_policy_is_not_kept(run, tmp_path, monkeypatch, n
     to_bytes, read = export.FORMATS[name]
     out = tmp_path / f"policy.{name}"
     out.write_text("before")
-    policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
+    policy, started = mjx_dher.load_policy(run), reading.read_spec(run)
     spoiled = spoil(to_bytes, policy, export.metadata(policy, started))
     monkeypatch.setitem(export.FORMATS, name, (lambda policy, about: spoiled, read))
     with refuses(message):
@@ -313,7 +313,7 @@ def test_a_run_without_a_policy_is_refused(tmp_path, capsys):
 def test_a_folder_that_cannot_be_written_to_is_told(run, tmp_path):
     """A folder is where the unfinished file would be."""
     (tmp_path / "policy.onnx.partial").mkdir()
-    policy, started = mjx_dher.load_policy(run), run_folder.read_spec(run)
+    policy, started = mjx_dher.load_policy(run), reading.read_spec(run)
     with refuses("out", tmp_path / "policy.onnx"):
         export.write(policy, started, "onnx", tmp_path / "policy.onnx")
 

@@ -17,8 +17,8 @@ import pytest
 from conftest import ROOT
 
 from mjx_dher.cli import sentence
-from mjx_dher.runs.folder import checkpoint
-from mjx_dher.runs.folder.results import Claims
+from mjx_dher.runs.folder import checkpoint, restoring
+from mjx_dher.runs.folder.run_folder import Claims
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 
@@ -167,7 +167,7 @@ def test_arrays_of_every_kind_come_back_to_the_bit_and_zeros_take_no_space(tmp_p
     others = [np.zeros((0, 3)), np.array(-0.0, np.float32), np.array(True), np.frombuffer(b"abc", np.int8)]
     arrays = [ring, ring[::2], folded, half, np.zeros(1 << 22, np.float32), *others]
     checkpoint._write_arrays(tmp_path / "x", arrays)
-    read = checkpoint._read_arrays(tmp_path / "x", [str(array.dtype) for array in arrays])
+    read = restoring._read_arrays(tmp_path / "x", [str(array.dtype) for array in arrays])
     assert [(x.dtype, x.shape, x.tobytes()) for x in read] == [(x.dtype, x.shape, x.tobytes()) for x in arrays]
     assert sum(path.stat().st_blocks * 512 for path in tmp_path.rglob("*.npy")) < 4 << 20  # of 22 MB
 

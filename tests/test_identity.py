@@ -14,7 +14,7 @@ from test_driver import rows_of
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, cli, envs
-from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -78,10 +78,10 @@ def resume(folder, capsys, *flags):
 def test_all_files_of_a_run_carry_one_digest(made):
     digests = set()
     for folder in (made / "run", made / "whole"):
-        content, spec = run_folder.read_run(folder)
+        content, spec = reading.read_run(folder)
         assert spec == SPEC
-        digests |= {content["digest"], fingerprint.digest(run_folder.identity_of(content, spec))}
-        digests |= {row["digest"] for row in loggers.read_rows(folder / "metrics.csv")}
+        digests |= {content["digest"], fingerprint.digest(reading.identity_of(content, spec))}
+        digests |= {row["digest"] for row in results.read_rows(folder / "metrics.csv")}
         with np.load(folder / "policy.npz") as arrays:
             digests.add(fingerprint.digest(json.loads(arrays["settings"].tobytes())))
     digests.add(json.loads((made / "whole" / "result.json").read_text())["digest"])
@@ -131,7 +131,7 @@ def test_a_setting_that_was_edited_is_named_and_refused(stopped, whole, capsys):
         edit(stopped, path, value)
         edit(whole, path, value)
         with contextlib.suppress(FolderError):
-            if run_folder.read_spec(whole) == SPEC:  # it was the default, and so it is
+            if reading.read_spec(whole) == SPEC:  # it was the default, and so it is
                 continue
         status, text = resume(stopped, capsys)
         assert (status, name in text, "Traceback" in text) == (2, True, False), (value, text)
@@ -152,7 +152,7 @@ def test_more_steps_than_the_run_was_begun_with_are_taken_and_told(stopped, tmp_
     for folder, flags in ((stopped, ["--total-steps", "320"]), (edited, [])):
         status, text = resume(folder, capsys, *flags)
         assert (status, "total_steps was 240 and is 320" in text) == (0, True), text
-        assert run_folder.read_spec(folder) == longer
+        assert reading.read_spec(folder) == longer
         assert [row["epoch"] for row in rows_of(folder)] == [str(epoch) for epoch in range(1, 9)]
     train(tmp_path / "long", longer)
     without = lambda rows: [{name: x for name, x in row.items() if name != "digest"} for row in rows]  # noqa: E731
@@ -243,7 +243,7 @@ def test_a_damaged_checkpoint_costs_no_whole_one(stopped, keep, capsys):
     train(stopped, until=3, keep=keep)
     expected = ["epoch-000003"] if keep == 1 else ["epoch-000003", "epoch-000002"]
     assert [path.name for path in run_folder.checkpoints(stopped)] == expected
-    assert run_folder.read_manifest(run_folder.checkpoints(stopped)[0])["epoch"] == 3
+    assert reading.read_manifest(run_folder.checkpoints(stopped)[0])["epoch"] == 3
     assert older.exists() == (keep == 2)
 
 
@@ -253,7 +253,7 @@ def test_a_damaged_older_one_is_not_kept_for_a_whole_one(made, tmp_path):
     damage(newest)
     train(folder, until=5)
     assert [path.name for path in run_folder.checkpoints(folder)] == ["epoch-000005", "epoch-000004"]
-    assert [run_folder.read_manifest(path)["epoch"] for path in run_folder.checkpoints(folder)] == [5, 4]
+    assert [reading.read_manifest(path)["epoch"] for path in run_folder.checkpoints(folder)] == [5, 4]
     assert not older.exists()
 
 
@@ -320,4 +320,4 @@ def test_lanes_share_a_checkpoint_of_their_own_settings(tmp_path):
 def test_an_infinite_number_survives_config_json(tmp_path):
     spec = RunSpec(env="reach", hparams=HParams(her_k=math.inf))
     run_folder.write_config(tmp_path / "run", spec, "native", {})
-    assert run_folder.read_run(tmp_path / "run")[1] == spec
+    assert reading.read_run(tmp_path / "run")[1] == spec

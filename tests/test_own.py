@@ -14,7 +14,7 @@ import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.evaluate import play_policy
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, run_folder
 from point_mass import PointMass, soon
 
 TINY = """
@@ -137,7 +137,7 @@ def parts(folder):
 
 
 def test_every_part_of_a_run_can_be_one_s_own(parts):
-    found = run_folder.read_spec(parts)
+    found = reading.read_spec(parts)
     assert {part: getattr(found, part) for part in PARTS} == {part: f"my_tasks:{part}" for part in PARTS}
     assert found.sampler == "weighted"
     written = rows(parts)

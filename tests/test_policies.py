@@ -15,7 +15,7 @@ from mjx_dher import cli
 from mjx_dher.cli import common
 from mjx_dher.cli.train import parse_train_args
 from mjx_dher.policy import bundled
-from mjx_dher.runs.folder import results, run_folder
+from mjx_dher.runs.folder import reading, results
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools.transfer import ORIGINALS
@@ -39,7 +39,7 @@ def test_the_tasks_have_policies():
 def test_a_policy_is_a_whole_run_with_a_card(name):
     folder = bundled.FOLDER / name
     assert results.result_problem(folder) is None
-    assert run_folder.read_spec(folder).env == name
+    assert reading.read_spec(folder).env == name
     assert (folder / "README.md").read_text() == PUBLISH["card"](folder)
     here = facts_of(name)["here"]
     assert here["success_low"] <= here["success_rate"] <= here["success_high"]
@@ -48,7 +48,7 @@ def test_a_policy_is_a_whole_run_with_a_card(name):
 
 @pytest.mark.parametrize("name", bundled.names())
 def test_the_command_on_a_card_describes_the_run(name):
-    run = run_folder.read_spec(bundled.FOLDER / name)
+    run = reading.read_spec(bundled.FOLDER / name)
     arguments = PUBLISH["command"](run)
     assert f"python train.py {' '.join(arguments)}\n" in (bundled.FOLDER / name / "README.md").read_text()
     assert parse_train_args(arguments).spec == run
@@ -195,7 +195,7 @@ def test_a_run_that_is_not_whole_is_not_published(damage, message, tmp_path):
     shutil.copytree(bundled.FOLDER / "reach", tmp_path / "run")
     damage(tmp_path / "run")
     with refuses(message):
-        PUBLISH["check"](tmp_path / "run", run_folder.read_spec(bundled.FOLDER / "reach"))
+        PUBLISH["check"](tmp_path / "run", reading.read_spec(bundled.FOLDER / "reach"))
 
 
 def edit(path, **changes):
@@ -205,6 +205,6 @@ def edit(path, **changes):
 def test_its_actions_are_those_of_the_run_that_it_is_of():
     """The array of settings in the policy is that of its config.json: files of two runs were not mixed up."""
     for name in bundled.names():
-        assert run_folder.edited(bundled.FOLDER / name, *run_folder.read_run(bundled.FOLDER / name)) == {}
+        assert reading.edited(bundled.FOLDER / name, *reading.read_run(bundled.FOLDER / name)) == {}
         with np.load(bundled.FOLDER / name / "policy.npz", allow_pickle=False) as arrays:
             assert json.loads(arrays["settings"].tobytes())["env"] == name

@@ -12,7 +12,7 @@ from conftest import ROOT, refuses, save_policy
 import mjx_dher
 from mjx_dher import RunSpec, learners
 from mjx_dher.config import Config, HParams
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.system.files import FolderError
 from probes import spec_of
 
@@ -64,8 +64,8 @@ def test_the_loaded_policy_acts_as_the_learner_does(run_dir, learner):
 
 
 def test_a_description_comes_back_as_it_was(run_dir):
-    assert run_folder.read_spec(run_dir) == SPEC
-    content = run_folder.read_config(run_dir)
+    assert reading.read_spec(run_dir) == SPEC
+    content = reading.read_config(run_dir)
     assert (content["engine"], content["physics"], content["note"]) == ("native", "native", "for the reader")
 
 

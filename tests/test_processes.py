@@ -14,7 +14,7 @@ from conftest import ROOT, free_port
 
 from mjx_dher.cli import main
 from mjx_dher.parallel import processes
-from mjx_dher.runs.folder import loggers
+from mjx_dher.runs.folder import results
 
 TALK = """
 import os, jax, numpy as np, psutil
@@ -133,7 +133,7 @@ def both(*arguments):
 
 
 def rows_of(folder):
-    return loggers.read_rows(folder / "metrics.csv")
+    return results.read_rows(folder / "metrics.csv")
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ import mjx_dher
 from mjx_dher import Options, cli
 from mjx_dher.cli import sweep
 from mjx_dher.cli import train as train_module
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import curves
@@ -143,7 +143,7 @@ def test_contents_of_a_wrong_type_or_range_are_named(made, tmp_path, file, path,
 def test_digests_from_before_a_resume_are_kept(stopped):
     """Lines of each digest that a run has had are its own, in this order."""
     train(stopped, LONGER)
-    assert run_folder.digests(run_folder.read_config(stopped)) == [digest_of(SPEC), digest_of(LONGER)]
+    assert reading.digests(reading.read_config(stopped)) == [digest_of(SPEC), digest_of(LONGER)]
     assert [row["digest"] for row in results.read_metrics(stopped)] == 4 * [digest_of(SPEC)] + 4 * [digest_of(LONGER)]
     assert results.result_problem(stopped) is None
     assert results.earlier_digests(stopped, digest_of(SPEC)) == [digest_of(SPEC), digest_of(LONGER)]
@@ -211,13 +211,13 @@ def test_a_sweep_starts_runs_over_whose_metrics_are_of_another(tmp_path):
     shutil.copy(other / "metrics.csv", one / "metrics.csv")
     told = []
     run_sweep(tmp_path, trials, lanes=2, report=told.append)
-    digest = run_folder.read_config(other)["digest"]
+    digest = reading.read_config(other)["digest"]
     assert any("metrics.csv" in line and digest in line for line in told)
     assert [grid.is_done(tmp_path, trial) for trial in trials] == [True, True]
 
 
 def test_other_versions_than_the_run_began_with_are_reported(stopped, monkeypatch, capsys):
-    content = run_folder.read_config(stopped)
+    content = reading.read_config(stopped)
     edit(stopped, ("versions", "jax"), "0.0.1")
     monkeypatch.setattr(train_module, "_train", lambda *arguments: 0)
     assert resume(stopped, capsys)[1].count(f"jax was 0.0.1 and is {content['versions']['jax']}") == 1
@@ -234,13 +234,13 @@ def test_flags_of_jax_that_change_numbers_are_part_of_a_run(stopped, made, monke
     status, text = resume(stopped, capsys)
     assert (status, "JAX_ENABLE_X64 was 0 and is 1" in text, "compiling" in text) == (2, True, False)
     train(stopped.with_name("new"), until=2)
-    assert run_folder.read_config(stopped.with_name("new"))["jax_flags"] == {"JAX_ENABLE_X64": 1}
+    assert reading.read_config(stopped.with_name("new"))["jax_flags"] == {"JAX_ENABLE_X64": 1}
     assert cli.main(["eval", str(made / "mine" / "whole"), "--episodes", "4"]) == 0
     assert "JAX_ENABLE_X64 was 0 and is 1" in capsys.readouterr().out
     monkeypatch.undo()
-    run_folder.read_run(stopped.with_name("new"))
+    reading.read_run(stopped.with_name("new"))
     with refuses("JAX_ENABLE_X64", 1, 0, error=FolderError):
-        run_folder.check_same(stopped.with_name("new"), SPEC)
+        reading.check_same(stopped.with_name("new"), SPEC)
 
 
 def test_flags_are_the_same_before_jax_is_imported_and_after():

@@ -21,7 +21,7 @@ from mjx_dher.cli import train
 from mjx_dher.cli.output import PlainConsole, printable
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy.numpy_policy import Policy
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import to_arguments, to_texts, validate
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -57,7 +57,7 @@ def write(folder, spec, physics="none"):
 
 def settings_of(folder):
     """The array of a policy that says which run it is of."""
-    identity = run_folder.identity_of(*run_folder.read_run(folder))
+    identity = reading.identity_of(*reading.read_run(folder))
     return np.frombuffer(json.dumps(identity).encode(), np.uint8)
 
 
@@ -152,7 +152,7 @@ def test_the_same_name_with_other_arguments_or_of_another_file_is_not_trusted(he
     (here / "point_mass.py").write_text("raise SystemExit('another module')")
     monkeypatch.syspath_prepend(str(here))
     monkeypatch.delitem(sys.modules, "point_mass")
-    spec = run_folder.read_spec(here / "received")
+    spec = reading.read_spec(here / "received")
     with refuses("env", "point_mass:PointMass", here / "point_mass.py"):
         import_paths.load("env", spec.env)
 
@@ -199,8 +199,8 @@ def test_demonstrations_that_a_file_names_are_not_read(here, received):
     received(spec)
     validate(spec)
     with refuses("demonstrations", here / "secret.npz", "--trust"):
-        validate(run_folder.read_spec(here / "received"))
-    validate(run_folder.read_spec(here / "received", trusted=True))
+        validate(reading.read_spec(here / "received"))
+    validate(reading.read_spec(here / "received", trusted=True))
 
 
 @pytest.mark.parametrize(

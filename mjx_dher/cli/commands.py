@@ -15,7 +15,7 @@ Args = TypeVar("Args")
 # Function (argv, console) -> exit status of each command. Its module also has the class of its arguments, such as EvalArgs.
 COMMANDS = {
     "train": "mjx_dher.cli.train:train_command",
-    "resume": "mjx_dher.cli.train:resume_command",
+    "resume": "mjx_dher.cli.resume:resume_command",
     "eval": "mjx_dher.cli.policies:eval_command",
     "render": "mjx_dher.cli.policies:render_command",
     "view": "mjx_dher.cli.view:view_command",

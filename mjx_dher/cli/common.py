@@ -23,7 +23,7 @@ from typing_extensions import Doc
 from mjx_dher import __version__, envs
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.lookup import check_name
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
 from mjx_dher.validation import check_count, check_number
 
@@ -127,8 +127,10 @@ def read_run(path: Path, console: Console) -> RunSpec:
     """Reads the description of the run in `path`, and prints which custom source files have changed since. Raises FolderError
     if it is not a run folder, or it is damaged.
     """
-    content, spec = run_folder.read_run(path)
-    for text in run_folder.changed_code(content, spec):
+    from mjx_dher.runs.folder import reading
+
+    content, spec = reading.read_run(path)
+    for text in reading.changed_code(content, spec):
         console.print(f"since {path} was trained: {text}")
     return spec
 

@@ -15,7 +15,7 @@ from mjx_dher.fleet import chunks, cluster, driver, worker
 from mjx_dher.fleet.chunks import LOCAL, Chunk, FleetOptions
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.runs.folder import fingerprint, run_folder
-from mjx_dher.runs.folder.results import Claims
+from mjx_dher.runs.folder.run_folder import Claims
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid

@@ -17,7 +17,7 @@ from mjx_dher.cli.commands import parse
 from mjx_dher.cli.common import EnvKwargs, Physics, Trust
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.policy import bundled
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.caches import check_platform, keep_compiled_programs
 
@@ -246,7 +246,7 @@ def export_command(argv: list[str], console: Console) -> int:
     args = parse(ExportArgs, argv)
     lookup.check_name("format", args.format, export.FORMATS)
     folder = common.find_run(args.run, console)
-    content, run = run_folder.read_run(folder)
+    content, run = reading.read_run(folder)
     beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside
     export.check(args.format, out, args.overwrite)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import tempfile
@@ -12,7 +11,7 @@ from typing import Any
 
 from mjx_dher import config as config_lib
 from mjx_dher.config import Config
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, run_folder
 from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
@@ -26,13 +25,13 @@ def load(path: Path) -> tuple[RunSpec, Options, list[str]]:
     """
     file = path / run_folder.CONFIG_FILE if path.is_dir() else path
     try:
-        content = run_folder.read_config_file(file)
+        content = reading.read_config_file(file)
     except FileNotFoundError:
         raise FolderError(f"config: there is no file {file}") from None
-    run = run_folder.to_spec(file, content)
+    run = reading.to_spec(file, content)
     options = options_of(content)
     options.check()
-    return run, options, [_origin(file, content, run), *run_folder.changed_code(content, run)]
+    return run, options, [_origin(file, content, run), *reading.changed_code(content, run)]
 
 
 def options_of(content: dict[str, Any]) -> Options:
@@ -45,7 +44,7 @@ def options_of(content: dict[str, Any]) -> Options:
 def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     """Origin of settings: the run, the version that wrote them, and whether they were edited since."""
     version = content.get("versions", {}).get("mjx_dher", "unknown")
-    now = fingerprint.digest(run_folder.identity_of(content, run))
+    now = fingerprint.digest(reading.identity_of(content, run))
     edited = "; edited since" if content["digest"] != now else ""
     lacking = fingerprint.settings(run).keys() - {*content, *content["config"], *content["hparams"]} if edited else ()
     if lacking:
@@ -54,14 +53,6 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
         f" {content['physics']}{edited}"
     )
-
-
-def without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
-    """Run with the values of `base` for settings that its components do not read, and lines about ignored settings."""
-    kept = fingerprint.with_unread_of(base, run)
-    old, new = fingerprint.settings(kept), fingerprint.settings(run)
-    ignored = [f"{name} {text(new[name])}" for name in new if new[name] != old[name]]
-    return kept, [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []
 
 
 def changes(before: RunSpec, now: RunSpec) -> str:
@@ -125,16 +116,3 @@ def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
         f" the compiled program needs more; {free} is free",
         f"physics {run_folder.engine_name(env)}, learner on {jax.devices()[0].device_kind}",
     ]
-
-
-def claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:
-    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run. Raises FolderError if it
-    holds something else, or the run has ended.
-    """
-    if not resumes or out is None or not (out / run_folder.CONFIG_FILE).exists():
-        return stack.enter_context(run_folder.claim_new(out, spec))
-    stack.enter_context(files.lock(out))
-    run_folder.check_same(out, spec)
-    if results.has_result(out) and results.read_result(out)["status"] != run_folder.FAILED:
-        raise FolderError(f"out: {out} holds this run, and it has ended")
-    return out

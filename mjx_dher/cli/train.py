@@ -1,4 +1,4 @@
-"""The commands `train` and `resume`."""
+"""The command `train`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs, lookup, presets, spec
-from mjx_dher.cli import common, settings
+from mjx_dher import lookup, presets, spec
+from mjx_dher.cli import common
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import VIEW_PORT, Devices, Physics, Screen, Trust, make_env, settle_compiler
+from mjx_dher.cli.common import VIEW_PORT, Devices, Screen, make_env, settle_compiler
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, to_texts
 from mjx_dher.system import files, signals
@@ -65,27 +65,6 @@ class TrainArgs:
     options: Options = dataclasses.field(default_factory=Options)
 
 
-@dataclasses.dataclass(frozen=True)
-class ResumeArgs:
-    """Resume a run that was stopped or killed, from its newest undamaged checkpoint.
-
-    On a CPU with the same engine, the result is bit-identical to an uninterrupted run. A finished run can resume with a larger
-    --total-steps if it was trained with --keep-end. Options default to their last values.
-    """
-
-    run: tyro.conf.Positional[Path]
-    """Run folder."""
-    engine: Physics = None
-    trust: Trust = False
-    distributed: bool = False
-    """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
-    total_steps: int | None = None
-    """Environment steps of the whole run, including earlier ones. Default: as before."""
-    curve: bool = True
-    """Picture of the learning curve, curve.png, at the end, where Matplotlib is installed (extra plot)."""
-    options: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-
-
 def train_command(argv: list[str], console: Console) -> int:
     """Trains a policy and writes a run folder."""
     args = parse_train_args(argv, console.print)
@@ -99,12 +78,12 @@ def train_command(argv: list[str], console: Console) -> int:
     from mjx_dher.parallel import processes
 
     with contextlib.ExitStack() as stack:
-        folder = Path(processes.broadcast(lambda: str(settings.claim(stack, args.out, args.spec, resumes=args.distributed))))
+        folder = Path(processes.broadcast(lambda: str(_claim(stack, args.out, args.spec, resumes=args.distributed))))
         prepare()
         env = make_env(args.spec)
         common.try_components([args.spec], screen, env)
         after_epoch = stack.enter_context(viewer(folder, screen)) if viewer and processes.leads() else lambda: None
-        return _train(env, args.spec, folder, args.options, args.curve, screen, args.devices, after_epoch)
+        return train_into(env, args.spec, folder, args.options, args.curve, screen, args.devices, after_epoch)
 
 
 def _viewer(port: int) -> Callable[[Path, Console], contextlib.AbstractContextManager[Callable[[], None]]]:
@@ -118,6 +97,8 @@ def _viewer(port: int) -> Callable[[Path, Console], contextlib.AbstractContextMa
 
 def _dry_run(args: TrainArgs, console: Console) -> int:
     """Prints what would be trained. Makes the environment, but compiles and writes nothing."""
+    from mjx_dher.cli import settings
+
     settings.check_out(args.out)
     settle_compiler(args.spec.engine)
     check_platform()
@@ -129,78 +110,6 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     for line in (amount, *memory, "one program to train, one for the last evaluation; nothing was written"):
         console.print(line)
     return 0
-
-
-def resume_command(argv: list[str], console: Console) -> int:
-    """Resumes a run."""
-    asked = parse(ResumeArgs, argv)  # to find the run
-    content = run_folder.read_config(asked.run)
-    args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
-    common.check_engine(args.engine)
-    settle_compiler(args.engine or content["physics"])
-    described = {name: str(value) for name, value in vars(args).items()} | {"digest": content["digest"]}
-    screen = common.join(args.distributed, described, console)
-    from mjx_dher.parallel import processes
-
-    with contextlib.ExitStack() as stack:
-        processes.broadcast(lambda: stack.enter_context(files.lock(args.run)))
-        run, options = _to_resume(args, asked.options.stop_at, content, screen)
-        prepare()
-        env = make_env(run, args.engine or (content["physics"] if envs.takes_engine(run.env) else None))
-        return _train(env, run, args.run, options, args.curve, screen, content.get("devices", 1))
-
-
-def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:
-    """The run in a locked folder and its options, with the changes of the command line.
-
-    `stop_at` is the command line's. A reached value does not stop the run again unless it is passed again. Raises FolderError
-    if the run has ended, has no checkpoint, or its settings were edited.
-    """
-    run, options = run_folder.to_spec(args.run, content), args.options
-    edits = run_folder.edited(args.run, content, run)
-    if refused := [text for name, text in edits.items() if name not in fingerprint.MAY_CHANGE]:
-        raise FolderError(
-            f"{args.run / run_folder.CONFIG_FILE} was edited, but a run resumes with its original settings:"
-            f" {'; '.join(refused)}"
-        )
-    run_folder.check_written(args.run, content, run)
-    if args.total_steps is not None:
-        run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
-    spec.validate(run)
-    options.check()
-    if results.has_result(args.run) and (result := results.read_result(args.run))["status"] != run_folder.FAILED:
-        _check_ended(args, run, stop_at, result)
-        options = dataclasses.replace(options, stop_at=stop_at)
-    run_folder.checkpoints_to_resume(args.run)
-    if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
-        console.print(
-            f"learning rates fall to {run.hparams.lr_end:g} of their start over the whole run. Its length has changed: they"
-            " continue from their value at this point of a run of the new length"
-        )
-    for text in run_folder.changed_versions(content):
-        console.print(f"since {args.run} began: {text}")
-    told = "; ".join(f"{name} {fingerprint.text(value)}" for name, value in vars(options).items())
-    console.print(f"resuming {args.run}: total_steps {run.config.total_steps}; {told}")
-    return run, options
-
-
-def _check_ended(args: ResumeArgs, run: RunSpec, stop_at: float | None, result: dict[str, Any]) -> None:
-    """Raises FolderError if an ended run cannot resume."""
-    if not run_folder.checkpoints(args.run):
-        raise FolderError(
-            f"{args.run} has ended; there is nothing to resume: --keep-end would have kept its last checkpoint."
-            f" `{lookup.command_name()} --config {args.run} --total-steps N` trains a longer one from the start"
-        )
-    if not results.can_go_on(args.run, run.config.total_steps):
-        raise FolderError(
-            f"{args.run} has ended after {result['env_steps']:,} environment steps; total_steps must be larger to resume it;"
-            f" got {run.config.total_steps}"
-        )
-    if args.total_steps is None and stop_at is None:
-        raise FolderError(
-            f"{args.run} has ended after {result['env_steps']:,} environment steps, at its stop_at {args.options.stop_at}:"
-            " pass --total-steps, or another --stop-at, to resume"
-        )
 
 
 def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda text: None) -> TrainArgs:
@@ -218,12 +127,14 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
     if chosen.config is not None:
         if chosen.preset != "auto":
             raise ValueError("config and preset cannot be combined; pass one of them")
+        from mjx_dher.cli import settings
+
         base, options, notes = settings.load(chosen.config)
         args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
         run = args.spec
         if run.env == base.env:
             run = dataclasses.replace(run, env_kwargs=to_texts({**base.env_arguments, **run.env_arguments}))
-        run, ignored = settings.without_unread(base, run)
+        run, ignored = _without_unread(base, run)
         for line in (*notes, settings.changes(base, run), *ignored):
             report(line)
         return dataclasses.replace(args, spec=run)
@@ -231,7 +142,7 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
     def parse_preset(preset: Any) -> tuple[TrainArgs, list[str]]:
         base = presets.preset(preset, chosen.env, chosen.learner)
         args = _parse(argv, TrainArgs(base), f"those of preset {preset} for {chosen.env}")
-        run, ignored = settings.without_unread(base, args.spec)
+        run, ignored = _without_unread(base, args.spec)
         return dataclasses.replace(args, spec=run, preset=preset), ignored
 
     # Finding the machine's preset starts CUDA, so invalid arguments are rejected before, except with --help.
@@ -255,7 +166,30 @@ def _check_out(args: TrainArgs) -> None:
         raise ValueError("out must name the run folder with --distributed, so that the same command can resume it; got none")
 
 
-def _train(
+def _without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
+    """Run with the values of `base` for settings that its components do not read, and lines about ignored settings."""
+    kept = fingerprint.with_unread_of(base, run)
+    old, new = fingerprint.settings(kept), fingerprint.settings(run)
+    ignored = [f"{name} {fingerprint.text(new[name])}" for name in new if new[name] != old[name]]
+    return kept, [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []
+
+
+def _claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:
+    """Locks a run's folder in `stack`: a new one, or if the command `resumes`, one with the same run. Raises FolderError if it
+    holds something else, or the run has ended.
+    """
+    if not resumes or out is None or not (out / run_folder.CONFIG_FILE).exists():
+        return stack.enter_context(run_folder.claim_new(out, spec))
+    from mjx_dher.runs.folder import reading, results
+
+    stack.enter_context(files.lock(out))
+    reading.check_same(out, spec)
+    if results.has_result(out) and results.read_result(out)["status"] != run_folder.FAILED:
+        raise FolderError(f"out: {out} holds this run, and it has ended")
+    return out
+
+
+def train_into(
     env: Any,
     run: RunSpec,
     folder: Path,
@@ -270,8 +204,11 @@ def _train(
     from mjx_dher.runs import driver
 
     console.print(f"{run.env}, sampler {run.sampler}, seed {run.seed}; writing to {folder}")
-    begun = (folder / run_folder.CONFIG_FILE).exists()
-    before = [row["success_rate"] for row in results.read_metrics(folder)] if begun else []
+    before: list[float] = []
+    if (folder / run_folder.CONFIG_FILE).exists():
+        from mjx_dher.runs.folder import results
+
+        before = [row["success_rate"] for row in results.read_metrics(folder)]
     screen = Screen(console, [run], before)
     curve = curve and processes.leads()
 
@@ -306,7 +243,7 @@ def _train(
     signals.forget()
     if result.status == run_folder.FAILED:
         _draw(folder, curve, console)
-        raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {results.last_checkpoint(folder)}")
+        raise ValueError(f"epoch {result.epoch}: {result.content['reason']}; {run_folder.last_checkpoint(folder)}")
     common.print_summary(result.content, console)
     console.print(f"run folder: {folder}")
     _draw(folder, curve, console)
@@ -317,6 +254,7 @@ def _draw(folder: Path, curve: bool, console: Console) -> None:
     """Draws the curve of an ended run, or reports that it cannot be drawn."""
     if not curve:
         return
+    from mjx_dher.runs.folder import results
     from mjx_dher.tools import curves, figures
 
     if not (figures.is_there() and results.read_metrics(folder)):

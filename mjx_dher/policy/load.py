@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher.policy import Policy, TrainedPolicy, bundled, from_arrays
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.system import npz
 from mjx_dher.system.files import FolderError
 
@@ -39,12 +39,12 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     run_dir = bundled.find(run_dir)
     folder = None if run_dir.is_file() else run_dir
     path = run_dir if folder is None else run_dir / run_folder.POLICY_FILE
-    content, spec = run_folder.read_run(folder, trust) if folder else ({}, None)
+    content, spec = reading.read_run(folder, trust) if folder else ({}, None)
     if not path.is_file():
         raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")
-    with run_folder.checked(path, "is damaged or not a policy of this program"):
-        arrays: dict[str, Any] = npz.read(path, ratio=run_folder.POLICY_RATIO)
-        if spec and (other := run_folder.foreign(content, spec, run_folder.policy_settings(arrays))):
+    with reading.checked(path, "is damaged or not a policy of this program"):
+        arrays: dict[str, Any] = npz.read(path, ratio=reading.POLICY_RATIO)
+        if spec and (other := reading.foreign(content, spec, reading.policy_settings(arrays))):
             raise FolderError(f"{path} belongs to a run with other settings: {other}")
         if not {"env_spec", "sizes"} & arrays.keys():
             return from_arrays(arrays)
@@ -54,7 +54,7 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
         raise ValueError(f"{use} needs a policy of NumPy arrays; {spec.learner!r} with networks {spec.networks!r} has none")
     from mjx_dher.policy.learner_policy import from_arrays as from_state
 
-    with run_folder.checked(path, "cannot be played"):
+    with reading.checked(path, "cannot be played"):
         return from_state(arrays, spec)
 
 

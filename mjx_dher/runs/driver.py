@@ -21,11 +21,10 @@ from mjx_dher import spec as spec_lib
 from mjx_dher.contract import robot_interface
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import diagnostics
-from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
 from mjx_dher.runs.folder.loggers import Sink
-from mjx_dher.runs.folder.results import Claims, Run, named
-from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
+from mjx_dher.runs.folder.run_folder import FAILED, FINISHED, Claims, Run, named
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program import program as program_lib
@@ -177,8 +176,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = zip(ended, specs, folders, runs) if processes.leads() else ()
         logs = [_open(stack, session, program.lanes, *run) for run in own]
-        earlier = processes.broadcast(lambda: results.read_metrics(folders[0]))
-        success = [row["success_rate"] for row in earlier]  # for stop_at, which needs a single run
+        success = processes.broadcast(lambda: _success_rates(folders[0], start.epoch))  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
         for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
@@ -211,6 +209,15 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     return ended_runs
 
 
+def _success_rates(folder: Path, ended: int) -> list[float]:
+    """Success rates of the epochs that ended before the run resumed."""
+    if not ended:
+        return []
+    from mjx_dher.runs.folder import results
+
+    return [row["success_rate"] for row in results.read_metrics(folder)]
+
+
 def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
     """Raises ValueError if all epochs of `total_steps` have ended."""
     if start.epoch >= num_epochs:
@@ -227,8 +234,11 @@ def _open(
 
     `ended` is the number of epochs in its metrics.
     """
-    digest = fingerprint.digest(run)
-    earlier = results.earlier_digests(folder, digest) if ended else []
+    digest, earlier = fingerprint.digest(run), []
+    if ended:
+        from mjx_dher.runs.folder import results
+
+        earlier = results.earlier_digests(folder, digest)
     placed = {"lanes": lanes} if session.devices == 1 else {"lanes": lanes, "devices": session.devices}
     extra = {**dataclasses.asdict(session.options), **placed, "interface": robot_interface(session.env)}
     run_folder.write_config(folder, spec, run["physics"], extra, earlier, resumes=ended > 0)

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
 
@@ -57,7 +57,7 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
     told: dict[str, int] = {}
     for path in sorted((sweep / CELLS).glob(f"*/{run_folder.CONFIG_FILE}")):
         try:
-            content = run_folder.read_config(path.parent)
+            content = reading.read_config(path.parent)
         except FolderError:
             continue  # reported when its result is read
         for (field, value), source in now.items():

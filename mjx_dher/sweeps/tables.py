@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, reading, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.sweeps.grid import CELLS
 from mjx_dher.system import files
@@ -39,7 +39,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
 def _read_trial(path: Path) -> dict[str, Any]:
     if (problem := results.result_problem(path)) is not None:
         raise FolderError(f"{problem}; run the sweep's command to train it again, or remove the folder")
-    result, (content, spec) = results.read_result(path), run_folder.read_run(path)
+    result, (content, spec) = results.read_result(path), reading.read_run(path)
     failed = result["status"] == FAILED
     flags = [f"{name} {value}" for name, value in content.get("jax_flags", {}).items()]
     try:

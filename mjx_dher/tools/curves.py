@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher.rates import wilson_interval
-from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
@@ -47,7 +47,7 @@ def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
     """Reads the curve of the run in `folder`, finished or not. Raises FolderError if it is not a run folder, it is damaged, or
     no epoch has ended and `allow_empty` is False.
     """
-    content, spec = run_folder.read_run(folder)
+    content, spec = reading.read_run(folder)
     result: dict[str, Any] = {}
     if results.has_result(folder):
         if (problem := results.result_problem(folder, with_policy=False)) is not None:

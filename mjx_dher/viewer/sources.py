@@ -13,7 +13,7 @@ import numpy as np
 
 from mjx_dher.components import is_hand
 from mjx_dher.policy import bundled, load
-from mjx_dher.runs.folder import checkpoint, results, run_folder
+from mjx_dher.runs.folder import reading, restoring, results, run_folder
 from mjx_dher.runs.program import loop, program
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
 from mjx_dher.system.files import FolderError
@@ -45,7 +45,7 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
     Raises FolderError if it is not a run folder, or has no policy, and ValueError if the policy is of another Shadow-hand task,
     whose observations and goals have the same sizes.
     """
-    run = run_folder.read_spec(folder)
+    run = reading.read_spec(folder)
     if env not in (None, run.env) and is_hand(env) and is_hand(run.env):
         raise ValueError(f"{label} is a policy of {run.env} and cannot be played in {env}, which looks alike")
     if not (folder / run_folder.POLICY_FILE).is_file():
@@ -164,7 +164,7 @@ def load_critic(folder: Path, run: RunSpec, env: Env) -> Critic:
     learner: Any = train.learner
     if not callable(getattr(learner, "value", None)):
         raise FolderError(f"learner {run.learner!r} has no method value")
-    restored = checkpoint.restore(folder, loop.state_template(train))
+    restored = restoring.restore(folder, loop.state_template(train))
     state = restored.state.learner
 
     @jax.jit

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.validation import check_number
 
 # A form is a type, a pattern for a string, (kind, interval) of a number, [form] for a list, or a dict of forms by key. The key
 # "*" means all keys, and a key that ends in "?" may be missing.
 Form = Any
 
-FINISHED, FAILED = "finished", "failed"  # statuses in result.json
+
 _DIGEST = "[0-9a-f]{10}"
 _COUNT, _LANES = (int, "[0, 9000000000000000000]"), (int, "[1, 1000000]")
 _SHARE, _AMOUNT = (float, "[0, 1]"), (float, "[0, inf]")

@@ -9,18 +9,20 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from mjx_dher.parallel import processes
-from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, results, run_folder
-from mjx_dher.runs.folder.checkpoint import Restored
+from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
 from mjx_dher.runs.program.loop import Progress, Start
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 from mjx_dher.trainer import TrainState
+
+if TYPE_CHECKING:
+    from mjx_dher.runs.folder.restoring import Restored
 
 NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
 SECONDS_TO_FIRST, SECONDS_BETWEEN = 120.0, 600.0  # checkpoints by the clock
@@ -96,9 +98,11 @@ class LaneCheckpoints:
 
     def _read(self, template: TrainState) -> Restored:
         """Reads the newest undamaged checkpoint. Raises FolderError in all processes if one of them cannot read it."""
+        from mjx_dher.runs.folder import restoring, results
+
         problem: FolderError | None = None
         try:
-            restored = checkpoint.restore(self.folder, template, [len(results.read_metrics(folder)) for folder in self.folders])
+            restored = restoring.restore(self.folder, template, [len(results.read_metrics(folder)) for folder in self.folders])
         except FolderError as error:
             problem = error
         if processes.any_process(problem is not None):
@@ -114,10 +118,12 @@ class LaneCheckpoints:
         """Reports changes of settings since the checkpoint. Raises FolderError for settings that must not change."""
         if len(restored.runs) != len(self.runs):
             raise FolderError(f"{restored.path} has {len(restored.runs)} runs, not {len(self.runs)}")
+        from mjx_dher.runs.folder import reading
+
         changed: dict[str, str] = {}
         for folder, before, now in zip(self.folders, restored.runs, self.runs):
-            content = run_folder.read_config(folder)
-            if other := run_folder.foreign(content, run_folder.to_spec(folder, content), before):
+            content = reading.read_config(folder)
+            if other := reading.foreign(content, reading.to_spec(folder, content), before):
                 raise FolderError(f"{restored.path} is of a run with other settings: {other}")
             changed |= fingerprint.differences(before, now)
         if refused := [text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import math
 import os
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mjx_dher.lookup import check_name, require_extra
-from mjx_dher.runs.folder import contents, fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, memory
 from mjx_dher.system.files import FolderError
@@ -42,9 +41,13 @@ class CsvSink:
     def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
         self._writer: csv.DictWriter[str] | None = None
         self._digest = digest
-        if epochs and (whole := len(read_rows(path))) < epochs:
-            raise FolderError(f"{path} is damaged: {epochs} epochs had ended, but it has complete lines of only {whole}")
-        kept = _whole_lines(path)[: 1 + epochs] if epochs else []
+        kept: list[str] = []
+        if epochs:
+            from mjx_dher.runs.folder import results
+
+            if (whole := len(results.read_rows(path))) < epochs:
+                raise FolderError(f"{path} is damaged: {epochs} epochs had ended, but it has complete lines of only {whole}")
+            kept = results.whole_lines(path)[: 1 + epochs]
         files.write(path, "".join(kept).encode())
         self._file = path.open("a", newline="", encoding="utf-8")
         if kept:
@@ -72,6 +75,8 @@ class JsonlSink:
     """
 
     def __init__(self, path: Path, epochs: int = 0):
+        from mjx_dher.runs.folder.results import read_rows
+
         whole = files.whole_lines(path)[:epochs]
         missing = read_rows(path.with_name(METRICS_FILE))[len(whole) : epochs] if epochs else []
         files.write(path, "".join([*whole, *map(_to_json, missing)]).encode())
@@ -83,44 +88,6 @@ class JsonlSink:
 
     def close(self) -> None:
         self._file.close()
-
-
-def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str, Any]]:
-    """Reads the lines of a metrics.csv as numbers, up to the first truncated one. The digest stays text.
-
-    `digests` are those that the run has had, in order. Raises FolderError if a line is missing, has an invalid value, or
-    belongs to another run.
-    """
-    head, *lines = list(csv.reader(_whole_lines(path))) or [[]]
-    rows: list[dict[str, Any]] = []
-    left = list(digests or ())
-    for number, line in enumerate(lines, 1):
-        with run_folder.checked(path, f"has an invalid line of epoch {number}"):
-            row: dict[str, Any] = {name: x if name == DIGEST else _to_number(name, x) for name, x in zip(head, line)}
-            contents.check({x: v for x, v in row.items() if v == v or x in FIRST_COLUMNS}, contents.ROW)  # noqa: PLR0124
-            if row["epoch"] != number or (rows and row["env_steps"] <= rows[-1]["env_steps"]):
-                raise ValueError(f"epoch {row['epoch']} with env_steps {row['env_steps']} does not follow")
-            while left and left[0] != row.get(DIGEST):
-                del left[0]
-            if digests is not None and not left:
-                raise ValueError(f"its digest {row.get(DIGEST)} belongs to another run; this one has {', '.join(digests)}")
-        rows.append(row)
-    return rows
-
-
-def _whole_lines(path: Path) -> list[str]:
-    """Head of metrics.csv, and its lines up to the first truncated one."""
-    head, *lines = files.whole_lines(path) or [""]
-    if not head.startswith(",".join(FIRST_COLUMNS) + ","):
-        return []
-    return [head, *itertools.takewhile(lambda line: line.count(",") == head.count(","), lines)]
-
-
-def _to_number(name: str, text: str) -> int | float:
-    try:
-        return int(text) if text.isdecimal() else float(text)
-    except ValueError:
-        raise ValueError(f"{name} must be a number; got {text[:40]!r}") from None
 
 
 def _to_json(row: dict[str, Any]) -> str:
@@ -159,12 +126,15 @@ class WandbSink:
     The run folder holds offline logs, and a resumed run continues the same W&B run.
     """
 
-    def __init__(self, folder: Path, content: dict[str, Any]):
+    def __init__(self, folder: Path):
         import wandb
 
-        run = run_folder.to_spec(folder, content)
+        from mjx_dher.runs.folder import reading
+
+        content = reading.read_config(folder)
+        run = reading.to_spec(folder, content)
         # A resumed run keeps its id, which therefore excludes settings that may change.
-        described = {name: x for name, x in run_folder.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
+        described = {name: x for name, x in reading.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
             name=folder.absolute().name,
@@ -200,7 +170,7 @@ def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: in
     makers: dict[str, Callable[[], Sink]] = {
         "jsonl": lambda: JsonlSink(folder / JSON_FILE, epochs),
         "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
-        "wandb": lambda: WandbSink(folder, run_folder.read_config(folder)),
+        "wandb": lambda: WandbSink(folder),
     }
     return [CsvSink(folder / METRICS_FILE, epochs, digest), *(makers[log]() for log in dict.fromkeys(logs))]
 

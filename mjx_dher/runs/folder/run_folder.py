@@ -1,4 +1,4 @@
-"""A run on disk: config.json, metrics.csv, policy.npz, checkpoints, result.json."""
+"""A run on disk: config.json, metrics.csv, policy.npz, checkpoints, result.json. `reading` and `results` read them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import datetime
 import json
 import math
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ import numpy as np
 
 from mjx_dher import __version__, lookup
 from mjx_dher import spec as spec_lib
-from mjx_dher.config import Config, HParams
-from mjx_dher.runs.folder import contents, fingerprint
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.fingerprint import in_a_path
 from mjx_dher.spec import RunSpec
-from mjx_dher.system import files, npz
-from mjx_dher.system.files import FolderError
+from mjx_dher.system import files
+from mjx_dher.system.files import BusyError, FolderError
 
 SCHEMA = 2
 CONFIG_FILE = "config.json"
@@ -31,8 +30,9 @@ RESULT_FILE = "result.json"
 CHECKPOINTS = "checkpoints"
 MANIFEST = "manifest.json"  # of a checkpoint
 INFINITE = "inf"  # JSON has no infinite numbers
-POLICY_RATIO = 20.0  # largest ratio of a policy's arrays to its uncompressed file
-FINISHED, FAILED = contents.FINISHED, contents.FAILED
+FINISHED, FAILED = "finished", "failed"  # statuses in result.json
+
+Run = tuple[RunSpec, Path]  # and its folder
 
 
 @contextlib.contextmanager
@@ -94,8 +94,10 @@ def write_config(
     run |= {"jax_flags": flags} if flags else {}
     content = json.loads(json.dumps({"schema": SCHEMA, **description, **run, **extra}))
     files.make_folder(path)
+    if resumes:
+        from mjx_dher.runs.folder.reading import read_config
     if not resumes or {**read_config(path), "versions": None} != {**content, "versions": None}:
-        files.write_json(path / CONFIG_FILE, {**content, "versions": _versions()})
+        files.write_json(path / CONFIG_FILE, {**content, "versions": versions()})
     record_names(spec)
 
 
@@ -113,17 +115,12 @@ def record_names(spec: RunSpec) -> None:
         trust.record("demonstrations", spec.demonstrations, spec_lib.find_demonstrations(spec.demonstrations))
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Versions of this program and its dependencies."""
     from importlib import metadata
 
     names = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     return {"mjx_dher": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
-
-
-def changed_versions(content: Mapping[str, Any]) -> list[str]:
-    """Sentences about versions of this program and its dependencies that differ from config.json."""
-    before, now = content.get("versions", {}), _versions()
-    return [f"{name} was {before[name]} and is {now[name]}" for name in now if before.get(name, now[name]) != now[name]]
 
 
 def checkpoints(path: Path) -> list[Path]:
@@ -146,194 +143,86 @@ def checkpoints_to_resume(path: Path) -> list[Path]:
     )
 
 
-def read_versioned(file: Path, schema: int) -> dict[str, Any]:
-    """Reads a JSON object whose key "schema" is `schema`. Raises FileNotFoundError if there is none, and FolderError if it
-    cannot be read, or has another schema.
-    """
-    content = files.read_json(file)
-    written = content.get("schema") if isinstance(content, dict) else None
-    if written != schema:
-        raise FolderError(f"{file} must have schema {schema}; got {written!r}")
-    return content
-
-
-def read_config(path: Path) -> dict[str, Any]:
-    """Reads config.json of the run in `path`. Raises FolderError if it is not a run folder, or has another schema."""
-    if not path.is_dir():
-        raise FolderError(f"{path} is not a run folder: no such folder")
-    try:
-        return read_config_file(path / CONFIG_FILE)
-    except FileNotFoundError:
-        raise FolderError(f"{path} is not a run folder: it has no {CONFIG_FILE}") from None
-
-
-def read_config_file(file: Path) -> dict[str, Any]:
-    """Reads a run's config.json from any path. Raises FileNotFoundError if there is none, and FolderError if it does not
-    describe a run, or has another schema.
-    """
-    content = read_versioned(file, SCHEMA)
-    with checked(file, "does not describe a run"):
-        contents.check(content, contents.CONFIG)
-        for flag in content.get("jax_flags", ()):
-            lookup.check_name("jax_flags", flag, fingerprint.JAX_FLAGS)
-    return content
-
-
-@contextlib.contextmanager
-def checked(file: Path, problem: str = "is damaged") -> Iterator[None]:
-    """Converts errors of a block that reads the content of `file` to a FolderError."""
-    try:
-        yield
-    except FolderError:
-        raise
-    except KeyError as error:
-        raise FolderError(f"{file} {problem} ({error} is missing)") from error
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise FolderError(f"{file} {problem} ({error})") from error
-
-
-def read_spec(path: Path, trusted: bool = False) -> RunSpec:
-    """Reads the description of the run in `path`. Raises FolderError like `read_run`."""
-    return read_run(path, trusted)[1]
-
-
-def read_run(path: Path, trusted: bool = False) -> tuple[dict[str, Any], RunSpec]:
-    """Reads config.json of the run in `path`: its content, and the run's description.
-
-    Code that it names is imported only if `trusted`, or if the user has trained with it (`trust`). Raises FolderError if it is
-    not a run folder, has another schema, or config.json was edited.
-    """
-    content = read_config(path)
-    spec = to_spec(path, content, trusted)
-    if edits := edited(path, content, spec):
-        raise FolderError(f"{path / CONFIG_FILE} was edited: {'; '.join(edits.values())}")
-    check_written(path, content, spec)
-    return content, spec
-
-
-def identity_of(content: dict[str, Any], spec: RunSpec) -> dict[str, Any]:
-    """`identity` of the run that config.json describes."""
-    own = fingerprint.identity(spec, content["physics"], content["sources"], content.get("jax_flags"))
-    return {**own, **{name: content["config"].get(name, value) for name, value in fingerprint.REMOVED.items()}}
-
-
-def digests(content: Mapping[str, Any]) -> list[str] | None:
-    """Digests that a run has had, in order, or None if its version did not keep them."""
-    return [*content["earlier"], content["digest"]] if "earlier" in content else None
-
-
-def foreign(content: dict[str, Any], spec: RunSpec, written: Mapping[str, Any]) -> str | None:
-    """Differences between a file's settings and all settings that the run has had, or None if the file belongs to the run."""
-    changed, known = fingerprint.differences(written, identity_of(content, spec)), digests(content)
-    if known is None:  # then a resumed run is indistinguishable from another one that differs in these
-        changed = {name: text for name, text in changed.items() if name not in fingerprint.MAY_CHANGE}
-    elif fingerprint.digest(written) in known:
-        return None
-    return "; ".join(changed.values()) or None
-
-
-def check_written(path: Path, content: dict[str, Any], spec: RunSpec) -> None:
-    """Raises FolderError if the newest checkpoint, or else the policy, belongs to a run with other settings."""
-    file, written = written_identity(path)
-    if written is not None and (other := foreign(content, spec, written)):
-        raise FolderError(f"{file} is of a run with other settings: {other}")
-
-
-def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
-    """Settings in config.json that differ from the trained ones, one sentence per name."""
-    now = identity_of(content, spec)
-    if content["digest"] == fingerprint.digest(now):
-        return {}
-    _, written = written_identity(path)
-    changed = {} if written is None else fingerprint.differences(written, now)
-    return changed or {"digest": f"its digest is {content['digest']}, but its settings have {fingerprint.digest(now)}"}
-
-
-def changed_code(content: dict[str, Any], spec: RunSpec) -> list[str]:
-    """Sentences about custom source files and JAX flags that changed since the run was trained."""
-    own = {**content["sources"], **fingerprint.sources(spec)}
-    now = fingerprint.identity(spec, content["physics"], own, fingerprint.jax_flags())
-    return list(fingerprint.differences(identity_of(content, spec), now).values())
-
-
-def check_same(path: Path, spec: RunSpec, may_change: Sequence[str] = fingerprint.MAY_CHANGE) -> None:
-    """Raises FolderError, naming the differences, if the folder holds a run that differs in more than `may_change`."""
-    content = read_config(path)
-    before = identity_of(content, to_spec(path, content))
-    now = fingerprint.identity(spec, content["physics"], content["sources"], fingerprint.jax_flags())
-    changed = fingerprint.differences(before, now)
-    if refused := [text for name, text in changed.items() if name not in may_change]:
-        raise FolderError(f"{path} holds a run with other settings: {'; '.join(refused)}")
-
-
-def read_manifest(checkpoint: Path) -> dict[str, Any]:
-    """Reads the manifest of a checkpoint. Raises FolderError if it is missing or damaged."""
-    with checked(checkpoint):
-        content = read_versioned(checkpoint / MANIFEST, SCHEMA)
-        if content.pop("sha256", None) != fingerprint.sha256_of(content):
-            raise ValueError(f"{MANIFEST} has changed: SHA-256 differs")
-        contents.check(content, contents.MANIFEST)
-        return content
-
-
 def save_policy(path: Path, policy: Any, run: Mapping[str, Any], interface: Mapping[str, Any] | None = None) -> None:
     """Writes policy.npz of the run in `path`, with the run's `identity` and its environment's `contract.robot_interface`."""
     texts = {name: json.dumps(part) for name, part in (("settings", run), ("interface", interface)) if part}
     policy.save(path / POLICY_FILE, **{name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()})
 
 
-def read_policy_settings(path: Path) -> dict[str, Any]:
-    """Reads the `identity` in policy.npz of the run in `path`. Raises FolderError if it is missing or damaged."""
-    file = path / POLICY_FILE
-    with checked(file, "is damaged or not a policy of this program"):
-        return policy_settings(npz.read(file, ("settings",), POLICY_RATIO))
+@dataclasses.dataclass(frozen=True)
+class Claims:
+    """One process's claims on runs."""
+
+    sweep: bool  # skip runs that have ended or that another process trains, instead of raising
+    report: Callable[[str], None]
+
+    def is_free(self, spec: RunSpec, folder: Path) -> bool:
+        """Whether to train a run, as far as known before compilation. Raises FolderError if not, except in a sweep."""
+        if not folder.exists():
+            return True
+        try:
+            with named(folder), files.lock(folder):
+                return self._is_due(spec, folder)
+        except BusyError:
+            if not self.sweep:
+                raise
+            return False
+
+    def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
+        """Makes and locks the folders of the first `lanes` runs that have not ended and that no other process trains.
+
+        Returns the claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither. Raises
+        FolderError if a folder is not writable or, except in a sweep, if a run has ended or another process trains it.
+        """
+        claimed: list[Run] = []
+        busy: list[Run] = []
+        for number, (spec, folder) in enumerate(waiting):
+            if len(claimed) == lanes:
+                return claimed, [*waiting[number:], *busy]
+            try:
+                with named(folder), contextlib.ExitStack() as attempt:
+                    attempt.enter_context(files.made(folder))
+                    attempt.enter_context(files.lock(folder))
+                    if self._is_due(spec, folder):
+                        claimed.append((spec, folder))
+                        stack.enter_context(attempt.pop_all())
+            except BusyError:
+                if not self.sweep:
+                    raise
+                busy.append((spec, folder))
+        return claimed, busy
+
+    def _is_due(self, spec: RunSpec, folder: Path) -> bool:
+        """Whether to train a locked run. Raises FolderError if not, except in a sweep."""
+        if not self.sweep and (folder / CONFIG_FILE).exists():
+            from mjx_dher.runs.folder import reading
+
+            reading.check_same(folder, spec)
+        if not (folder / RESULT_FILE).exists():
+            return True
+        from mjx_dher.runs.folder import results
+
+        problem = results.trial_problem(folder, spec) if self.sweep else results.result_problem(folder, with_policy=False)
+        if self.sweep and problem is not None:
+            self.report(f"{problem}; training it again")
+        if self.sweep:
+            return problem is not None
+        if problem is None and results.can_go_on(folder, spec.config.total_steps):
+            return True
+        raise FolderError(problem or f"{folder} has ended; there is nothing to resume")
 
 
-def policy_settings(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """`identity` among the arrays of a policy.npz. Raises ValueError, KeyError or TypeError if there is none."""
-    if "settings" not in arrays:
-        raise ValueError("it has no settings, unlike the policies of runs")
-    settings = json.loads(arrays["settings"].tobytes())
-    contents.check(settings, contents.IDENTITY, "settings")
-    return dict(settings)
+@contextlib.contextmanager
+def named(folder: Path) -> Iterator[None]:
+    """Converts an OSError to a FolderError that names the folder and its last checkpoint."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or error
+        raise FolderError(f"{folder} cannot be written to ({reason}); {last_checkpoint(folder)}") from error
 
 
-def written_identity(path: Path) -> tuple[Path, dict[str, Any] | None]:
-    """The run's newest checkpoint, or else its policy, and the `identity` in it, or None without either."""
-    for checkpoint in checkpoints(path):
-        with contextlib.suppress(FolderError, ValueError):  # damaged, or of several runs
-            (content,) = read_manifest(checkpoint)["runs"]
-            return checkpoint, dict(content)
-    with contextlib.suppress(FolderError):  # `load_policy` reports a damaged one
-        return path / POLICY_FILE, read_policy_settings(path)
-    return path, None
-
-
-def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSpec:
-    """Description of a run from the content of its config.json, at `path` or in the folder `path`.
-
-    Names of code and of demonstrations are marked as coming from a file, unless `trusted`. Raises FolderError if an entry is
-    missing or invalid.
-    """
-    file = path / CONFIG_FILE if path.is_dir() else path
-    with checked(file, "does not describe a run"):
-        fields = {f.name for f in dataclasses.fields(RunSpec)} - {"config", "hparams"}
-        config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
-        if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default could be wrong
-            raise ValueError(f"it lacks {', '.join(sorted(missing))}")
-        spec = RunSpec(
-            config=Config(**{name: value for name, value in config.items() if name not in fingerprint.REMOVED}),
-            hparams=HParams(**{name: math.inf if x == INFINITE else x for name, x in content["hparams"].items()}),
-            **{name: content[name] for name in fields - {"env_kwargs"} if name in content},
-            env_kwargs=tuple(content["env_kwargs"]),
-        )
-        spec_lib.validate_values(spec)
-    if trusted:
-        return spec
-    from mjx_dher import trust
-
-    names = {**spec_lib.custom_components(spec), "demonstrations": spec.demonstrations}
-    marked: dict[str, Any] = {
-        field: trust.FromFile.of(name, file, spec.env_kwargs if field == "env" else ()) for field, name in names.items() if name
-    }
-    return dataclasses.replace(spec, **marked)
+def last_checkpoint(folder: Path) -> str:
+    """Part of an error message about the run's newest checkpoint."""
+    paths = checkpoints(folder)
+    return f"`{lookup.command_name()} resume {folder}` resumes from {paths[0]}" if paths else "there is no checkpoint"

@@ -72,7 +72,7 @@ def train(
     `train_runs` adds folders, checkpoints, logs and parallel runs.
 
     Args:
-      start: point to resume from, as returned by `checkpoint.restore`.
+      start: point to resume from, as returned by `restoring.restore`.
       devices: number of devices that share the run, or "all". Each has an equal part of environments, ring and batches.
       **parts: sampler, priority and learner, as in `make_train`.
 
@@ -199,7 +199,7 @@ def compile_lowered(lowered: jax.stages.Lowered, search: bool = False, plain: bo
 
 
 def state_template(program: Train) -> TrainState:
-    """Shapes and dtypes of a run's TrainState, for `checkpoint.restore`."""
+    """Shapes and dtypes of a run's TrainState, for `restoring.restore`."""
     return jax.eval_shape(program.init, jax.random.key(0), as_arrays(HParams()))
 
 

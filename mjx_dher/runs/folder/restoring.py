@@ -1,0 +1,167 @@
+"""Restores a run's newest undamaged checkpoint. `checkpoint` writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_dher.runs.folder.checkpoint import STATE_FOLDER, CheckpointError, digest_of, files_of, is_key, to_shapes
+from mjx_dher.runs.folder.reading import checked, read_manifest
+from mjx_dher.runs.folder.run_folder import checkpoints_to_resume, epoch_of
+from mjx_dher.system.files import FolderError
+
+_HPARAMS = ".hparams."
+_CURSOR, _STEPS = ".replay.cursor", ".env_steps"
+_EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # missing in checkpoints of 0.2.0
+
+
+class Restored(NamedTuple):
+    """A restored checkpoint."""
+
+    path: Path
+    epoch: int  # epochs that had ended
+    wall_seconds: float
+    state: Any
+    runs: list[dict[str, Any]]  # `fingerprint.identity` of each
+    refused: dict[Path, str]  # newer unusable checkpoints, and why
+    failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane
+
+
+def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
+    """Restores the newest undamaged checkpoint of a run.
+
+    Args:
+      template: structure of the state (`jax.ShapeDtypeStruct`s), with shardings if there are several devices.
+      lines: epochs in metrics.csv of each run. Checkpoints of later epochs are not used.
+
+    Raises:
+      FolderError: there is no checkpoint.
+      CheckpointError: no checkpoint is usable. The message has the reason for each.
+    """
+    refused: dict[Path, str] = {}
+    for path in checkpoints_to_resume(folder):
+        try:
+            with checked(path):
+                manifest = read_manifest(path)
+                failed = _check_lines(path, manifest, lines)
+                arrays = _load(path, manifest, template)
+            state = _place(arrays, template)
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
+        except FolderError as error:
+            refused[path] = str(error)
+    raise CheckpointError(f"{folder} has no checkpoint to resume from: " + "\n".join(refused.values()))
+
+
+def _check_lines(path: Path, manifest: Mapping[str, Any], lines: Sequence[int]) -> dict[int, tuple[int, str]]:
+    """Failed runs. Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
+    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
+    for lane, whole in enumerate(lines):
+        if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
+            raise CheckpointError(f"{path} has a later epoch than the last complete line of metrics.csv, {whole}")
+    return failed
+
+
+def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.ndarray]:
+    present = {file.relative_to(path).as_posix() for file in files_of(path)}
+    for name, digest in manifest["files"].items():
+        if name not in present:  # this also excludes files of other folders
+            raise CheckpointError(f"{path} is damaged: {name} is missing")
+        if digest_of(path / name) != digest:
+            raise CheckpointError(f"{path} is damaged: {name} has changed (SHA-256 differs)")
+    if manifest["epoch"] != epoch_of(path):
+        raise CheckpointError(f"{path} was renamed: it is the checkpoint of epoch {manifest['epoch']}")
+    read = _read_arrays(path / STATE_FOLDER, [dtype for _, _, dtype in manifest["leaves"]])
+    arrays = {name: array for (name, _, _), array in zip(manifest["leaves"], read)}
+    for name, shape, dtype in manifest["leaves"]:
+        if (held := _say(name, arrays[name])) != (saved := f"{name} {dtype}{shape}"):
+            raise CheckpointError(f"{path} was written as {saved} but read as {held}")
+    shapes = to_shapes(template)
+    arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
+    _check_devices(path, arrays, shapes)
+    return _fit(path, arrays, shapes)
+
+
+def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
+    """Arrays of the saved `runs`, with the last one repeated up to the number of lanes in `shapes`.
+
+    A program may have more lanes than runs. A single run has no lane axis.
+    """
+    if _STEPS not in arrays or _STEPS not in shapes:
+        return arrays  # not a TrainState
+    saved, needed = arrays[_STEPS].shape, tuple(shapes[_STEPS].shape)
+    if saved == needed or not 1 <= runs <= min(*(saved or (1,)), *(needed or (1,))):
+        return arrays
+    lanes: Any = np.minimum(np.arange(needed[0]), runs - 1) if needed else 0
+    return {name: (array if saved else array[None])[lanes] for name, array in arrays.items()}
+
+
+def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any]) -> None:
+    """Raises CheckpointError if another number of devices shared each run. Each device has a ring with a cursor."""
+    if all(name in known for name in (_CURSOR, _STEPS) for known in (arrays, shapes)):
+        before, now = (known[_CURSOR].size // max(1, known[_STEPS].size) for known in (arrays, shapes))
+        if before != now:
+            raise CheckpointError(f"{path}: devices must be {before} per run, as when it was written; got {now}")
+
+
+def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
+    """Arrays in the order of `shapes`.
+
+    Missing HParams become 0 and additional ones are dropped, because a run takes them from its settings. Raises CheckpointError
+    for the first array that does not match `shapes`.
+    """
+    fitted = []
+    for name, leaf in shapes.items():
+        needed = _say(name, leaf)
+        if name not in arrays and name.startswith(_HPARAMS):
+            fitted.append(np.zeros(leaf.shape, leaf.dtype))
+        elif name not in arrays and name in _EARLIER:  # written before episodes could end early: all have T steps
+            steps = shapes[".replay.episodes.action"].shape[-2]
+            fitted.append(np.full(leaf.shape, steps if name.endswith("length") else 0, leaf.dtype))
+        elif name not in arrays:
+            raise CheckpointError(f"{path} does not fit this run: it has no {needed}")
+        elif (held := _say(name, arrays[name])) != needed:
+            raise CheckpointError(f"{path} does not fit this run: it has {held} instead of {needed}")
+        else:
+            fitted.append(arrays[name])
+    if extra := [name for name in arrays if name not in shapes and not name.startswith(_HPARAMS)]:
+        raise CheckpointError(f"{path} does not fit this run: it has {extra[0]}, which is not needed")
+    return fitted
+
+
+def _say(name: str, array: Any) -> str:
+    return f"{name} {array.dtype}{list(array.shape)}"
+
+
+def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
+    """Makes a state from its leaves, with the shardings of `template` or on the default device."""
+    leaves, treedef = jax.tree.flatten(template)
+
+    def put(array: np.ndarray, leaf: Any) -> Any:
+        if getattr(leaf, "sharding", None) is None:
+            value = jnp.array(array)  # a copy, because the next epoch reuses its memory
+        else:
+            value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
+        return jax.random.wrap_key_data(value) if is_key(leaf) else value
+
+    return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
+
+
+def _read_arrays(path: Path, dtypes: Sequence[str]) -> list[np.ndarray]:
+    names = [f"{index:04d}" for index in range(len(dtypes))]
+    try:
+        if not any(path.glob("*.npy")):  # from a version that used orbax
+            from mjx_dher.system import private_api
+
+            with private_api.array_checkpointer() as checkpointer:
+                arrays = checkpointer.restore(path.absolute())
+            return [np.asarray(arrays[name]) for name in names]
+        read = [np.load(path / f"{name}.npy", allow_pickle=False) for name in names]
+        # NumPy has no name for bfloat16.
+        return [array.view(jnp.dtype(dtype)) if array.dtype.kind == "V" else array for array, dtype in zip(read, dtypes)]
+    except Exception as error:  # orbax raises many kinds of errors
+        raise CheckpointError(f"{path} cannot be read ({error})") from error
