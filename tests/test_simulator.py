@@ -5,6 +5,7 @@ import gc
 import pickle
 import warnings
 import weakref
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from conftest import refuses
 from mujoco.batch import DATA_FIELDS
 
 from mjx_dher.envs import Simulator, make
-from mjx_dher.envs.engines import Controls, batches, native
+from mjx_dher.envs.engines import Controls, batches, host_call, native
 from mjx_dher.envs.engines.fields import REJECTED
 from mjx_dher.tools import gym_cache
 
@@ -43,7 +44,7 @@ RICH = """
   <keyframe><key name="up" qpos="0 0 2 1 0 0 0 0.5 -0.5" ctrl="0.1 0.2"/></keyframe>
 </mujoco>
 """
-STATE = native._STATE
+STATE = native.STATE
 
 
 def load(model, data, values):
@@ -70,7 +71,7 @@ def loop(model, first, controls, substeps):
         states.append(state)
         time, history = data.time, data.history.copy()
         data = mujoco.MjData(model)
-        load(model, data, native.Data(**{name: state[name] for name in STATE}, residue=None, derived={}))
+        load(model, data, SimpleNamespace(**{name: state[name] for name in STATE}))
         data.time, data.history[:] = time, history  # float64 between steps, too
     return states
 
@@ -142,24 +143,32 @@ def test_few_states_are_stepped_by_one_thread_if_that_is_faster():
 
 
 def test_mujoco_s_clock_stands_still_only_during_a_call(monkeypatch):
-    model = mujoco.MjModel.from_xml_string(FIGURE)
-    sim, data = Simulator(model, derived=["xpos"]), mujoco.MjData(model)
-    seen = []
-    run = batches.Batch.step
+    sim, clock, run, seen = Simulator(mujoco.MjModel.from_xml_string(FIGURE)), batches.UNTIMED._clock, batches.Batch.step, []
     monkeypatch.setattr(batches.Batch, "step", lambda *args, **kw: (seen.append(clock.value), run(*args, **kw)))
-    clock = batches.UNTIMED._clock
-    before = clock.value
+    before, data = clock.value, sim.make_data()
     assert before is not None  # the bindings export it on this system
-    jax.block_until_ready(sim.step(sim.make_data()))
+    sim.step(data)
     with batches.UNTIMED:  # a second simulator, in another thread
-        jax.block_until_ready(sim.step(sim.make_data()))
+        sim.step(data)
         assert clock.value is None
     assert (seen, clock.value) == ([None, None], before)
-    mujoco.mj_step(model, data)
-    assert data.timer[int(mujoco.mjtTimer.mjTIMER_STEP)].duration > 0
     with batches.UNTIMED:
-        clock.value = other = before + 0  # as set_mjcb_time does meanwhile
-    assert clock.value == other
+        clock.value = before  # as set_mjcb_time does meanwhile
+    assert clock.value == before
+
+
+def test_numpy_states_are_stepped_without_jax_to_the_same_numbers(monkeypatch):
+    sim = Simulator(mujoco.MjModel.from_xml_string(RICH), derived=["xpos"], substeps=3, num_threads=1)
+    ctrl = np.random.default_rng(0).uniform(-1, 1, (5, 4, 2)).astype(np.float32)
+    first = jax.tree.map(lambda x: jnp.broadcast_to(x, (4, *x.shape)), sim.make_data("up"))
+    expected = jax.jit(lambda data: jax.lax.scan(lambda x, u: (jax.vmap(sim.step)(x, u), None), data, ctrl)[0])(first)
+    data = jax.tree.map(np.asarray, first)
+    monkeypatch.setattr(host_call.jax.ffi, "ffi_call", None)
+    for inputs in ctrl:
+        data = sim.step(data, inputs)
+    assert type(data.row) is np.ndarray
+    np.testing.assert_array_equal(data.row, expected.row)
+    np.testing.assert_array_equal(sim.step(jax.tree.map(lambda x: x[1], data)).qpos, sim.step(expected).qpos[1])
 
 
 def test_what_blows_up_is_not_reset_behind_one_s_back():
@@ -207,6 +216,10 @@ def test_bad_arguments_are_rejected():
         (lambda model: Simulator(model).make_data(3), ["keyframe", 3]),
         (lambda model: Simulator(model).step(Simulator(model).make_data(), jnp.ones(3)), ["ctrl", "[3]", "[4]"]),
         (lambda model: Simulator(model).step(None), ["data", "NoneType"]),
+        (lambda model: Simulator(model, derived=["xpos"]).step(Simulator(model).make_data()), ["data", "make_data"]),
+        (lambda model: Simulator(model).make_data().replace(qpoz=0.0), ["field", "qpoz", "qpos"]),
+        (lambda model: Simulator(model, derived=["xpos"]).make_data().replace(xpos=0.0), ["field", "xpos"]),
+        (lambda model: Simulator(model).make_data().replace(time=np.zeros(2)), ["time", "[2]", "[]"]),
         (lambda model: Simulator(asleep(model)), ["sleep", "IPC"]),
     ]
     for call, parts in cases:
@@ -320,7 +333,7 @@ def test_memory_is_freed_with_the_simulator_and_sizes_are_bounded():
     data, program = sim.make_data(), jax.jit(sim.step)
     expected = program(data)
     compiled = program.lower(data).compile()
-    row = np.concatenate([np.ravel(getattr(data, name)) for name in ("residue", *STATE)])
+    row = np.asarray(data.row)
     for size in range(1, 3 + batches._KEPT):
         sim._on_step(np.tile(row, (size, 1)), np.empty((size, len(row)), np.float32))
     assert len(sim._batches[True].kept) == batches._KEPT

@@ -28,9 +28,9 @@ class Rows:
       batch: it must be persistent if some of `derived` are `LATE`.
       inputs: fields of the state that `write` sets.
       outputs: fields of the state that `read` returns.
-      derived: other fields that it returns.
+      derived: other fields that it returns, after the outputs and factors.
       digits: numbers at the start of a row: the digits of `EXACT` that float32 omits, or 0 if rows do not have them.
-      variation: numbers of the model that vary (`base.variation_of`). Their factors end a row that goes in.
+      variation: numbers of the model that vary (`base.variation_of`). Their factors follow the inputs in a row.
     """
 
     def __init__(
@@ -45,7 +45,9 @@ class Rows:
         self.batch, self.seconds = batch, 0.0  # that a call takes
         self._inputs = _placed(batch, inputs, digits, EXACT if digits else ())
         self._outputs = _placed(batch, outputs, digits)
-        begin = digits + sum(_size(batch.bind(name)) for name in outputs)
+        # Factors follow the inputs, and derived fields follow the factors.
+        begin = digits + sum(_size(batch.bind(name)) for name in inputs)
+        self._factor_place, begin = np.s_[:, begin : begin + variation.size], begin + variation.size
         self._late: dict[str, _Place] = {}
         for name in derived:
             view = batch.bind(name).reshape(batch.nsim, -1)
@@ -82,7 +84,7 @@ class Rows:
                 np.add(whole, rows[low], out=whole)
                 np.copyto(view, whole, where=whole.astype(np.float32) == view)
         self._known = None
-        if self._varied and not np.array_equal(factors := rows[:, -self._variation.size :], self._factors):
+        if self._varied and not np.array_equal(factors := rows[self._factor_place], self._factors):
             self._factors[...] = factors
             for name, value in self._variation.values(self._factors).items():
                 self._varied[name][...] = value
@@ -93,6 +95,8 @@ class Rows:
             results[place] = view
         if self._late:
             self._compute_late(results)
+        if self._exact and self._varied:
+            results[self._factor_place] = self._factors
         for view, place, high, low, rest in self._exact:
             np.subtract(view, results[place], out=rest)
             results[high] = rest

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher.types import Array
@@ -106,8 +107,13 @@ def register(name: str, method: _Function) -> None:
 def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
     """Calls the method registered as `name` with `inputs` [m]. Returns its outputs, float32 of `shape`.
 
-    Under `vmap` it is called once, with [..., m]. Programs for devices other than CPUs are not cached.
+    Under `vmap` it is called once, with [..., m]. Programs for devices other than CPUs are not cached. Outside a program, it is
+    called without JAX, and NumPy inputs give NumPy outputs.
     """
+    if not isinstance(inputs, jax.core.Tracer):
+        outputs = np.empty(shape, np.float32)
+        _method(name)(np.asarray(inputs, np.float32), outputs)
+        return outputs if isinstance(inputs, np.ndarray) else jnp.asarray(outputs)
     result = jax.ShapeDtypeStruct(shape, np.float32)
     inputs = inputs.astype(np.float32)  # JAX may compute in 64 bits
     if jax.default_backend() != "cpu":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextvars
 import copy
-import dataclasses
 import hashlib
 import math
 import threading
@@ -16,46 +15,16 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 from mujoco.batch import Batch
 
 from mjx_dher.envs.engines import host_call
-from mjx_dher.envs.engines.base import Controls, Physics, check_shape, check_shapes, variation_of
+from mjx_dher.envs.engines.base import Controls, Physics, check_shapes, variation_of
 from mjx_dher.envs.engines.batches import EXACT, FULL, UNTIMED, Choice, Rows, residue
-from mjx_dher.envs.engines.fields import LATE, derived_fields
+from mjx_dher.envs.engines.fields import LATE, STATE, Data, Layout, derived_fields
 from mjx_dher.system.limits import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
 
-
-@struct.dataclass
-class Data:
-    """Complete state of one simulation, in MuJoCo's layout and with MuJoCo's names, float32.
-
-    It is a whole `mjSTATE_INTEGRATION`, so nothing else influences a step. Fields that a model does not use are empty. Use
-    `data.replace(ctrl=...)` to set a field.
-    """
-
-    time: Array  # [] s; `residue` has the digits that float32 omits
-    qpos: Array  # [nq]
-    qvel: Array  # [nv]
-    act: Array  # [na]
-    history: Array  # [nhistory] of delayed actuators and sensors
-    qacc_warmstart: Array  # [nv]
-    ctrl: Array  # [nu]
-    qfrc_applied: Array  # [nv]
-    xfrc_applied: Array  # [nbody, 6]
-    eq_active: Array  # [neq] 1 or 0
-    mocap_pos: Array  # [nmocap, 3]
-    mocap_quat: Array  # [nmocap, 4]
-    userdata: Array  # [nuserdata]
-    plugin_state: Array  # [npluginstate]
-    residue: Array  # [2, 1 + nhistory] digits of `time` and `history` that float32 omits; 0 if you set those
-    derived: dict[str, Array]  # requested fields of MjData, with their shapes
-    factors: Array | None = None  # [number of `varied`] by which the model's numbers are multiplied; None for 1
-
-
-_STATE = tuple(name for name in Data.__dataclass_fields__ if name not in ("residue", "derived", "factors"))
 # Inputs of `advance`: fields of `Physics` by MuJoCo's names, and the controls.
 _PHYSICS = {"qpos": "qpos", "qvel": "qvel", "act": "act", "qacc_warmstart": "warmstart"}
 _CONTROLS = ("ctrl", "mocap_pos", "mocap_quat")
@@ -101,14 +70,17 @@ class Simulator:
         self._model = copy.copy(model)
         # Without this flag, MuJoCo silently resets a diverged simulation to qpos0.
         self._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        self._substeps, self._derived = substeps, derived_fields(derived, _STATE)
+        self._substeps, self._derived = substeps, derived_fields(derived, STATE)
         if "energy" in self._derived:
             self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
         self._num_threads, self._variation = num_threads or usable_cores(), variation_of(model, varied)
         self._name = f"mjx_dher_native_{_digest(self._model, substeps, self._num_threads, self._derived, *varied)}"
         batch = Batch(self._model, 1, 1)
-        self._shapes = {name: batch.bind(name).shape[1:] for name in (*_STATE, *self._derived)}
-        self._shapes["residue"], self._shapes["factors"] = (2, 1 + model.nhistory), (self._variation.size,)
+        self._shapes: dict[str, tuple[int, ...]] = {"residue": (2, 1 + model.nhistory)}
+        self._shapes |= {name: batch.bind(name).shape[1:] for name in STATE}
+        self._shapes["factors"] = (self._variation.size,)
+        self._shapes |= {name: batch.bind(name).shape[1:] for name in self._derived}
+        self._layout = Layout(tuple(self._shapes.items()), self._derived)
         self._begin()
 
     def _begin(self) -> None:
@@ -152,10 +124,11 @@ class Simulator:
         self._note_lost(sum(data.warning[kind].number - 1 for kind in FULL))
         for compute in dict.fromkeys(LATE[name] for name in self._derived if name in LATE):
             compute(self._model, data)
-        values = {name: np.asarray(getattr(data, name)).reshape(self._shapes[name]) for name in (*_STATE, *self._derived)}
-        values["residue"] = residue(np.concatenate([values[name].ravel() for name in EXACT]))
+        values = {name: np.ravel(getattr(data, name)) for name in (*STATE, *self._derived)}
+        values["residue"] = residue(np.concatenate([values[name] for name in EXACT])).ravel()
         values["factors"] = np.ones(self._variation.size)
-        return self._data({name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
+        row = np.concatenate([values[name] for name in self._shapes])
+        return Data(jnp.asarray(row, jnp.float32), self._layout)
 
     def step(self, data: Data, ctrl: Array | None = None) -> Data:
         """State `substeps` timesteps later, under `ctrl` [nu] if given.
@@ -167,7 +140,7 @@ class Simulator:
           ValueError: a field does not have the model's shape.
         """
         if ctrl is not None and isinstance(data, Data):
-            data = dataclasses.replace(data, ctrl=ctrl)
+            data = data.replace(ctrl=ctrl)
         return self._update("step", data)
 
     def forward(self, data: Data) -> Data:
@@ -180,10 +153,13 @@ class Simulator:
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         check_shapes(self._model, physics, controls, self._variation.size)
-        values = {name: getattr(physics, field) for name, field in _PHYSICS.items()}
-        values |= {"ctrl": controls.ctrl, "mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
-        after = self._call("advance", {**values, "factors": self._variation.factors(physics.factors, jnp)})
-        return Physics(**{field: after[name] for name, field in _PHYSICS.items()}, factors=physics.factors)
+        inputs = [*(getattr(physics, field) for field in _PHYSICS.values()), controls.ctrl]
+        inputs += [controls.mocap[:, :3], controls.mocap[:, 3:], self._variation.factors(physics.factors, jnp)]
+        # One array in and one out, because each costs some microseconds.
+        row = jnp.concatenate([jnp.ravel(jnp.asarray(value, jnp.float32)) for value in inputs])
+        ends = np.cumsum([math.prod(self._shapes[name]) for name in _PHYSICS]).tolist()
+        parts = jnp.split(host_call.call(f"{self._name}_advance", (ends[-1],), row), ends[:-1])
+        return Physics(**dict(zip(_PHYSICS.values(), parts, strict=True)), factors=physics.factors)
 
     def check(self) -> None:
         """Raises ValueError if contacts since the last call did not fit into the model's memory."""
@@ -195,30 +171,10 @@ class Simulator:
     def _update(self, function: str, data: Data) -> Data:
         if not isinstance(data, Data):
             raise ValueError(f"data must be a Data from make_data; got a {type(data).__name__}")
-        values = {name: getattr(data, name) for name in (*_STATE, "residue")}
-        values["factors"] = self._variation.factors(data.factors, jnp)
-        for name, value in values.items():
-            check_shape(name, value, self._shapes[name])
-        return self._data({**values, **self._call(function, values)})
-
-    def _data(self, values: dict[str, Array]) -> Data:
-        state = {name: values[name] for name in (*_STATE, "residue")}
-        factors = values["factors"] if self._variation.size else None
-        return Data(**state, derived={name: values[name] for name in self._derived}, factors=factors)
-
-    def _fields(self, function: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names of the fields that a function takes and returns, in the order of a packed row."""
-        if function == "advance":
-            return (*_PHYSICS, *_CONTROLS, "factors"), tuple(_PHYSICS)
-        return ("residue", *_STATE, "factors"), ("residue", *_STATE, *self._derived)
-
-    def _call(self, function: str, values: dict[str, Array]) -> dict[str, Array]:
-        """Calls a function of the host, with one array in and one out, because each costs some microseconds."""
-        inputs, outputs = self._fields(function)
-        row = jnp.concatenate([jnp.ravel(jnp.asarray(values[name], jnp.float32)) for name in inputs])
-        ends = np.cumsum([math.prod(self._shapes[name]) for name in outputs]).tolist()
-        parts = jnp.split(host_call.call(f"{self._name}_{function}", (ends[-1],), row), ends[:-1])
-        return {name: part.reshape(self._shapes[name]) for name, part in zip(outputs, parts, strict=True)}
+        if data.layout != self._layout or jnp.shape(data.row)[-1:] != (self._layout.size,):
+            raise ValueError("data has other fields than this simulator's make_data gives")
+        row = host_call.call(f"{self._name}_{function}", jnp.shape(data.row), data.row)
+        return Data(row, self._layout)
 
     def _on_step(self, rows: np.ndarray, results: np.ndarray) -> None:
         self._on_host("step", rows, results)
@@ -258,8 +214,8 @@ class Simulator:
         """Makes a batch for `advance`, or for functions of the whole state."""
         derived, digits = (self._derived, math.prod(self._shapes["residue"])) if whole else ((), 0)
         batch = Batch(self._model, nsim, num_threads, persistent=any(name in LATE for name in derived))
-        inputs = _STATE if whole else (*_PHYSICS, *_CONTROLS)
-        return Rows(batch, inputs, _STATE if whole else tuple(_PHYSICS), derived, digits, self._variation)
+        inputs = STATE if whole else (*_PHYSICS, *_CONTROLS)
+        return Rows(batch, inputs, STATE if whole else tuple(_PHYSICS), derived, digits, self._variation)
 
     def _note_lost(self, lost: int) -> None:
         """Counts timesteps that left out contacts, and warns the first time."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -48,9 +47,8 @@ class Sensors:
             return self._reader.read_sensors(physics, controls)
         state = {"qpos": physics.qpos, "qvel": physics.qvel, "act": physics.act, "qacc_warmstart": physics.warmstart}
         mocap = {"mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
-        data = dataclasses.replace(
-            jax.tree.map(jnp.asarray, self._rest), ctrl=controls.ctrl, factors=physics.factors, **state, **mocap
-        )
+        varied = {} if physics.factors is None else {"factors": physics.factors}
+        data = jax.tree.map(jnp.asarray, self._rest).replace(ctrl=controls.ctrl, **varied, **state, **mocap)
         return self._reader.forward(data).derived["sensordata"]
 
     def check(self) -> None:
