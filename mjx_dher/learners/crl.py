@@ -94,7 +94,9 @@ class CRL(ActorCriticBase):
         self, state: ActorCriticState, batch: Batch, hparams: HParams, with_actor: bool = True
     ) -> tuple[ActorCriticState, Metrics]:
         """Takes one step of Adam for the critic and, `with_actor`, one for the actor, judged by the critic before it."""
-        observation, positive = self.normalize(state, batch.observation, _positives(batch), hparams)
+        if batch.hindsight_goal is None:
+            raise ValueError("hindsight_goal is missing: learner crl needs batches that `relabel.relabel` has made")
+        observation, positive = self.normalize(state, batch.observation, batch.hindsight_goal, hparams)
         _, goal = self.normalize(state, batch.observation, batch.desired_goal, hparams)
         before = state.params
 
@@ -136,13 +138,6 @@ class CRL(ActorCriticBase):
             return logits
         same = jnp.all(row[:, None] == row[None], axis=-1) & ~jnp.eye(len(row), dtype=bool)
         return jnp.where(same, -jnp.inf, logits)
-
-
-def _positives(batch: Batch) -> Array:
-    """Goals [B, G] that the sampler chose."""
-    if batch.hindsight_goal is None:
-        raise ValueError("hindsight_goal is missing: learner crl needs batches that `relabel.relabel` has made")
-    return batch.hindsight_goal
 
 
 def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> CRL:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -181,7 +181,9 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
-            _log(rows, logs, watch.failed)
+            for lane, (row, opened) in enumerate(zip(rows, logs)):
+                for sink in opened if lane not in watch.failed else ():
+                    sink.write(row)
             success.append(rows[0]["success_rate"])
             if progress.epoch == progress.num_epochs or len(watch.failed) == len(specs) or options.is_reached(success):
                 break
@@ -253,14 +255,6 @@ def _rows(progress: Progress, lanes: int) -> list[dict[str, float]]:
     """Metrics of an epoch, per run."""
     metrics = {name: np.atleast_1d(values) for name, values in progress.metrics.items()}
     return [loggers.metrics_row(progress, {name: float(x[lane]) for name, x in metrics.items()}) for lane in range(lanes)]
-
-
-def _log(rows: Sequence[dict[str, float]], logs: Sequence[Sequence[Sink]], failed: Container[int]) -> None:
-    """Writes an epoch's metrics of each run that has not failed."""
-    for lane, (row, opened) in enumerate(zip(rows, logs)):
-        if lane not in failed:
-            for sink in opened:
-                sink.write(row)
 
 
 def _save_policy(env: Env, program: Program, learner: Any, spec: RunSpec, folder: Path, run: dict[str, Any]) -> None:

@@ -46,7 +46,11 @@ def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[s
         yield from check_components(env, run, with_env=number == 0)
     if verdict is not None:
         with contextlib.suppress(OSError):
-            _keep(verdict)
+            verdict.parent.mkdir(parents=True, exist_ok=True)
+            verdict.touch()
+            for old in verdict.parent.glob("?" * len(verdict.name)):  # nothing but verdicts
+                if time.time() - old.stat().st_mtime > KEPT_SECONDS:
+                    old.unlink()
 
 
 def _read(spec: RunSpec) -> RunSpec:
@@ -90,11 +94,3 @@ def _own_files() -> Iterator[Path]:
         file = getattr(module, "__file__", None)
         if file and not file.startswith(installed) and Path(file).is_file():
             yield Path(file)
-
-
-def _keep(verdict: Path) -> None:
-    verdict.parent.mkdir(parents=True, exist_ok=True)
-    verdict.touch()
-    for old in verdict.parent.glob("?" * len(verdict.name)):  # nothing but verdicts
-        if time.time() - old.stat().st_mtime > KEPT_SECONDS:
-            old.unlink()
