@@ -14,8 +14,9 @@ from conftest import refuses
 from mjx_dher import HParams, learners, make_train, networks
 from mjx_dher.learners import critics
 from mjx_dher.learners.actor_critic import ActorCritic
-from mjx_dher.learners.actors import Deterministic, Gaussian
+from mjx_dher.learners.actors import Deterministic
 from mjx_dher.learners.critics import Critics
+from mjx_dher.learners.gaussian import Gaussian
 from mjx_dher.networks import Networks
 from mjx_dher.policy import Policy
 from mjx_dher.types import Batch

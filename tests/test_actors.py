@@ -10,8 +10,8 @@ import pytest
 import scipy.stats
 
 from mjx_dher.config import HParams
-from mjx_dher.learners import actors
-from mjx_dher.learners.actors import Deterministic, Gaussian
+from mjx_dher.learners.actors import Deterministic
+from mjx_dher.learners.gaussian import Gaussian, sample_action
 from mjx_dher.networks import Actor, GaussianActor
 
 KEY = jax.random.key(0)
@@ -52,7 +52,7 @@ def normal(*shape):
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def draw(params, number, size=2):
     """Actions of as many states, and their log probabilities."""
-    return actors.sample_action(Fixed(), params, zeros(number, size), zeros(number, 1), normal(number, size))
+    return sample_action(Fixed(), params, zeros(number, size), zeros(number, 1), normal(number, size))
 
 
 def test_a_target_s_actions_are_smoothed_within_bounds():

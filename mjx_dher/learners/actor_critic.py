@@ -20,9 +20,10 @@ from flax import struct
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common, critics
-from mjx_dher.learners.actors import ActorKind, Deterministic, Gaussian
+from mjx_dher.learners.actors import ActorKind, Deterministic
 from mjx_dher.learners.common import ActorCriticBase, Params
 from mjx_dher.learners.critics import Categorical, Critics
+from mjx_dher.learners.gaussian import Gaussian
 from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, zeros
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree

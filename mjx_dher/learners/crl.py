@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
 from mjx_dher.learners.actor_critic import ActorCriticState, first_state
-from mjx_dher.learners.actors import Gaussian
 from mjx_dher.learners.common import ActorCriticBase, Params
+from mjx_dher.learners.gaussian import Gaussian
 from mjx_dher.networks import Heads, NetworksFn, check_heads
 from mjx_dher.types import Array, Batch, EnvSpec, Metrics, PRNGKey, PyTree
 

@@ -3,6 +3,6 @@
 `Policy` needs only NumPy. Import `policy.load`, `policy.learner_policy` and `policy.bundled` explicitly.
 """
 
-from mjx_dher.policy.numpy_policy import Policy, TrainedPolicy, from_arrays, from_mlp
+from mjx_dher.policy.numpy_policy import Policy, TrainedPolicy, from_mlp
 
-__all__ = ["Policy", "TrainedPolicy", "from_arrays", "from_mlp"]
+__all__ = ["Policy", "TrainedPolicy", "from_mlp"]
