@@ -69,14 +69,15 @@ def card(folder: Path) -> str:
         "success in the original": _original(facts["original"]),
         "already at reset": f"{facts['here']['reset_success_rate']:.3f} of the episodes here",
         "learner": f"`{run.learner}`, networks `{run.networks}`, hidden layers of {sizes}",
-        "sampler, seed": f"`{run.sampler}`, {run.seed}",
+        "sampler, priority, seed": f"`{run.sampler}`, `{run.priority}`, {run.seed}",
         "environment steps": f"{result['env_steps']:,}",
         "training": f"{result['wall_seconds']:,.0f} s on {facts['machine']}, physics `{content['physics']}`",
         "commit": f"`{facts['commit']}`",
         "versions": ", ".join(f"{name} {versions[name]}" for name in ("jax", "mujoco", "numpy", "python")),
         "published": facts["date"],
     }
-    settings = {**content["config"], **content["hparams"]}  # the fields at the time of its training
+    today = {*_fields(run.config), *_fields(run.hparams)}  # an option that was removed since had its default
+    settings = {name: value for name, value in {**content["config"], **content["hparams"]}.items() if name in today}
     numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, list) else _text(x)}" for name, x in settings.items())
     return "\n".join(
         (
@@ -88,7 +89,7 @@ def card(folder: Path) -> str:
             "|---|---|",
             *(f"| {name} | {value} |" for name, value in rows.items()),
             "",
-            "This command trains it again. Another machine, or other versions, round otherwise, and so learn another policy.",
+            "This command trains it again. Rounding differs between machines and versions, so the trained policy differs, too.",
             "",
             "```bash",
             f"python train.py {' '.join(command(run))}",
