@@ -1,5 +1,7 @@
 """The kernel of the engine warp, on a CPU, with one lane an environment. A GPU runs the same code with more."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -59,12 +61,14 @@ def touching(model, seed=0):
     return qpos, qvel, np.concatenate([poses, control], axis=1)
 
 
-def in_c(model, qpos, qvel, inputs):
-    """One timestep of MuJoCo C."""
-    data, found = mujoco.MjData(model), []
+def in_c(model, qpos, qvel, inputs, change=lambda model, i: None):
+    """One timestep of MuJoCo C, of each environment in a model that `change` may have changed."""
+    model, found = copy.copy(model), []
+    data = mujoco.MjData(model)
     for i in range(NUM):
+        change(model, i)
         mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], inputs[i, 7:]
+        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], inputs[i, 7 : 7 + model.nu]
         data.mocap_pos[0], data.mocap_quat[0] = inputs[i, :3], inputs[i, 3:7]
         mujoco.mj_step(model, data)
         found.append((data.nefc, *(x.copy() for x in (data.qacc, data.qvel, data.qpos))))

@@ -1,13 +1,16 @@
 """Timesteps of random robots in the fused kernel, against MuJoCo C: each feature of a model by itself, and all of them."""
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from test_fused import NUM, floats, in_c, quick_compiler  # noqa: F401
 
-from mjx_dher.envs.engines.fused import setup
+from mjx_dher.envs.engines.fused import setup, varied
 from mjx_dher.envs.engines.fused.simulation import Simulation
 from mjx_dher.envs.engines.fused.support import unsupported
+from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system.warp_setup import wp
 
 SHAPES = (
@@ -130,6 +133,8 @@ def robot(seed, features=()):
 
 
 ROBOTS = [(0, FEATURES), *((seed, ()) for seed in (1, 2, 3)), *((4 + i, (name,)) for i, name in enumerate(FEATURES))]
+VARIED = ("mass:box0 link1", "mass:link3", "friction:o*", "friction:floor", "damping:j*", "gain:j1* j2*")
+ROBOTS += [(14, ("varied", "motors")), (15, ("varied", "elliptic"))]
 
 
 @pytest.mark.parametrize(
@@ -146,10 +151,20 @@ def test_a_timestep_of_a_random_robot_is_mujoco_c_s(seed, features, monkeypatch)
     qpos[:, [0, 1, 7, 8]] += 0.1 * rng.standard_normal((NUM, 4))
     qpos[:, [*range(3, 7), *range(10, 14)]] += 0.02 * rng.standard_normal((NUM, 8))  # no parallel capsules
     inputs = np.concatenate([np.tile([0, 0, 0, 1, 0, 0, 0], (NUM, 1)), rng.uniform(-1, 1, (NUM, model.nu))], axis=1)
-    there = in_c(model, qpos, qvel, inputs)
+    variation = Variation(model, VARIED if "varied" in features else ())
+    factors = rng.uniform(0.3, 2, (NUM, variation.size))
+    numbers = varied.Numbers(model, variation, inputs.shape[1])
+    row = jax.jit(lambda factors: jnp.concatenate([jnp.zeros(0), *numbers.row(variation.values(factors, jnp))]))
+
+    def change(model, i):
+        for field, value in variation.values(factors[i]).items():
+            getattr(model, field)[...] = value
+
+    there = in_c(model, qpos, qvel, inputs, change)
+    inputs = np.concatenate([inputs, [row(jnp.float32(own)) for own in factors]], axis=1)
     here = [wp.zeros((NUM, n), dtype=float) for n in (model.nq, model.nv, model.nv)]
     state = floats(qpos), floats(qvel), floats(np.zeros((NUM, model.nv)))
-    simulation = Simulation(model, NUM, substeps=1)
+    simulation = Simulation(model, NUM, substeps=1, varied=numbers.begins)
     simulation.advance(state, floats(inputs), tuple(here))
     assert simulation.overflow() == 0
     assert there[0].max() > 12

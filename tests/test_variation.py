@@ -35,10 +35,10 @@ CASES = (
 
 
 @pytest.mark.parametrize(
-    "engine", ["native", pytest.param("jax", marks=pytest.mark.slow), pytest.param("warp", marks=pytest.mark.slow)]
+    "engine", ["native", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jax", "graph", "fused"))]
 )
 def test_twice_the_mass_is_half_the_acceleration(engine):
-    options = {"path": "graph", "allow_cpu": True} if engine == "warp" else {}
+    engine, options = ("warp", {"path": engine, "allow_cpu": True}) if engine in ("graph", "fused") else (engine, {})
     made = make_engine(engine, mujoco.MjModel.from_xml_string(TWO), 1, varied=NAMES, **options)
     factors = jnp.asarray([case for case, _ in CASES], jnp.float32)
     zeros, none = jnp.zeros((len(CASES), 2)), jnp.zeros((len(CASES), 0))
@@ -161,7 +161,6 @@ def test_bad_factors_are_rejected():
         (lambda: to_ranges({"gain:y": (0.5, float("nan"))}), ["gain:y", "nan"]),
         (lambda: to_ranges({"gain:y": 2}), ["gain:y", 2]),
         (lambda: to_ranges(3), [3]),
-        (lambda: make_engine("warp", model, 1, varied=["mass:cart"], path="fused", allow_cpu=True), ["fused", "path=graph"]),
     ]
     for call, parts in cases:
         with refuses(*parts):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -11,7 +11,7 @@ _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"
 # Most contacts of two geoms, in the order of MuJoCo's types. Otherwise 1 with a sphere or an ellipsoid, else 8.
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
 _MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2, ("CAPSULE", "CYLINDER"): 2}
-_LEAST_FRICTION = 1e-5  # MuJoCo's
+LEAST_FRICTION = 1e-5  # MuJoCo's
 _MANY = 50  # contacts of height fields and signed distance fields
 
 
@@ -60,7 +60,7 @@ def all_pairs(model: mujoco.MjModel) -> Pairs:
     touch = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     listed = [getattr(model, f"pair_{name}")[: model.npair * touch] for name in Pairs._fields]
     at = Pairs._fields.index("friction")
-    listed[at] = np.maximum(listed[at], _LEAST_FRICTION)
+    listed[at] = np.maximum(listed[at], LEAST_FRICTION)
     others = meeting(model)
     if not len(others):
         return Pairs(*listed)
@@ -74,18 +74,34 @@ def all_pairs(model: mujoco.MjModel) -> Pairs:
     blend = np.where((solref[..., :1] > 0).all(axis=1), (share * solref).sum(axis=1), solref.min(axis=1))
     led = np.where(leads[:, :1], solref[:, 0], solref[:, 1])
     counts = np.where(leads.any(axis=1, keepdims=True), leads, True)
-    friction = np.where(counts[..., None], model.geom_friction[others], -np.inf).max(axis=1)
     mixed = Pairs(
         others[:, 0],
         others[:, 1],
         np.where(counts, model.geom_condim[others], 0).max(axis=1),
         model.geom_margin[others].sum(axis=1),
-        np.maximum(friction[:, [0, 0, 1, 2, 2]], _LEAST_FRICTION),
+        mixed_friction(model, others, model.geom_friction, np),
         np.where(leads.any(axis=1, keepdims=True), led, blend),
         (share * model.geom_solimp[others]).sum(axis=1),
         np.zeros_like(blend),
     )
     return Pairs(*(np.concatenate(both) for both in zip(listed, mixed)))
+
+
+def mixed_friction(model: mujoco.MjModel, pairs: np.ndarray, friction: Any, xp: Any) -> Any:
+    """Friction [n, 5] of contacts of geoms [n, 2] that have `friction` [ngeom, 3], by `xp`: NumPy or jax.numpy."""
+    priority = model.geom_priority[pairs]
+    counts = priority == priority.max(axis=1, keepdims=True)
+    mixed = xp.where(counts[..., None], friction[pairs], -xp.inf).max(axis=1)
+    return xp.maximum(mixed[:, np.array([0, 0, 1, 2, 2])], LEAST_FRICTION)
+
+
+def frictions(model: mujoco.MjModel, pairs: Pairs, friction: Any, xp: Any) -> dict[str, Any]:
+    """Numbers [n, ...] of the fused kernel that depend on friction [n, 5], by `xp`: NumPy or jax.numpy."""
+    slide, elliptic = friction[:, 0], model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    inverse = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (pairs.geom1, pairs.geom2))
+    edge = xp.where(elliptic | (pairs.dim == 1), 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio)
+    mu = xp.where(pairs.dim == 1, 1, slide / np.sqrt(model.opt.impratio))
+    return {"friction": friction[:, :3], "rolling": friction[:, 3:], "weight": inverse * edge, "mu": mu}
 
 
 def most_contacts(model: mujoco.MjModel, geom1: int, geom2: int) -> int:

@@ -18,6 +18,7 @@ import mujoco
 from mjx_dher.envs.engines import graph
 from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
 from mjx_dher.envs.engines.fused import simulation, support
+from mjx_dher.envs.engines.fused.varied import NONE, Numbers
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.lookup import check_name
 from mjx_dher.system import private_api
@@ -46,7 +47,7 @@ class WarpEngine:
       contacts: memory for contacts, with the same default. Only for `graph`.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread, to compare engines.
       sensors: whether to make the object for `read_sensors` instead of `advance`. Only for `graph`.
-      varied: as in `make_engine`. Only for `graph`.
+      varied: as in `make_engine`. "auto" is then `graph`.
 
     Raises:
       ValueError: JAX does not run on an NVIDIA GPU and `allow_cpu` is False, or the path does not support the model.
@@ -80,6 +81,8 @@ class WarpEngine:
         self._variation = Variation(model, varied)
         self._varied = [name for name in self._variation.fields if name != "dof_M0"]  # which MuJoCo Warp does not have
         self.path, self.note, rows = _choose(model, path, constraints, bool(varied))
+        own = varied and self.path == "fused"
+        self._numbers = Numbers(model, self._variation, 7 * model.nmocap + model.nu) if own else None
         self.name = "warp" if self.path == "fused" else "warp graph"  # separate names, because results differ
         if self.path == "graph":
             most_contacts, rows = graph.memory_for(model)
@@ -157,7 +160,7 @@ class WarpEngine:
         if self._variation.size:
             with jax.default_matmul_precision("highest"):
                 values = self._variation.values(self._variation.factors(physics.factors, jnp), jnp)
-            inputs += [values[name].ravel() for name in self._varied]
+            inputs += self._numbers.row(values) if self._numbers else [values[name].ravel() for name in self._varied]
         return [x[0] for x in self._call(*rows, jnp.concatenate(inputs)[None])]
 
     def check(self) -> None:
@@ -194,7 +197,8 @@ class WarpEngine:
         if self.path == "graph":
             sizes = self._substeps, self._contacts, self._constraints
             return graph.Simulation(self._model, num_envs, *sizes, self._sensors, self._varied)
-        return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints)
+        begins = self._numbers.begins if self._numbers else NONE
+        return simulation.Simulation(self._model, num_envs, self._substeps, self._constraints, begins)
 
     def _simulation(self, device: Any, num_envs: int) -> simulation.Simulation | graph.Simulation:
         key = (str(device), num_envs)
@@ -216,8 +220,8 @@ def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: b
     support the model.
     """
     left_out, reason = support.unsupported(model), "as asked"
-    if varied:
-        left_out.append("physics that varies between environments (path=graph has it)")
+    if varied and path == "auto":
+        path, reason = "graph", "physics varies between environments (path='fused' has this, too)"
     if left_out and path != "graph":
         reason = f"the fused kernel does not support features of the model: {', '.join(left_out)}"
         if path == "fused":

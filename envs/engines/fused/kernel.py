@@ -18,6 +18,7 @@ from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.sparse import ask_sparse
 from mjx_dher.envs.engines.fused.tendons import soften
 from mjx_dher.envs.engines.fused.threads import gather, sync
+from mjx_dher.envs.engines.fused.varied import NONE, Begins, owning
 from mjx_dher.system.warp_setup import wp
 
 
@@ -74,6 +75,7 @@ class Traits(NamedTuple):
     has_sparse: bool  # whether there are rows of `Sparse`
     has_tendons: bool  # whether there are `Tendons`
     elliptic: bool  # whether friction cones are elliptic
+    varied: Begins = NONE  # of numbers that differ between environments
 
 
 def _ending(traits: Traits, nv: int, warps: int) -> Any:
@@ -198,6 +200,7 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits)
       threads_per_env, warps: threads that share an environment; and warps of 32 threads in a block, 0 on a CPU.
     """
     shared = warps * (32 // threads_per_env) * floats
+    own_bodies, own_dofs, own_contacts = owning(traits.varied)
     constrain, end = _constraining(traits, warps), _ending(traits, nv, warps)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
@@ -229,6 +232,10 @@ def make(floats: int, threads_per_env: int, warps: int, nv: int, traits: Traits)
             _ = wp.tile_empty(shape=shared, dtype=float, storage="shared")  # what `carve` takes
         own = spare[env % spare.shape[0]]
         memory = carve(layout, own, threads)
+        if wp.static(traits.varied != NONE):
+            bodies = own_bodies(bodies, inputs[env])
+            dofs = own_dofs(dofs, inputs[env])
+            contacts = own_contacts(contacts, inputs[env])
         _begin(memory, old_qpos[env], old_qvel[env], old_guess[env], thread, threads)
         for _substep in range(substeps):
             _forces(world, bodies, dofs, memory, inputs[env], wp.static(traits.has_tendons), wp.static(warps), thread, threads)

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, Tendons, World
-from mjx_dher.envs.engines.pairs import all_pairs
+from mjx_dher.envs.engines.pairs import all_pairs, frictions
 from mjx_dher.system.warp_setup import wp
 
 _MOST = {"PLANE_BOX": 4, "PLANE_CYLINDER": 4, "BOX_BOX": 8, "CYLINDER_BOX": 5, "PLANE_CAPSULE": 2}
@@ -163,6 +163,18 @@ def _tendons_of(model: mujoco.MjModel) -> Any:
     )
 
 
+def actuator_force(model: mujoco.MjModel, gain: Any, bias: Any, xp: Any) -> Any:
+    """`Dofs.actuator_force` of actuators with these gains and biases, by `xp`: NumPy or jax.numpy."""
+    gear = model.actuator_gear[:, 0]
+    return xp.stack([gear * bias[:, 0], gear**2 * bias[:, 1], gear**2 * bias[:, 2], gear * gain[:, 0]], axis=1)
+
+
+def damps_implicitly(model: mujoco.MjModel) -> bool:
+    """Whether the integrator is implicit in damping."""
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return bool(implicit or not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP))
+
+
 def dofs_of(model: mujoco.MjModel) -> Any:
     """Returns `Dofs` of a model."""
     joints = model.dof_jntid
@@ -171,12 +183,11 @@ def dofs_of(model: mujoco.MjModel) -> Any:
     limited = np.flatnonzero(model.jnt_limited if not is_sparse(model) else [])
     on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     driven = np.where(on_joint, model.actuator_trnid[:, 0], 0)
-    gear, gain, bias = model.actuator_gear[:, 0], model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+    gear = model.actuator_gear[:, 0]
     everything = np.array([-np.inf, np.inf])
     links = links_of(model)
     link_of_joint = np.flatnonzero(links.joint >= 0)  # in the order of joints
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    euler_damp = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
     drive = np.where(model.jnt_actfrclimited[joints, None], model.jnt_actfrcrange[joints], everything)
     return fill(
         Dofs,
@@ -184,7 +195,7 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         body=link_of_joint[joints],
         armature=model.dof_armature,
         damping=model.dof_damping,
-        implicit_damping=model.dof_damping * (euler_damp or implicit),
+        implicit_damping=model.dof_damping * damps_implicitly(model),
         implicit=int(implicit),
         drive=drive,
         first_control=7 * model.nmocap,
@@ -201,7 +212,7 @@ def dofs_of(model: mujoco.MjModel) -> Any:
         actuator_dof=np.where(on_joint, model.jnt_dofadr[driven], -1),
         actuator_qpos=model.jnt_qposadr[driven],
         tendons=_tendons_of(model),
-        actuator_force=np.stack([gear * bias[:, 0], gear**2 * bias[:, 1], gear**2 * bias[:, 2], gear * gain], axis=1),
+        actuator_force=actuator_force(model, model.actuator_gainprm, model.actuator_biasprm, np),
         actuator_clip=np.concatenate(
             [
                 np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, everything),
@@ -227,11 +238,10 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
     geom1[swap], geom2[swap] = geom2[swap], geom1[swap]
     kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
-    slide, slots = pairs.friction[:, 0], int(most.sum())
+    slots = int(most.sum())
     elliptic, edges = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, edges_of(model, pairs.dim)
-    few, all_fit, alone = slots <= FEW, rows >= int((most * edges).sum()), elliptic | (pairs.dim == 1)
+    few, all_fit = slots <= FEW, rows >= int((most * edges).sum())
     slips = np.where(pairs.solreffriction.any(axis=1, keepdims=True), pairs.solreffriction, pairs.solref)
-    weight = sum(model.body_invweight0[model.geom_bodyid[geom], 0] for geom in (geom1, geom2))
     return fill(
         Contacts,
         geom_body=links_of(model).last[model.geom_bodyid],
@@ -249,12 +259,9 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
         margin=pairs.margin,
         dim=pairs.dim,
         edges=edges,
-        friction=pairs.friction[:, :3],
-        rolling=pairs.friction[:, 3:],
+        **frictions(model, pairs, pairs.friction, np),
         soft=[softness(model, *soft) for soft in zip(pairs.solref, pairs.solimp)],
-        weight=weight * np.where(alone, 1, (1 + slide**2) * 2 * slide**2 / model.opt.impratio),
         slots=slots if few or all_fit else min(slots, max(1, rows // 3)),
-        mu=np.where(pairs.dim == 1, 1, slide / np.sqrt(model.opt.impratio)),
         slip=[softness(model, *soft)[1] for soft in zip(slips, pairs.solimp)],
         elliptic=int(elliptic),
         pair=np.repeat(np.arange(len(kind)), most),

@@ -7,6 +7,7 @@ import mujoco
 from mjx_dher.envs.engines import graph
 from mjx_dher.envs.engines.fused import kernel, memory, setup
 from mjx_dher.envs.engines.fused.sparse import sparse_of
+from mjx_dher.envs.engines.fused.varied import NONE, Begins
 from mjx_dher.system.warp_setup import load, wp
 
 # Threads that share an environment of few degrees of freedom, and the most warps of 32 threads in a block: measured on an H100.
@@ -24,12 +25,13 @@ class Simulation:
       model: a model for which `unsupported` is empty; its options limit the iterations of Newton's method and its line search.
       substeps: timesteps an environment step.
       rows: constraint rows that fit into memory; more than can occur are not allocated.
+      varied: where the inputs have numbers of the model.
 
     Raises:
       ValueError: the device's shared memory does not suffice.
     """
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = 10**6):
+    def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = 10**6, varied: Begins = NONE):
         structs = _structs(model, rows)
         size, contacts, sparse = structs[-1].size, structs[3], structs[4]
         device = wp.get_device()
@@ -39,7 +41,7 @@ class Simulation:
         kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
         edges = int(max([6, *contacts.edges.numpy()]))
         pulls = bool(structs[2].tendons.number)
-        traits = kernel.Traits(kinds, edges, contacts.near == 0, sparse.rows > 0, pulls, bool(contacts.elliptic))
+        traits = kernel.Traits(kinds, edges, contacts.near == 0, sparse.rows > 0, pulls, bool(contacts.elliptic), varied)
         self._kernel = kernel.make(size if warps else 0, self._threads, warps, model.nv, traits)
         memory = wp.zeros((num_envs, size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (*structs, memory)
