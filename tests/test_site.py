@@ -84,11 +84,11 @@ def test_versions_are_ordered_as_numbers(tmp_path):
 def test_links_that_lead_nowhere_are_listed(tmp_path):
     (tmp_path / "a.html").write_text(
         '<h1 id="top">A</h1><a href="b.html#x%20y">1</a><a href="#top">2</a><a href="https://example.org/none">3</a>'
-        '<a href="none.html">4</a><a href="b.html#none">5</a><img src="none.png"><a href="#none">6</a>'
+        '<a href="none.html">4</a><a href="b.html#none">5</a><img src="none.png"><a href="#none">6</a><a href="http://[">7</a>'
     )
     (tmp_path / "b.html").write_text('<p id="x y"><a href="a.html">A</a></p>')
     found = sorted(line.removeprefix("a.html links to ") for line in check.broken_links(tmp_path))
-    assert found == ["#none", "b.html#none", "none.html", "none.png"]
+    assert found == ["#none", "b.html#none", "http://[", "none.html", "none.png"]
 
 
 def test_the_paper_has_the_journals_form():
@@ -110,3 +110,5 @@ def test_the_paper_has_the_journals_form():
     assert shown.startswith(f"# {head['title']}\n")
     assert "(Andrychowicz et al. 2017)" in shown
     assert "@" not in shown
+    with pytest.raises(ValueError, match="nobody"):
+        citations.page(text.read_text().replace("[@her]", "[@nobody]"), bib.read_text())

@@ -46,17 +46,24 @@ class Page(HTMLParser):
                 self.names.add(value)
 
 
+def leads(path: Path, link: str, pages: dict[Path, Page]) -> bool:
+    """Whether a link of the page `path` leads to a file, and to a name in it. True for other sites' addresses."""
+    try:
+        target = urlsplit(link)
+        if target.scheme or target.netloc or link.startswith("/"):
+            return True
+        end = (path.parent / unquote(target.path)).resolve() if target.path else path
+        return end.is_file() and (not target.fragment or unquote(target.fragment) in getattr(pages.get(end), "names", ()))
+    except ValueError:  # no address at all
+        return False
+
+
 def broken_links(site: Path) -> Iterator[str]:
     """Links of all pages that lead nowhere."""
-    pages = {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    site = site.resolve()
+    pages = {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html") if path.parent.name != "demo"}
     for path, page in pages.items():
-        for link in page.links:
-            target = urlsplit(link)
-            if target.scheme or target.netloc or link.startswith("/") or path.parent.name == "demo":
-                continue
-            end = (path.parent / unquote(target.path)).resolve() if target.path else path
-            if not end.is_file() or (target.fragment and unquote(target.fragment) not in getattr(pages.get(end), "names", ())):
-                yield f"{path.relative_to(site)} links to {link}"
+        yield from (f"{path.relative_to(site)} links to {link}" for link in page.links if not leads(path, link, pages))
 
 
 def wide_pages(site: Path, driver: Any) -> Iterator[str]:
@@ -107,6 +114,6 @@ def in_browser(site: Path) -> Iterator[str]:
 if __name__ == "__main__":
     if len(sys.argv) != 2 or not Path(sys.argv[1], "searchindex.js").is_file():
         raise SystemExit(__doc__)
-    problems = [*broken_links(Path(sys.argv[1]).resolve()), *in_browser(Path(sys.argv[1]))]
+    problems = [*broken_links(Path(sys.argv[1])), *in_browser(Path(sys.argv[1]))]
     print("\n".join([*problems, f"{len(problems)} problems"]))
     raise SystemExit(bool(problems))

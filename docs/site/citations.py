@@ -42,6 +42,8 @@ def reference(entry: dict[str, str]) -> str:
 def page(text: str, bib: str) -> str:
     """The paper as a page: its title as heading, labels for keys, and the references at the end."""
     known, (_, front, body) = entries(bib), text.split("---\n", 2)
+    if missing := sorted(set(re.findall(r"@(\w+)", "".join(CITATION.findall(body)))) - set(known)):
+        raise ValueError(f"{PAPER}.md cites {', '.join(missing)}, which the .bib file lacks")
     body = CITATION.sub(lambda keys: "(" + "; ".join(label(known[key[1:]]) for key in keys[1].split("; ")) + ")", body)
     title = re.search(r'^title: "(.*)"$', front, re.M)
     body = re.sub(r"^# ", "## ", body, flags=re.M)
