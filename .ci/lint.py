@@ -30,7 +30,7 @@ NAMES_HEAD = """# API: index of names
 
 Every public name of the algorithm's modules. The module's link leads to its docstrings, with shapes and errors. The package
 itself has the names in `mjx_dher.__all__`, such as `Config`, `HParams`, `RunSpec`, `preset`, `train_runs`, `make_train` and
-`load_policy`. [Environments](environments.md) has those of `mjx_dher.envs`. `python .ci/lint.py --write-names` writes it.
+`load_policy`. [Environments](environments.md) lists `mjx_dher.envs`. `python .ci/lint.py --write-names` writes it.
 
 | name | module | description |
 |---|---|---|
