@@ -1,0 +1,52 @@
+"""Critics of 2024 and 2025 in the preset `gpu` of Slide and Block Z: normalization, residual blocks, categorical values, resets.
+
+    python bench/modern_critics.py --out critics --plan
+    python bench/modern_critics.py --out critics --minutes 9   trains for 9 minutes and reports; run it again to resume
+    python bench/modern_critics.py --out toy --toy --seeds 2   the same on the point mass, on a CPU
+
+It is bench/bakeoff.py with other arms, and has its options. docs/experiments/ablation.md has the plan.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable
+
+import bakeoff
+from ablation import sized
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes, tuned
+
+from mjx_dher.spec import RunSpec
+
+RESET_CYCLES = 6  # of 17 on Slide and 15 on Block Z, so that the last reset has five or three cycles to recover
+# What an arm changes about the preset: `dtqc`, `layer_norm` in the critics, three layers of 512.
+CHANGES: dict[str, Callable[[RunSpec], RunSpec]] = {
+    "preset": lambda run: run,
+    "mlp": lambda run: dataclasses.replace(run, networks="mlp"),
+    "residual": lambda run: dataclasses.replace(run, networks="residual"),
+    "unit_norm": lambda run: dataclasses.replace(run, networks="unit_norm"),
+    "categorical": lambda run: dataclasses.replace(run, learner="ctd3"),
+    "categorical_unit_norm": lambda run: dataclasses.replace(run, learner="ctd3", networks="unit_norm"),
+    "resets": lambda run: sized(run, reset_every=RESET_CYCLES * run.config.updates_per_cycle),
+}
+
+
+def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
+    """Run of an arm, seed 0, with the preset's priority."""
+    del learner
+    run = dataclasses.replace(tuned("slide" if toy else task), env=task)
+    return CHANGES[arm.name](sized(run, **(TOY if toy else SIZES["best", task].changes)))
+
+
+CRITICS = Experiment(
+    arms=tuple(Arm(name, name) for name in CHANGES),
+    learners=("gpu",),
+    tasks=("slide", "block_rotate_z"),
+    spec_of=spec_of,
+    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    table="modern_critics.csv",
+)
+
+if __name__ == "__main__":
+    sys.exit(bakeoff.main(None, CRITICS, __doc__))
