@@ -20,6 +20,7 @@ from paper_set import verdict
 sys.path.append(str(DOCS.parent / "bench"))
 
 from ablation import ABLATION
+from as_published import EXPERIMENTS as PUBLISHED
 from bakeoff_arms import BAKEOFF, Experiment
 from bakeoff_report import ALPHA, Row, compare, corrected, forest
 from bakeoff_runs import by_arm, load
@@ -52,6 +53,7 @@ PAGES = (
     Page(ABLATION, EXPERIMENTS / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
     Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
     Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
+    Page(PUBLISHED["cher"], EXPERIMENTS / "as_published.md", DOCS / "as_published_cher_runs.csv", "cher", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
 
@@ -85,7 +87,7 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
     several, lines, before = len(page.experiment.learners) > 1, [], None
     for row in rows:
         family = (row.learner, row.task)
-        names = [NAMES[row.task], *([f"`{row.learner}`"] if several else [])]
+        names = [NAMES.get(row.task, row.task.capitalize()), *([f"`{row.learner}`"] if several else [])]
         lines.append([*(names if family != before else [""] * len(names)), *cells(row)])
         before = family
     return table(f"task | {'learner | ' if several else ''}arm | {COLUMNS}", lines)

@@ -107,7 +107,9 @@ def lottery(the_set: Mapping[str, Sweeps]) -> str:
         gains, same = future[:, None] - weighted, (future[:, None] - future)[~np.eye(len(future), dtype=bool)]
         counts = [f"{np.sum(hits)} of {hits.size}" for hits in (gains >= claimed, gains <= -claimed, same >= claimed)]
         rows.append([NAMES[task], str(claimed), *counts])
-    return table("task | epochs | `weighted` sooner by these | `weighted` later | `future` sooner than `future`", rows)
+    return table(
+        "task | epochs | pairs with `weighted` sooner by at least these | later | `future` sooner than another seed of it", rows
+    )
 
 
 def pooled_gains(data: Mapping[str, Sweeps]) -> str:
