@@ -187,9 +187,8 @@ def test_arms_of_several_tasks_can_be_corrected_together(report, arms):
 
 def test_runs_that_are_kept_are_those_of_the_arms_as_they_are(arms, ablation):
     """Else `--runs` would train them again: a preset that changes must not change what was compared."""
-    import bakeoff_runs
-
     import as_published
+    import bakeoff_runs
 
     ours, parts, cher = arms.BAKEOFF, ablation.ABLATION, as_published.EXPERIMENTS["cher"]
     of_ours = [(name, ours) for name in ("bakeoff", "bakeoff_repeat", "bakeoff_third")]
