@@ -11,6 +11,7 @@ import numpy as np
 import paper_analysis
 import paper_set
 import pytest
+import scipy.stats
 from conftest import ROOT, refuses
 from markdown_it import MarkdownIt
 
@@ -172,6 +173,44 @@ def test_the_readme_s_ranges_are_of_these_seeds_and_of_the_originals():
         there = next(cells(line)[5] for line in bench.splitlines() if re.match(rf"\| {task} \| [\d,]+ \| \d+ \|", line))
         for shown, seeds in ((row[1], SUCCESS.findall(there)), (row[3], published(task, "cpu")[0])):
             assert shown.strip() == f"{min(seeds)} to {max(seeds)}"
+
+
+README_EFFECTS = [  # task, sweep and setting, baseline's, sign of the difference in the text
+    ("push", ("own_push", "weighted"), ("own_push", "future"), 1),
+    ("pick_and_place", ("own_pick_and_place", "weighted"), ("own_pick_and_place", "future"), 1),
+    ("push", ("own_methods", "epsilon_closest"), ("own_push", "future"), -1),
+    ("push", ("own_methods", "closest"), ("own_methods", "epsilon_closest"), -1),
+    ("push", ("k_push", "future, her_k 16"), ("samplers", "future"), 1),
+    ("slide", ("k_slide", "future, her_k 16"), ("slide", "future"), -1),
+    ("push", ("eventful_push", "future, priority_fraction 0.5"), ("samplers", "future"), 1),
+    ("pick_and_place", ("eventful_pick_and_place", "future, priority_fraction 0.5"), ("pick_and_place", "future"), 1),
+]
+
+
+@pytest.fixture(scope="module")
+def committed():
+    """Success by task, sweep, setting and seed, as in the files."""
+    curves = {}
+    for task in paper_analysis.NAMES:
+        with (ROOT / "docs" / "paper" / f"{task}_curves.csv").open() as file:
+            for row in csv.DictReader(file):
+                by_seed = curves.setdefault((task, row["sweep"], row["setting"]), {})
+                by_seed.setdefault(int(row["seed"]), []).append(float(row["success_rate"]))
+    return curves
+
+
+@pytest.mark.parametrize(("task", "own", "base", "sign"), README_EFFECTS)
+def test_the_effects_in_the_readme_by_scipy(committed, task, own, base, sign):
+    """Areas by the trapezoidal rule over the common epochs, paired by seed, with scipy's t interval."""
+    a, b = committed[task, *own], committed[task, *base]
+    epochs = min(len(curve) for curve in (*a.values(), *b.values()))
+    area = lambda curve: np.trapezoid(curve[:epochs]) / (epochs - 1)  # noqa: E731
+    test = scipy.stats.ttest_rel(*([sign * area(curves[seed]) for seed in a] for curves in (a, b)))
+    low, high = test.confidence_interval(0.95)
+    mean = np.mean([sign * (area(a[seed]) - area(b[seed])) for seed in a])
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    signed, plain = (f"{mean:{f}.3f} ({low:{f}.3f} to {high:{f}.3f})" for f in ("+", ""))
+    assert signed in readme or plain in readme, (signed, plain)
 
 
 def test_the_gain_of_td_error_over_all_sweeps():
