@@ -111,17 +111,18 @@ class Data:
             if name not in places or name in self.layout.derived:
                 check_name("field", name, [each for each in places if each not in self.layout.derived])
             place, shape = places[name]
-            check_shape(name, given, (*row.shape[:-1], *shape))
-            value = xp.asarray(given, np.float32).reshape(*row.shape[:-1], math.prod(shape))
+            value = xp.asarray(given, np.float32)
+            check_shape(name, value, (*row.shape[:-1], *shape))
+            flat = value.reshape((*row.shape[:-1], math.prod(shape)))
             if xp is np:
-                row[..., place] = value
+                row[..., place] = flat
             else:
-                row = row.at[..., place].set(value)
+                row = row.at[..., place].set(flat)
         return type(self)(row, self.layout)
 
     def _field(self, name: str) -> Any:
         place, shape = self.layout.places[name]
-        return self.row[..., place].reshape(*self.row.shape[:-1], *shape)
+        return self.row[..., place].reshape((*self.row.shape[:-1], *shape))
 
     def __getattr__(self, name: str) -> Any:
         if name in STATE or name in ("residue", "factors"):

@@ -112,7 +112,8 @@ def call(name: str, shape: tuple[int, ...], inputs: Array) -> Array:
     """
     if not isinstance(inputs, jax.core.Tracer):
         outputs = np.empty(shape, np.float32)
-        _method(name)(np.asarray(inputs, np.float32), outputs)
+        if outputs.size:
+            _method(name)(np.asarray(inputs, np.float32), outputs)
         return outputs if isinstance(inputs, np.ndarray) else jnp.asarray(outputs)
     result = jax.ShapeDtypeStruct(shape, np.float32)
     inputs = inputs.astype(np.float32)  # JAX may compute in 64 bits
