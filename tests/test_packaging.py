@@ -20,6 +20,25 @@ def test_importing_prints_nothing_and_loads_neither_jax_nor_mujoco():
     assert (run.stdout, run.stderr) == ("set()\n", "")
 
 
+def test_a_run_loads_what_it_uses_and_little_else():
+    """`train --env push --learner ddpg` up to its compilation. Until its end, without the curve, it loads no more."""
+    code = """
+import sys
+from mjx_dher import __main__, envs
+from mjx_dher.cli.train import parse_train_args
+from mjx_dher.runs import driver
+spec = parse_train_args(["--env", "push", "--learner", "ddpg"]).spec
+driver.program_lib.make_loop(envs.make(spec.env), spec, driver.program_lib.choices_of([spec]))
+own = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == "mjx_dher"}
+lines = sum(len(open(module.__file__).readlines()) for module in own.values())
+print(*sorted(own), len(own), lines)
+"""
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    *names, modules, lines = printed.splitlines()[-1].split()
+    assert int(modules) <= 68, names
+    assert int(lines) <= 10_400, names
+
+
 def test_loading_everything_prints_nothing():
     code = (
         "import mjx_dher; [getattr(mjx_dher, n) for n in mjx_dher.__all__];"
