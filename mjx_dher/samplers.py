@@ -49,7 +49,7 @@ class Sampler:
     # Scores of each stored episode's goals, computed once per cycle and passed to `log_weights` as its last argument.
     score: ScoreFn | None = struct.field(pytree_node=False, default=None)
     # The sampler for another goal distance. None unless it measures by the environment's (`of_distance`).
-    measure_by: Callable[[DistanceFn], Sampler] | None = struct.field(pytree_node=False, default=None)
+    measure_by: Callable[[DistanceFn], Sampler] | None = struct.field(pytree_node=False, default=None, kw_only=True)
 
 
 @struct.dataclass
