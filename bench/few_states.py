@@ -26,7 +26,7 @@ from mjx_dher.envs import Simulator
 from mjx_dher.envs.engines import Controls, Physics
 
 ARM = Path(__file__).parent.parent / "docs" / "examples" / "arm.xml"
-SECONDS, TRIALS = 0.005, 41  # of a trial, and how many
+SECONDS, TRIALS = 0.03, 21  # of a trial, and how many
 
 
 def runs(model: mujoco.MjModel, states: int, timesteps: int, length: int):
