@@ -105,6 +105,7 @@ EDITS = {
     ("generator",): "mjx_dher.contrib.generators:reset",
     ("learner",): "mjx_dher.learners.ddpg:make",
     ("networks",): "mjx_dher.networks:mlp",
+    ("demonstrations",): "episodes.npz",
     ("seed",): 7,
     **{("config", field.name): 2 for field in dataclasses.fields(mjx_dher.Config) if field.type == "Count"},
     ("config", "num_envs"): 3,

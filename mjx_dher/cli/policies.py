@@ -82,7 +82,7 @@ def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Co
 class RenderArgs:
     """Draw episodes of a run's or bundled policy, or of random actions, as a video or as stills.
 
-    Needs no screen: EGL or OSMesa draws, as set by MUJOCO_GL. Needs the extra: `pip install -e ".[video]"`.
+    Needs no screen: EGL or OSMesa draws, as set by MUJOCO_GL. Needs the extra `video`.
     """
 
     out: Path
@@ -224,7 +224,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
 class ExportArgs:
     """Write a policy as a file for other programs, and check that the file gives the same actions.
 
-    docs/policies.md describes the files. Needs the extra: `pip install -e ".[export]"`.
+    docs/policies.md describes the files. Needs the extra `export`.
     """
 
     run: tyro.conf.Positional[Path]

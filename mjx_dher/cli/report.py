@@ -80,7 +80,7 @@ def _plot_sweep(args: PlotArgs, console: Console) -> int:
 class ReportArgs:
     """Write an HTML report of a run or a sweep: curves, tables, settings and videos in one file that opens without a server.
 
-    Videos (.mp4, .gif, .webm) in the folder are included. Needs the extra: `pip install -e ".[plot]"`.
+    Videos (.mp4, .gif, .webm) in the folder are included. Needs the extra `plot`.
     """
 
     folder: tyro.conf.Positional[Path]

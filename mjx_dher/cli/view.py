@@ -42,7 +42,7 @@ class Page:
 class ViewArgs:
     """Show policies in the browser: drag the goal and the object, and watch. Ctrl-C ends it.
 
-    A run that is still training is shown as it learns. Needs the extra: `pip install -e ".[view]"`.
+    A run that is still training is shown as it learns. Needs the extra `view`.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
@@ -60,7 +60,7 @@ class ViewArgs:
 
 @dataclasses.dataclass(frozen=True)
 class DemoArgs:
-    """Show the bundled policy of Push in the browser. Ctrl-C ends it. Needs the extra: `pip install -e ".[view]"`."""
+    """Show the bundled policy of Push in the browser. Ctrl-C ends it. Needs the extra `view`."""
 
     page: tyro.conf.OmitArgPrefixes[Page] = dataclasses.field(default_factory=Page)
 

@@ -122,6 +122,9 @@ def check_written(path: Path, content: dict[str, Any], spec: RunSpec) -> None:
 
 def edited(path: Path, content: dict[str, Any], spec: RunSpec) -> dict[str, str]:
     """Settings in config.json that differ from the trained ones, one sentence per name."""
+    file = content["sources"].get("demonstrations")  # the identity has its digest in place of the name
+    if (file is None) != (spec.demonstrations is None):
+        return {"demonstrations": f"demonstrations is {spec.demonstrations!r}, and the file of its training is {file!r}"}
     now = identity_of(content, spec)
     if content["digest"] == fingerprint.digest(now):
         return {}
