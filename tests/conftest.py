@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import importlib.metadata
 import os
 import re
@@ -22,7 +23,7 @@ EXAMPLES = ROOT / "docs" / "examples"
 # Processes may share the folders: what JAX finds half-written it compiles again, and Warp puts a kernel there in one piece.
 KEPT = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-dher-tests"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "xla"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # half of the time goes to small programs
 os.environ.setdefault("WARP_CACHE_PATH", str(KEPT / "warp"))
 MONTH = 30 * 24 * 60 * 60  # s
 
@@ -49,6 +50,12 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 # Compiling takes most of the tests' time, and less than half of it without what makes programs fast. An unknown flag would end
 # the process: jaxlib 0.11 has no fusion emitters to turn off.
 _FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+# These passes make loops faster, which take no time here, and each lengthens the fixed-point iteration that all are part of.
+_PASSES = (
+    *("while-loop-invariant-code-motion", "simplify-while-loops", "while-loop-constant-sinking", "simplify-conditional"),
+    *("tree_reduction_rewriter", "reshape-mover", "gemv-rewriter"),
+)
+_FLAGS += f" --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes={','.join(_PASSES)}"
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     _FLAGS += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", _FLAGS)
@@ -159,6 +166,23 @@ LONGEST = (
     *("sweep", "trainer", "engines", "cli", "checkpoint", "sweep_cli", "warp", "render", "driver", "ddpg", "own"),
     *("mistakes", "identity", "wrong_calls", "claims", "relabel", "replay", "doctor"),
 )
+
+
+def pytest_configure():
+    """Python does not search for reference cycles while modules are imported. That took a third of the time of collection."""
+    gc.disable()
+
+
+def pytest_collection_finish():
+    """Python searches less often, and not among what was imported. Otherwise that takes a seventh of the time of the tests.
+
+    Warp compiles for the CPU without optimization, which is quicker. The test modules import it.
+    """
+    gc.freeze()
+    gc.set_threshold(20_000, 10, 10)
+    gc.enable()
+    if warp := sys.modules.get("warp"):
+        warp.config.optimization_level = 0
 
 
 def pytest_collection_modifyitems(items):
