@@ -21,9 +21,9 @@ DEFAULT = HParams()
 _compiled = {}
 
 
-@pytest.fixture(autouse=True)
-def compile_once(monkeypatch):
-    """What one test has compiled the next one need not: a compiled program has no state."""
+@pytest.fixture(scope="module", autouse=True)
+def compile_once():
+    """Tests and fixtures of a module that imports it share compiled programs, which have no state."""
     compile_runs = program.compile_runs
 
     def cached(env, specs, max_lanes, final_episodes, report, devices=()):
@@ -39,7 +39,9 @@ def compile_once(monkeypatch):
             report(line)
         return compiled
 
-    monkeypatch.setattr(program, "compile_runs", cached)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(program, "compile_runs", cached)
+        yield
 
 
 def spec_of(static=CONFIG, **changes):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import refuses
+from sweep_helpers import compile_once  # noqa: F401
 
 import mjx_dher
 from mjx_dher import Config, HParams, RunSpec, cli, envs, samplers, spec
