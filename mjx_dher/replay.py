@@ -125,7 +125,8 @@ def add(state: ReplayState, episodes: Episode, priority: Array | float = 0.0, va
       valid: mask [N] of the episodes to write, bool. Default: all.
 
     Raises:
-      ValueError: more episodes than the ring holds, or arrays with other shapes or dtypes.
+      ValueError: more episodes than the ring holds, or arrays with other shapes or dtypes. Outside `jit` also for a length
+        below 1 or above T, or below T in a ring without `ends`.
     """
     episodes = episodes.filled()
     num_new, num_rows = _check_new(state, episodes, priority, valid), capacity(state)
@@ -179,6 +180,13 @@ def _check_new(state: ReplayState, episodes: Episode, priority: Array | float, v
             raise ValueError(f"{name} must be [N] = {list(leading)}, one for each episode; got {list(np.shape(value))}")
     if leading == (0,):
         raise ValueError("episodes must have at least one episode; got none")
+    if not isinstance(episodes.length, jax.core.Tracer) and not isinstance(valid, jax.core.Tracer):
+        most = episodes.action.shape[1]
+        least = 1 if state.ends else most
+        length = np.asarray(episodes.length)[... if valid is None else np.asarray(valid, bool)]
+        if not np.all((length >= least) & (length <= most)):
+            hint = "" if state.ends else " (shorter ones need a ring by init(..., ends=True))"
+            raise ValueError(f"length of episodes must be in [{least}, {most}]{hint}; got {length.tolist()[:8]}")
     return leading[0]
 
 

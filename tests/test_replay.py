@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,6 +83,19 @@ def test_refuses_an_empty_ring_and_lengths_that_disagree():
         replay.init(template, 0)
     with refuses("scalar", 5):
         replay.init(template.replace(observation=template.observation | {"scalar": jnp.zeros(4)}), 2)
+
+
+def test_short_episodes_need_a_ring_for_them():
+    """Else their padding would be drawn. Lengths of episodes that are not written do not matter."""
+    episodes = dataclasses.replace(make_episodes([0, 1]), length=jnp.array([1, 2]))
+    ring, ends = make_ring(4), replay.init(jax.tree.map(lambda x: x[0], episodes), 4, ends=True)
+    with refuses("length", [1, 2], [T, T], "ends=True"):
+        replay.add(ring, episodes)
+    assert replay.add(ends, episodes).size == 2
+    with refuses("length", [0, 2]):
+        replay.add(ends, dataclasses.replace(episodes, length=jnp.array([0, 2])))
+    kept = replay.add(ring, dataclasses.replace(episodes, length=jnp.array([1, T])), valid=jnp.array([False, True]))
+    assert kept.size == 1
 
 
 def test_draw_rows_mixes_by_priority_and_uniform():

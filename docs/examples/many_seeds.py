@@ -28,7 +28,7 @@ def main(argv=None):
     )
     program = make_train(PointMass(), config, sampler=samplers.make("weighted"))
     keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
-    # One value per lane. To compare values, replace one, such as `hparams._replace(gamma=jnp.array([0.9, 0.95]))`.
+    # One value per lane. To compare values, replace one: `hparams._replace(gamma=jnp.linspace(0.9, 0.95, args.seeds))`.
     hparams = jax.tree.map(lambda x: jnp.full(args.seeds, x), HParams(gamma=0.9, polyak=0.98))
     states = jax.jit(jax.vmap(program.init))(keys, hparams)
     epoch = jax.jit(jax.vmap(program.epoch), donate_argnums=0)
