@@ -186,7 +186,7 @@ def test_a_safetensors_file_holds_the_policy_to_the_bit(run):
 
 
 def test_the_document_loads_a_run_in_python(run):
-    (example,) = [block for block in python_of_the_document() if "load_policy" in block]
+    (example,) = [block for block in python_of_the_document() if "load_policy(run)" in block]
     scope = {"run": run, "observation": np.ones((5, D)), "desired_goal": np.ones((5, G))}
     exec(example, scope)
     assert scope["action"].shape == (5, A)
