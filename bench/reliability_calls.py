@@ -142,7 +142,7 @@ def silent(kind, field, text, folder, right):
         return "" if field in text else "silent: changed without a word"
     now = {**of_run(folder), "config": right["config"]}  # the edited one
     if field == "keep_end":  # an option that means what it says: the last checkpoint may stay
-        now["files"] = [file for file in now["files"] if not file.startswith("checkpoints/")]
+        now["files"] = [file for file in now["files"] if not file.startswith("checkpoints")]
     return "" if now == right else "silent: another result"
 
 
