@@ -108,6 +108,15 @@ def geometric(achieved: Array, desired: Array, step: Array, hparams: HParams, le
 random = Sampler(episode, cross_episode=True)
 
 
+def __getattr__(name: str) -> Any:
+    """The samplers that measure distances are in `by_distance`, which a run loads only if it uses one."""
+    if name in ("closest", "epsilon_closest", "weighted"):
+        from mjx_dher import by_distance
+
+        return getattr(by_distance, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 def make(
     name: str | Sampler | LogWeightsFn,
     kernel: str | KernelFn = "linear",

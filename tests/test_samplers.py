@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import samplers, spec
+from mjx_dher import by_distance, samplers, spec
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
 from mjx_dher.spec import RunSpec
@@ -215,3 +215,10 @@ def test_what_cannot_be_used_is_refused(mine, arguments, parts):
 def test_a_run_with_a_name_that_is_not_built_in_is_refused(field, value):
     with pytest.raises(ValueError, match=f"{field} must be one of .*module:attribute; got '{value}'"):
         spec.validate(RunSpec(**{field: value}))
+
+
+def test_the_papers_samplers_are_among_the_samplers():
+    assert samplers.weighted is by_distance.weighted
+    assert samplers.closest is by_distance.closest
+    with pytest.raises(AttributeError, match="wieghted"):
+        samplers.wieghted  # noqa: B018
