@@ -19,6 +19,7 @@ from test_identity import SPEC, edit, resume, train
 
 import mjx_dher
 from mjx_dher import Options, cli
+from mjx_dher.cli import resume as resume_module
 from mjx_dher.cli import sweep
 from mjx_dher.cli import train as train_module
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
@@ -219,7 +220,7 @@ def test_a_sweep_starts_runs_over_whose_metrics_are_of_another(tmp_path):
 def test_other_versions_than_the_run_began_with_are_reported(stopped, monkeypatch, capsys):
     content = reading.read_config(stopped)
     edit(stopped, ("versions", "jax"), "0.0.1")
-    monkeypatch.setattr(train_module, "_train", lambda *arguments: 0)
+    monkeypatch.setattr(resume_module, "train_into", lambda *arguments: 0)
     assert resume(stopped, capsys)[1].count(f"jax was 0.0.1 and is {content['versions']['jax']}") == 1
 
 
@@ -291,7 +292,7 @@ def test_options_of_resume_are_those_of_the_next_one(stopped, monkeypatch, capsy
     ]
     given += ["--total-steps", "320"]
     taken = []
-    monkeypatch.setattr(train_module, "_train", lambda *arguments: taken.append(arguments) or 0)
+    monkeypatch.setattr(resume_module, "train_into", lambda *arguments: taken.append(arguments) or 0)
     assert cli.main(["resume", str(stopped), *given]) == 0
     options = Options(final_episodes=3, checkpoint_every=0, keep=3, keep_end=True, log=("jsonl",), stop_at=0.9)
     assert taken[0][3] == options
