@@ -112,7 +112,7 @@ def _found(arm: str, rows: Sequence[Row]) -> str:
 
 
 def blocks(page: Page, rows: Sequence[Row]) -> Mapping[str, str]:
-    """Tables of a page by name."""
+    """Tables of a page, each with its name."""
     return {"claims": claims(rows, page.experiment)} if page.claims else {page.name: whole_table(page, rows)}
 
 

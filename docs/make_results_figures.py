@@ -221,7 +221,7 @@ OWN, TODAY = "the paper's cycles, 20 seeds", "today's preset"  # names of the se
 
 
 def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, str]:
-    """All tables by name, from the curves of the set and of 2026-11-22."""
+    """All tables with their names, from the curves of the set and of 2026-11-22."""
     both = with_repeats(the_set, before)
     found = {"verdicts": verdicts(the_set), "lottery": lottery(the_set), "samplers": samplers(the_set), "k": ks(the_set)}
     found |= {"pooled": pooled_gains(both), "repeats": repeats(both), "robustness": robustness(before)}

@@ -115,7 +115,7 @@ def table(head: str, rows: list[list[str]]) -> str:
 
 
 def with_tables(page: str, script: str, blocks: Mapping[str, str]) -> str:
-    """The page's text with a script's current tables, by name.
+    """The page's text with a script's current tables, which have names.
 
     Raises:
       ValueError: the page has no place for a table.

@@ -146,7 +146,7 @@ def add_comments(module: str) -> None:
 
 
 def classes(module: str) -> dict[str, ast.ClassDef]:
-    """Classes of an imported module by name."""
+    """Classes of an imported module, with their names."""
     origin = getattr(sys.modules.get(module), "__file__", None)
     tree = ast.parse(Path(origin).read_text(encoding="utf-8")) if origin else ast.Module([], [])
     return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
