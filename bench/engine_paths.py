@@ -1,15 +1,19 @@
 """Both paths of the engine warp against native: the difference of their coordinates, and their speed.
 
     PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu] [--models arm block_rotate_z] [--num-envs 1024 8192]
+    PYTHONPATH=.:tests python bench/engine_paths.py --models push --varied "mass:object0" "friction:object0"   and not varied
 
 A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest of all coordinates within 8
 environment steps of 64 environments under random controls. A task has its own number of timesteps per step. The speed is
-measured over the next 24 steps, of physics alone. Each line is printed as soon as it is measured.
+measured over the next 24 steps, of physics alone. Each line is printed as soon as it is measured. With --varied, the models
+run with and without varied physics, by random factors from 0.5 to 1.5.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import itertools
 import time
 
 import jax
@@ -23,7 +27,7 @@ from mjx_dher import envs
 from mjx_dher.envs.engines import make_engine
 
 FEW = 64  # environments that `native` plays, too
-HEAD = "| model | path | environments | env steps/s | first call, s | median distance | largest |"
+HEAD = "| model | varied | path | environments | env steps/s | first call, s | median distance | largest |"
 
 
 def load(name: str) -> tuple[mujoco.MjModel, int]:
@@ -36,9 +40,13 @@ def load(name: str) -> tuple[mujoco.MjModel, int]:
     return env.model, env.engine._substeps
 
 
-def measure(engine, model, num_envs: int) -> tuple[float, float, np.ndarray]:
+def measure(engine, model, num_envs: int, factors: int) -> tuple[float, float, np.ndarray]:
     """Environment steps per second, seconds of the first call, and coordinates [64, 8, nq]."""
     first, controls = start(model, (FEW,))
+    if factors:
+        first = dataclasses.replace(
+            first, factors=jax.random.uniform(jax.random.key(0), (FEW, factors), minval=0.5, maxval=1.5)
+        )
     many = lambda x: jnp.tile(x, (num_envs // FEW, *([1] * (x.ndim - 1))))  # noqa: E731
     first, controls = jax.tree.map(many, first), jax.tree.map(many, controls)
     played = jax.jit(jax.vmap(lambda *given: play(engine, *given)))
@@ -60,23 +68,25 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=[*MODELS, "docs/examples/arm.xml"])
     parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
+    parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object0"')
     args = parser.parse_args()
-    print(f"{machine()}\n\n{HEAD}\n|{'---|' * 7}", flush=True)
-    for name in args.models:
+    print(f"{machine()}\n\n{HEAD}\n|{'---|' * 8}", flush=True)
+    for name, varied in itertools.product(args.models, [[], args.varied] if args.varied else [[]]):
         model, substeps = load(name)
-        native = measure(make_engine("native", model, substeps), model, FEW)
-        print(f"| {name} | native | {FEW} | {native[0]:,.0f} | {native[1]:.1f} | | |", flush=True)
+        native = measure(make_engine("native", model, substeps, varied=varied), model, FEW, len(varied))
+        row = f"| {name} | {', '.join(varied)} |"
+        print(f"{row} native | {FEW} | {native[0]:,.0f} | {native[1]:.1f} | | |", flush=True)
         for path in args.paths:
             try:
-                engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu)
+                engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu, varied=varied)
             except ValueError as error:
-                print(f"| {name} | {path} | {error} | | | | |", flush=True)
+                print(f"{row} {path} | {error} | | | | |", flush=True)
                 continue
             for num_envs in args.num_envs:
-                rate, compiled, qpos = measure(engine, model, num_envs)
+                rate, compiled, qpos = measure(engine, model, num_envs, len(varied))
                 error = np.abs(qpos - native[2]).max(axis=(1, 2))
                 distances = f"{np.median(error):.1e} | {error.max():.1e}"
-                print(f"| {name} | {path} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
+                print(f"{row} {path} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
 
 
 if __name__ == "__main__":

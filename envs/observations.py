@@ -28,8 +28,8 @@ class Entry:
         if len(set(sizes)) > 1:
             raise ValueError(f"observation {text!r} must subtract entries of equal sizes; got {sizes}")
         self.size = sizes[0]
-        self.names = self._parts[0].names  # of the joints or sensors whose numbers it has
-        self.reads_sensors = any(part.kind == "sensor" for part in self._parts)
+        self.joints = next((part.names for part in self._parts if part.kind in ("qpos", "qvel")), ())  # of its numbers
+        self.sensors = next((part.names for part in self._parts if part.kind == "sensor"), ())
 
     def __call__(self, physics: Physics) -> Array:
         value, *others = [part(physics) for part in self._parts]

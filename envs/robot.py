@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.contract import robot_interface
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.wrappers import ActionFilter, FrameStack, Wrapper
@@ -42,7 +41,7 @@ class RobotLoop:
         self.task, self.policy = task, policy
         model = task.model
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "sensors": model.nsensordata, "goal": task.goal_size}
-        self._senses = bool(robot_interface(task).get("sensors"))
+        self._senses = task._rest.sensors is not None
         self._see, self._act = jax.jit(self._observe), jax.jit(self._control)
         zeros = {name: np.zeros(size, np.float32) for name, size in self._sizes.items()}
         self.start()

@@ -86,7 +86,7 @@ class MujocoTask(SimulatedTask):
         ends = np.cumsum([0, *(entry.size for entry in self._entries)]).tolist()
         self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
         self.observation_size = ends[-1]
-        if any(entry.reads_sensors for entry in self._entries):
+        if any(entry.sensors for entry in self._entries):
             self._sensors = Sensors(self.engine.name, self.model, getattr(self.engine, "allow_cpu", False), tuple(self._ranges))
             none: Any = np.zeros(self.model.nsensordata, np.float32)
             self._rest = dataclasses.replace(self._rest, sensors=none)  # `_sensed` reads them
@@ -98,13 +98,13 @@ class MujocoTask(SimulatedTask):
     @property
     def robot_interface(self) -> dict[str, Any]:
         """Controls, goal, observation layout, and names of joints and sensors of its entries as JSON, for policy files."""
-        named = [(name, entry) for name, entry in zip(self.layout, self._entries) if entry.names]
+        entries = list(zip(self.layout, self._entries))
         return {
             "controls": [part.describe() for part in self.parts],
             "goal": self.goal.describe() | {"threshold": self.distance_threshold},
             "layout": {name: [part.start, part.stop] for name, part in self.layout.items()},
-            "joints": {name: entry.names for name, entry in named if not entry.reads_sensors},
-            "sensors": {name: entry.names for name, entry in named if entry.reads_sensors},
+            "joints": {name: entry.joints for name, entry in entries if entry.joints},
+            "sensors": {name: entry.sensors for name, entry in entries if entry.sensors},
         }
 
     @property

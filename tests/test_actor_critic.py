@@ -148,7 +148,7 @@ def test_critics_learn_a_known_value(name):
     """A chain whose every step costs 1 and leads to itself: Q = -1 / (1 - gamma) = -5, whatever the action."""
     learner, _ = made(name)
     hparams = HParams(gamma=0.8, polyak=0.9, critic_lr=0.003)
-    np.testing.assert_allclose(learned_value(learner)(hparams), -5.0, atol=0.1)
+    np.testing.assert_allclose(learned_value(learner, 5000)(hparams), -5.0, atol=0.1)  # ctd3 had NaN after 2,000
 
 
 @pytest.mark.parametrize("name", ["sac", *(pytest.param(name, marks=pytest.mark.slow) for name in ("redq", "tqc"))])
@@ -180,7 +180,7 @@ def batch_of(action, reward, hparams):
     return Batch(ones, ones, ones, action, reward, jnp.full(len(reward), hparams.gamma), jnp.arange(len(reward)))
 
 
-def learned_value(learner):
+def learned_value(learner, updates=1500):
     """Returns a function of HParams: the value that the critics come to in the chain."""
 
     @jax.jit
@@ -190,7 +190,7 @@ def learned_value(learner):
             state, losses = learner.update(state, batch_of(action, -jnp.ones(32), hparams), hparams)
             return learner.update_target(state, hparams), losses["q_mean"]
 
-        _, values = jax.lax.scan(step, learner.init(jax.random.key(0)), jax.random.split(jax.random.key(1), 1500))
+        _, values = jax.lax.scan(step, learner.init(jax.random.key(0)), jax.random.split(jax.random.key(1), updates))
         return values[-100:].mean()
 
     return value

@@ -76,6 +76,19 @@ def test_a_robots_loop_takes_sensors():
     assert env.robot_interface["sensors"]["sensor:push where - sensor:push where"] == ["push", "where"]
 
 
+def test_a_robots_loop_takes_the_sensor_of_a_difference():
+    class Apart(Press):
+        observations = ("site:pad - sensor:where", "qpos:lift")
+
+    env = Apart(engine="native")
+    loop = RobotLoop(env, lambda obs: obs["observation"][2:3])  # heights: of the pad, minus the sensor's
+    sensors, zeros = np.zeros(env.model.nsensordata), (np.float32(env.model.qpos0), np.zeros(env.model.nv), np.zeros(3))
+    sensors[2] = 0.1
+    assert loop(*zeros, sensors).ctrl[0] == pytest.approx(-0.15 + 0.3 * 0.35)
+    assert env.robot_interface["sensors"] == {"site:pad - sensor:where": ["where"]}
+    assert env.robot_interface["joints"] == {"qpos:lift": ["lift"]}
+
+
 def test_a_sensor_that_is_missing_is_named():
     with refuses("sensor", "'tuoch'", "touch"):
         type("Wrong", (Press,), {"observations": ("sensor:tuoch",)})(engine="native")

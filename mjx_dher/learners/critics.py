@@ -171,7 +171,10 @@ def _sum(term: Callable[[Any], Term], number: int) -> Term:
 
 def lowest(values: Array) -> Array:
     """Smallest of the critics' values [B]. SAC's actor loss uses it, and TD3's with the first critic alone."""
-    return jnp.min(jnp.mean(values, axis=-1), axis=0)
+    means = jnp.mean(values, axis=-1)
+    # Not jnp.min. Its gradient compares the minimum with the values, and XLA may compute these twice, in two ways that round
+    # differently. Then no value equals the minimum, and the gradient is 0 / 0.
+    return jnp.take_along_axis(means, jnp.argmin(means, axis=0)[None], axis=0)[0]
 
 
 def mean(values: Array) -> Array:

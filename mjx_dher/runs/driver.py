@@ -135,7 +135,7 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
     results: list[Result] = []
     while waiting and not (results and session.should_stop()):
         with contextlib.ExitStack() as stack:
-            claimed, waiting = _claim(session, claims, stack, waiting, program.lanes)
+            claimed, waiting = _claim(claims, stack, waiting, program.lanes)
             if not claimed:
                 break
             specs, folders = zip(*claimed)
@@ -144,9 +144,7 @@ def _train_in_turn(session: _Session, program: Program, claims: Claims, waiting:
     return results
 
 
-def _claim(
-    session: _Session, claims: Claims, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int
-) -> tuple[list[Run], list[Run]]:
+def _claim(claims: Claims, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
     """Claims runs for the first process. Returns the claimed and the waiting ones."""
     places = {run[1]: place for place, run in enumerate(waiting)}
     decide = lambda: [[places[folder] for _, folder in runs] for runs in claims.claim(stack, waiting, lanes)]  # noqa: E731

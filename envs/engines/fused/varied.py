@@ -29,6 +29,7 @@ class Numbers:
 
     def __init__(self, model: mujoco.MjModel, variation: Variation, first: int):
         self._model = model
+        self._links, self._pairs, self._met = setup.links_of(model), all_pairs(model), meeting(model)
         fields = [("body_mass",), ("dof_damping",), ("actuator_gainprm",), ("geom_friction", "pair_friction")]
         self._varies = [any(field in variation.fields for field in of_kind) for of_kind in fields]
         begins, ends = [], first
@@ -50,16 +51,11 @@ class Numbers:
         def of(field: str) -> Any:
             return values.get(field, getattr(model, field))
 
-        links = setup.links_of(model)
+        links, pairs, met = self._links, self._pairs, self._met
         ends = links.last[links.body] == np.arange(len(links.body))
-        damping, pairs = of("dof_damping"), all_pairs(model)
-        listed = len(pairs.dim) - len(meeting(model))
-        friction = xp.concatenate(
-            [
-                xp.maximum(of("pair_friction")[:listed], LEAST_FRICTION),
-                mixed_friction(model, meeting(model), of("geom_friction"), xp),
-            ]
-        )
+        damping = of("dof_damping")
+        named = xp.maximum(of("pair_friction")[: len(pairs.dim) - len(met)], LEAST_FRICTION)
+        friction = xp.concatenate([named, mixed_friction(model, met, of("geom_friction"), xp)])
         return [
             [of("body_mass")[links.body] * ends, of("body_inertia")[links.body] * ends[:, None]],
             [damping, damping * setup.damps_implicitly(model)],
