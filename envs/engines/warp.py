@@ -47,7 +47,7 @@ class WarpEngine:
       contacts: memory for contacts, with the same default. Only for `graph`.
       allow_cpu: whether to run without an NVIDIA GPU, on one thread, to compare engines.
       sensors: whether to make the object for `read_sensors` instead of `advance`. Only for `graph`.
-      varied: as in `make_engine`. "auto" is then `graph`.
+      varied: as in `make_engine`.
 
     Raises:
       ValueError: JAX does not run on an NVIDIA GPU and `allow_cpu` is False, or the path does not support the model.
@@ -80,7 +80,7 @@ class WarpEngine:
         self.allow_cpu = allow_cpu
         self._variation = Variation(model, varied)
         self._varied = [name for name in self._variation.fields if name != "dof_M0"]  # which MuJoCo Warp does not have
-        self.path, self.note, rows = _choose(model, path, constraints, bool(varied))
+        self.path, self.note, rows = _choose(model, path, constraints)
         own = varied and self.path == "fused"
         self._numbers = Numbers(model, self._variation, 7 * model.nmocap + model.nu) if own else None
         self.name = "warp" if self.path == "fused" else "warp graph"  # separate names, because results differ
@@ -215,13 +215,11 @@ class WarpEngine:
         return made
 
 
-def _choose(model: mujoco.MjModel, path: str, constraints: int | None, varied: bool) -> tuple[str, str, int]:
+def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[str, str, int]:
     """Path that runs, the reason, and the constraint rows that `fused` has memory for. Raises ValueError if the path does not
     support the model.
     """
     left_out, reason = support.unsupported(model), "as asked"
-    if varied and path == "auto":
-        path, reason = "graph", "physics varies between environments (path='fused' has this, too)"
     if left_out and path != "graph":
         reason = f"the fused kernel does not support features of the model: {', '.join(left_out)}"
         if path == "fused":
