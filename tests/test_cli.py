@@ -297,6 +297,7 @@ def test_ctrl_c_twice_stops_at_once_with_the_last_saved_policy(tmp_path):
     deadline = time.time() + 120
     while not (out / "policy.npz").exists() and time.time() < deadline:
         time.sleep(0.1)
+    time.sleep(1)  # into the second epoch, which takes seven: a signal between two epochs would end the run at once
     os.kill(process.pid, signal.SIGINT)
     time.sleep(0.7)
     os.kill(process.pid, signal.SIGINT)
