@@ -166,6 +166,25 @@ def test_the_table_of_presets_is_that_of_the_file():
     assert tasks == {"push", "pick_and_place", "slide", "reach"}
 
 
+def test_the_table_of_unseen_seeds_is_of_the_file():
+    finals = {}
+    with (ROOT / "docs" / "unseen_runs.csv").open() as file:
+        for row in csv.DictReader(file):
+            assert 600 <= int(row["seed"]) < 610
+            finals.setdefault((row["learner"], row["task"]), []).append(float(row["final"]))
+    page = (ROOT / "docs" / "experiments" / "presets.md").read_text()
+    shown = {
+        (preset, task): SUCCESS.findall(line)
+        for preset, task, line in re.findall(r"\| `(cpu|gpu|frugal)`, `(\w+)` (\|.*)", page)
+    }
+    assert shown.keys() == finals.keys()
+    for of, values in finals.items():
+        assert len(values) == 10
+        low, high = scipy.stats.t.interval(0.95, 9, np.mean(values), scipy.stats.sem(values))
+        numbers = (min(values), np.median(values), max(values), np.mean(values), low, min(high, 1.0))
+        assert shown[of] == [f"{number:.3f}" for number in numbers], of
+
+
 def test_the_readme_s_ranges_are_of_these_seeds_and_of_the_originals():
     readme, bench = (ROOT / "README.md").read_text(), (ROOT / "bench" / "README.md").read_text()
     for task in ("push", "pick_and_place", "slide"):
