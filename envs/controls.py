@@ -19,6 +19,7 @@ from mjx_dher.validation import check_number
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_NONE)
+_FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
 
 
 class Control:
@@ -51,7 +52,7 @@ class Control:
     def describe(self) -> dict[str, Any]:
         """Kind, names of the moved parts, numbers of the action, scale, gear and limits, as JSON."""
         about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved), "size": self.size}
-        for name in ("scale", "turn", "gear", "low", "high"):
+        for name in ("scale", "turn", "gear", "offset", "low", "high"):
             if name in vars(self):
                 about[name] = np.round(np.asarray(vars(self)[name], float), 6).tolist()
         return about
@@ -104,7 +105,10 @@ class Actuators(Control):
 
 
 class JointPosition(Actuators):
-    """Position servos: -1 and 1 are the ends of the servo's ctrlrange, or of its joint's range if it has none."""
+    """Position servos: -1 and 1 are the ends of the servo's ctrlrange, or of its joint's range if it has none.
+
+    A servo's gain is fixed, and its bias is affine and falls with the position.
+    """
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
         return is_servo(model, index)
@@ -123,7 +127,7 @@ class JointDelta(JointPosition):
         self.scale = scale
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
-        target = self.gear * (physics.qpos[self.qpos] + self.scale * action)
+        target = self.gear * (physics.qpos[self.qpos] + self.scale * action) + self.offset
         return dataclasses.replace(
             controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(jnp.clip(target, self.low, self.high))
         )
@@ -136,10 +140,13 @@ class JointDelta(JointPosition):
 
     def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
         self.qpos = model.jnt_qposadr[joints]
-        self.gear = np.array(model.actuator_gear[self.indices, 0], np.float32)
+        self.gear, offset = np.array([_holding(model, i) for i in self.indices], np.float32).T
+        if offset.any():
+            self.offset = offset
 
     qpos: np.ndarray
-    gear: np.ndarray
+    gear: np.ndarray  # input per rad or m of the joint
+    offset: np.ndarray | float = 0.0  # input that holds the joint at 0
 
 
 class Torque(Actuators):
@@ -196,7 +203,14 @@ class Mocap(Control):
 
 def is_servo(model: mujoco.MjModel, index: int) -> bool:
     """Whether an actuator is a position servo, whose force decreases with the position."""
-    return bool(model.actuator_biastype[index] == _AFFINE and model.actuator_biasprm[index, 1] < 0)
+    is_linear = model.actuator_gaintype[index] == _FIXED and model.actuator_biastype[index] == _AFFINE
+    return bool(is_linear and model.actuator_gainprm[index, 0] != 0 and model.actuator_biasprm[index, 1] < 0)
+
+
+def _holding(model: mujoco.MjModel, index: int) -> tuple[float, float]:
+    """Slope and offset of the input with which a servo pulls its joint to a position."""
+    gain, (bias, stiffness) = model.actuator_gainprm[index, 0], model.actuator_biasprm[index, :2]
+    return model.actuator_gear[index, 0] * (-stiffness / gain), -bias / gain
 
 
 def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
@@ -204,7 +218,8 @@ def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     ctrl = np.zeros(model.nu)
     for index in range(model.nu):
         if is_servo(model, index) and (joint := _joint(model, index)) >= 0:
-            ctrl[index] = model.actuator_gear[index, 0] * qpos[model.jnt_qposadr[joint]]
+            slope, offset = _holding(model, index)
+            ctrl[index] = slope * qpos[model.jnt_qposadr[joint]] + offset
     limited = model.actuator_ctrllimited.astype(bool)
     ctrl[limited] = np.clip(ctrl[limited], *model.actuator_ctrlrange[limited].T)
     return ctrl
@@ -222,6 +237,7 @@ def _range(model: mujoco.MjModel, index: int) -> Any:
     if model.actuator_ctrllimited[index]:
         return model.actuator_ctrlrange[index]
     if is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
-        return np.sort(model.actuator_gear[index, 0] * model.jnt_range[joint])
+        slope, offset = _holding(model, index)
+        return np.sort(slope * model.jnt_range[joint] + offset)
     name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")
     raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")

@@ -39,9 +39,10 @@ class RobotLoop:
         if not isinstance(task, SimulatedTask):
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
-        model = task.model
-        self._sizes = {"qpos": model.nq, "qvel": model.nv, "sensors": model.nsensordata, "goal": task.goal_size}
-        self._senses = task._rest.sensors is not None
+        model, sensors = task.model, task._rest.sensors
+        self._sizes = {"qpos": model.nq, "qvel": model.nv, "goal": task.goal_size}
+        self._sizes["sensors"] = 0 if sensors is None else len(sensors)
+        self._senses = sensors is not None
         self._see, self._act = jax.jit(self._observe), jax.jit(self._control)
         zeros = {name: np.zeros(size, np.float32) for name, size in self._sizes.items()}
         self.start()
@@ -60,7 +61,7 @@ class RobotLoop:
           qpos: positions [nq] of all joints of the model in its order, rad or m; a free body has x, y, z, and w, x, y, z.
           qvel: velocities [nv], rad/s or m/s.
           goal: desired goal [G].
-          sensors: sensor data [nsensordata], if the task observes sensors.
+          sensors: sensor data [nsensordata], if the task observes sensors. The arm tasks with a cube observe one number.
 
         Returns:
           `ctrl` [nu] for the actuators and `mocap` [nmocap, 7], in NumPy.

@@ -9,12 +9,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
 
 from mjx_dher import lookup
+from mjx_dher.context import reached_fn
 from mjx_dher.contract import env_spec, episode_template
 from mjx_dher.spec import find_demonstrations
 from mjx_dher.system import npz
@@ -39,7 +40,7 @@ def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
     names = _named(template)
     try:
         check = functools.partial(_check_arrays, names=names, env=env, max_episodes=max_episodes)
-        arrays = npz.read(path, check=check) if path.is_file() else _read_minari(path, names, env.episode_length)
+        arrays = npz.read(path, check=check) if path.is_file() else _read_minari(path, names, env)
         check(arrays)
         _check_values(arrays, names, env, arrays["action"].shape[1])
     except ValueError as error:
@@ -53,15 +54,22 @@ def _named(episode: Episode) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
-def _read_minari(path: Path, names: Mapping[str, Any], num_steps: int) -> dict[str, np.ndarray]:
-    """Reads the episodes of a Minari data set of a goal environment, padded to `num_steps`."""
+def _read_minari(path: Path, names: Mapping[str, Any], env: Env) -> dict[str, np.ndarray]:
+    """Reads the episodes of a Minari data set of a goal environment, padded to the length of `env`'s.
+
+    Their terminal states are terminal for every goal, except those that ended at the goal where `env` does so.
+    """
     lookup.require_extra("a Minari data set", "minari", "minari")
     from minari import MinariDataset
 
     try:
         episodes = list(MinariDataset(path / "data"))
-        rows = [_minari_row(episode, names, num_steps) for episode in episodes]
-        return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        rows = [_minari_row(episode, names, env.episode_length) for episode in episodes]
+        arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        if env_spec(env).ends_at_goal:
+            last: Any = arrays["achieved_goal"][np.arange(len(rows)), arrays["length"]]
+            arrays["terminal"] &= ~np.asarray(reached_fn(env)(last, cast(Any, arrays["desired_goal"])))
+        return arrays
     except (OSError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"must be a Minari data set with goal observations; {type(error).__name__}: {error}") from error
 

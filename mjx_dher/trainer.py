@@ -288,6 +288,8 @@ def _update_normalizers(
     scores = samplers.score_episodes(loop.sampler, fresh.episodes, context)
     sample = add_choices(fresh, sample, loop.sampler, scores, relabel_key)
     batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
+    if loop.spec.ends:  # not what follows the end
+        valid = valid[:, None] & (jnp.arange(num_steps + 1) <= episodes.length[:, None])
     updated = loop.learner.update_normalizers(learner, episodes.observation, batch.desired_goal, context.hparams, valid)
     check.kept("learner.update_normalizers", learner, updated)
     return updated, {**_relabel_metrics(context, sample.desired_goal, batch.desired_goal), "no_goal_share": no_goal_share}

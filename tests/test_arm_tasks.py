@@ -8,6 +8,7 @@ import pytest
 
 from mjx_dher import envs
 from mjx_dher.envs import arms
+from mjx_dher.envs.robot import RobotLoop
 
 MARKER = '<body name="marker" pos="-0.3 0.6 0.07" gravcomp="1"><freejoint/><geom type="box" size=".03 .03 .03"/></body>'
 
@@ -95,3 +96,14 @@ def test_the_arm_moves_as_in_jaxgcrl():
     expected = [1.6079, 0.746, -0.0046, -1.503, 0.0004, 3.0013, 1.4116]
     np.testing.assert_allclose(state.physics.qpos, expected, atol=1e-4)
     np.testing.assert_allclose(state.physics.qvel, [1.3563, 0.1707, -0.0732, 2.627, 0.0069, -2.0323, -1.4378], atol=1e-3)
+
+
+def test_a_robots_loop_takes_the_force(push):
+    observations = []
+    loop = RobotLoop(push, lambda obs: np.tanh(observations.append(obs["observation"]) or obs["observation"][:5]))
+    state = jax.jit(push.reset)(jax.random.key(0))
+    state = jax.jit(push.step)(state, jnp.ones(5))
+    sent = loop(state.physics.qpos, state.physics.qvel, state.obs["desired_goal"], state.physics.sensors)
+    np.testing.assert_allclose(observations[-1], state.obs["observation"], atol=1e-6)
+    expected = push.controls(state.physics, jnp.tanh(state.obs["observation"][:5]))
+    np.testing.assert_allclose(sent.ctrl, expected.ctrl, atol=1e-5)

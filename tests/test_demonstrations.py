@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +14,14 @@ from conftest import EXAMPLES, refuses
 from flax import struct
 
 import mjx_dher
-from mjx_dher import HParams, Options, RunSpec, cli, trainer
+from mjx_dher import HParams, Options, RunSpec, cli, demonstrations, trainer
 from mjx_dher.contract import env_spec
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint, reading
 from mjx_dher.spec import validate
 from point_mass import PointMass, PointState
+from probes import Walk
 
 ENV = PointMass()
 
@@ -193,3 +196,22 @@ def test_a_minari_data_set_is_read(tmp_path, monkeypatch):
         assert fingerprint.sources(RunSpec(demonstrations=source))["demonstrations"].startswith("walk-v0 ")
     with refuses("point/walk-v0", "length", "10"):
         read_demonstrations("point/walk-v0", ENV, 6)
+
+
+def test_a_minari_episode_that_ends_at_its_goal_is_not_terminal_for_other_goals(monkeypatch, tmp_path):
+    env = Walk(ends_at_goal=True)
+    row = {"observation": np.zeros((4, 2)), "achieved_goal": np.array([[0, 0], [0.1, 0], [0.2, 0], [0.5, 0]])}
+    episodes = [
+        SimpleNamespace(
+            id=number,
+            observations=row | {"desired_goal": np.tile(goal, (4, 1))},
+            actions=np.zeros((3, 2)),
+            terminations=[False, False, True],
+        )
+        for number, goal in enumerate(([0.5, 0.0], [0.9, 0.0]))
+    ]
+    monkeypatch.setitem(sys.modules, "minari", SimpleNamespace(MinariDataset=lambda path: episodes))
+    monkeypatch.setattr(demonstrations.lookup, "require_extra", lambda *names: None)
+    monkeypatch.setattr(demonstrations, "find_demonstrations", lambda source: tmp_path)
+    assert read_demonstrations("any", env, 6).terminal.tolist() == [False, True]
+    assert read_demonstrations("any", Walk(), 6).terminal.tolist() == [True, True]

@@ -27,6 +27,11 @@ def episode_of(achieved, desired=None):
     return Episode(achieved, achieved, desired, jnp.zeros((len(achieved) - 1, 2))).filled()
 
 
+def test_next_future_mixes_in_the_future_of_a_short_episode():
+    weights = goals.next_future(jnp.zeros((11, 1)), jnp.zeros(1), jnp.int32(1), HP, jnp.int32(4))
+    np.testing.assert_allclose(samplers.probabilities(weights)[:6], [0, 0, 0.5, 0.25, 0.25, 0], atol=1e-6)
+
+
 def test_next_future_mixes_the_step_s_own_goal_with_the_future():
     achieved, desired = jnp.zeros((5, 2)), jnp.zeros(2)
     found = samplers.probabilities(goals.next_future(achieved, desired, jnp.int32(1), HP))  # k 4: a quarter

@@ -66,6 +66,13 @@ def test_a_pause_stops_the_clock():
     assert player.clock == 1
 
 
+def test_an_episode_ends_at_its_goal_if_the_task_says_so():
+    player = Player(GAME._replace(move_object=None, ends_at_goal=True), lambda obs: np.array([0.2]))
+    for _ in range(2):
+        player.step()
+    assert (player.clock, player.episodes) == (2, Tally(1, 1))
+
+
 def test_an_episode_counts_as_an_evaluation_counts_it():
     """By its last step, whatever came before."""
     player = Player(GAME, follow)

@@ -14,7 +14,7 @@ from mjx_dher.contract import env_spec
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.program import loop
 from mjx_dher.system import memory
-from probes import Explodes, PointMass
+from probes import Explodes, PointMass, Walk
 
 ENV = PointMass()
 DTYPES = ("float32", "bfloat16")
@@ -316,3 +316,16 @@ def test_a_run_ends_with_the_step_sizes_at_their_end(learn):
         for i in (0, -2)
     )
     assert last < 0.2 * first
+
+
+def test_normalizers_leave_out_what_follows_an_early_end():
+    env = Walk()
+    train = make_train(env, dataclasses.replace(SMALL, num_envs=16, replay_size=100_000))
+    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
+    episodes, number = jax.device_get(state.replay.episodes), int(state.replay.size)
+    assert set(episodes.length[:number].tolist()) > {env.episode_length}
+    seen = np.concatenate([episodes.observation[i, : episodes.length[i] + 1] for i in range(number)])
+    moments = state.learner.observation_norm
+    assert int(moments.count) == len(seen)
+    np.testing.assert_allclose(moments.mean, seen.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(moments.var, seen.var(axis=0), rtol=1e-4)

@@ -16,7 +16,7 @@ import point_mass
 from mjx_dher import cli, envs
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.robot import RobotLoop
-from mjx_dher.envs.task import JointDelta
+from mjx_dher.envs.task import JointDelta, JointPosition, Joints, MujocoTask, Start
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
 
@@ -128,3 +128,31 @@ def test_an_edited_mjcf_changes_the_identity_of_a_run(tmp_path, monkeypatch):
         fingerprint._source.cache_clear()
         digests.append(fingerprint.sources(RunSpec(env="robot_of_test:Reach"))["env"])
     assert digests[0] != digests[1] == digests[2]
+
+
+SERVO = """
+<mujoco><option gravity="0 0 0"/>
+  <worldbody><body><joint name="j" axis="0 0 1" damping="1" range="-90 90"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass="1"/></body></worldbody>
+  <actuator><general joint="j" gear="2" gainprm="20" biastype="affine" biasprm="4 -40 -2"/></actuator>
+  <keyframe><key name="home" qpos="1.0"/></keyframe>
+</mujoco>"""
+
+
+@pytest.mark.parametrize("moves", [JointPosition(), JointDelta("j")])
+def test_a_servo_with_any_gain_and_bias_holds_the_start(moves):
+    """Its force is 20 u + 4 - 40 (2 q) for the joint at q, so u = 4 q - 0.2."""
+
+    class Turn(MujocoTask):
+        model, control, goal, start = SERVO, moves, Joints("j", (-1.0,), (1.0,)), Start("home", settle=10)
+
+    env = Turn(engine="native")
+    state = env.reset(jax.random.key(0))
+    np.testing.assert_allclose(state.physics.qpos, 1.0, atol=1e-4)
+    rest = jnp.asarray(env.rest_action)
+    np.testing.assert_allclose(env.controls(state.physics, rest).ctrl, 3.8, atol=1e-4)
+    for _ in range(10):
+        state = env.step(state, rest)
+    np.testing.assert_allclose(state.physics.qpos, 1.0, atol=1e-4)
+    if not isinstance(moves, JointDelta):
+        np.testing.assert_allclose(env.controls(state.physics, jnp.ones(1)).ctrl, 4 * np.pi / 2 - 0.2, rtol=1e-5)

@@ -20,14 +20,14 @@ _SOFTNESS = 0.05  # softness of the matching, as a fraction of the mean cost
 _SINKHORN_ROUNDS = 50
 
 
-def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
+def next_future(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """The next goal with probability 1/k, else any future one. k is `her_k`, at least 1.
 
     In Özgür, Zurbrügg & Kumar 2025 ("Next-Future"), the first of k virtual goals is the next achieved one.
     """
     share = 1.0 / jnp.maximum(hparams.her_k, 1.0)
     following = (jnp.arange(achieved.shape[0]) == step + 1).astype(jnp.float32)
-    return jnp.log(share * following + (1.0 - share) * jax.nn.softmax(future(achieved, desired, step, hparams)))
+    return jnp.log(share * following + (1.0 - share) * jax.nn.softmax(future(achieved, desired, step, hparams, length)))
 
 
 def match(cost: Array, usable: Array, softness: Array | float = _SOFTNESS, rounds: int = _SINKHORN_ROUNDS) -> Array:

@@ -90,7 +90,8 @@ class Learner(Protocol):
         Args:
           observation: [N, T+1, D] of the rollout's episodes.
           goal: relabelled goals [B, G].
-          valid: bool [N]. Episodes for which it is False may contain NaN and must be ignored.
+          valid: bool [N], or [N, T+1] if episodes can end early. Observations for which it is False may be NaN and must be
+            ignored.
 
         Returns:
           The next state.

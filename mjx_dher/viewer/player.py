@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import context
-from mjx_dher.contract import step_seconds
+from mjx_dher.contract import env_spec, step_seconds
 from mjx_dher.tools.render import check_drawable, goal_marks
 
 HOLD = 0.6  # s, display time of the end of an episode
@@ -33,6 +33,7 @@ class Game(NamedTuple):
     move_goal: Callable[[Any, Any], Any] | None  # state, position [3] -> state; None if it cannot be moved
     move_object: Callable[[Any, Any], Any] | None  # the same
     turn_goal: Callable[[Any, Any], Any] | None = None  # state, orientation [4] -> state; None if it cannot be turned
+    ends_at_goal: bool = False  # whether an episode ends where its goal is reached
 
     @property
     def dt(self) -> float:
@@ -68,6 +69,7 @@ def make_game(env: Any) -> Game:
         move_goal=jax.jit(move_goal) if hasattr(env, "with_goal") and has_position else None,
         move_object=jax.jit(env.with_object) if hasattr(env, "with_object") and has_object else None,
         turn_goal=jax.jit(turn_goal) if hasattr(env, "with_goal") and turned is not None else None,
+        ends_at_goal=env_spec(env).ends_at_goal,
     )
     state = game.reset(np.uint32(0))
     game.step(state, np.zeros(env.action_size, np.float32))
@@ -148,7 +150,8 @@ class Player:
         self.clock += 1
         self._steps += 1
         self._look()
-        failed, ended = self._flag("failed"), self._flag("done") or self._flag("terminal")
+        failed = self._flag("failed")
+        ended = self._flag("done") or self._flag("terminal") or (self.game.ends_at_goal and self.success)
         if failed or ended or self.clock == self.length:
             (self.own if self.is_own else self.episodes).add(self.success)
             self._held = self.game.steps(HOLD) if failed or ended or self.renew else 0
