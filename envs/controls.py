@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Self
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.arm_kinematics import quat_multiply
+from mjx_dher.envs.arm_kinematics import quat_multiply, quat_to_matrix
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.kinematics import Numbered, Place, names_of, pick, to_quat
 from mjx_dher.lookup import check_name
@@ -19,7 +20,9 @@ from mjx_dher.validation import check_number
 
 _JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _AFFINE, _NO_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_NONE)
-_FIXED = int(mujoco.mjtGain.mjGAIN_FIXED)
+_FIXED, _BODY, _WELD = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtObj.mjOBJ_BODY), int(mujoco.mjtEq.mjEQ_WELD)
+_NO_DYNAMICS, _INTEGRATOR = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtDyn.mjDYN_INTEGRATOR)
+_FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 
 class Control:
@@ -107,7 +110,7 @@ class Actuators(Control):
 class JointPosition(Actuators):
     """Position servos: -1 and 1 are the ends of the servo's ctrlrange, or of its joint's range if it has none.
 
-    A servo's gain is fixed, and its bias is affine and falls with the position.
+    A servo's gain is fixed, its bias is affine and falls with the position, and its input may be filtered.
     """
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
@@ -140,7 +143,8 @@ class JointDelta(JointPosition):
 
     def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
         self.qpos = model.jnt_qposadr[joints]
-        self.gear, offset = np.array([_holding(model, i) for i in self.indices], np.float32).T
+        slope, offset = np.array([_holding(model, i) for i in self.indices], np.float32).T
+        self.gear = slope * np.array(model.actuator_gear[self.indices, 0], np.float32)
         if offset.any():
             self.offset = offset
 
@@ -176,53 +180,99 @@ class Mocap(Control):
         mocap = {name: i for i, name in enumerate(names_of(model, "body")) if model.body_mocapid[i] >= 0}
         check_name("mocap body", self.body, mocap)
         bound.index = int(model.body_mocapid[mocap[self.body]])
-        weld = int(mujoco.mjtEq.mjEQ_WELD)
-        ends = model.eq_obj1id, model.eq_obj2id
-        pulled = {
-            int(b[i]) for a, b in (ends, ends[::-1]) for i in np.flatnonzero((model.eq_type == weld) & (a == mocap[self.body]))
-        }
-        if len(pulled) != 1:
-            raise ValueError(f"mocap body {self.body!r} must be welded to one body; the model welds {len(pulled)} to it")
-        bound.place = Place(model, f"body:{names_of(model, 'body')[pulled.pop()]}")
+        welds = (model.eq_type == _WELD) & (model.eq_objtype == _BODY) & model.eq_active0.astype(bool)
+        own = np.flatnonzero(welds & ((model.eq_obj1id == mocap[self.body]) | (model.eq_obj2id == mocap[self.body])))
+        if len(own) != 1:
+            raise ValueError(
+                f"mocap body {self.body!r} must be welded to one body, by names of bodies; the model has {len(own)} such welds"
+            )
+        first, second = int(model.eq_obj1id[own[0]]), int(model.eq_obj2id[own[0]])
+        bound._is_first = first == mocap[self.body]
+        bound.place = Place(model, f"body:{names_of(model, 'body')[second if bound._is_first else first]}")
+        # In MuJoCo: pos1 + mat1 * data[3:6] = pos2 + mat2 * data[:3], and quat1 * data[6:10] = quat2.
+        data = np.array(model.eq_data[own[0]], np.float32)
+        bound._own, bound._others = (data[3:6], data[:3]) if bound._is_first else (data[:3], data[3:6])
+        bound._relative = data[6:10] / np.linalg.norm(data[6:10])
         bound.size = 6 if self.turn else 3
         bound.moved = [self.body]
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
         pos, mat = self.place.pose(physics.qpos)
-        mocap = controls.mocap.at[self.index, :3].set(pos + self.scale * action[:3])
+        mocap, target = controls.mocap, pos + self.scale * action[:3]
         if self.turn:
             half = jnp.concatenate([jnp.ones(1, jnp.float32), 0.5 * self.turn * action[3:]])
             turned = quat_multiply(half, to_quat(mat))
-            mocap = mocap.at[self.index, 3:].set(turned / jnp.sqrt(jnp.sum(jnp.square(turned))))
-        return dataclasses.replace(controls, mocap=mocap)
+            turned = turned / jnp.sqrt(jnp.sum(jnp.square(turned)))
+            mat = quat_to_matrix(turned)
+            if self._relative[0] < 1.0:
+                sign = np.array([1, -1, -1, -1], np.float32) if self._is_first else 1.0
+                turned = quat_multiply(turned, jnp.asarray(sign * self._relative))
+            mocap = mocap.at[self.index, 3:].set(turned)
+        if self._others.any():
+            target = target + jnp.sum(mat * self._others, axis=-1)
+        if self._own.any():
+            target = target - jnp.sum(quat_to_matrix(mocap[self.index, 3:]) * self._own, axis=-1)
+        return dataclasses.replace(controls, mocap=mocap.at[self.index, :3].set(target))
 
     index: int
-    place: Place
+    place: Place  # the body that is welded to the mocap body
+    _is_first: bool  # whether the mocap body is the weld's first one
+    _own: np.ndarray  # [3] the weld's point on the mocap body, m
+    _others: np.ndarray  # [3] the weld's point on the other body, m
+    _relative: np.ndarray  # quaternion [4] of the weld
 
 
 def is_servo(model: mujoco.MjModel, index: int) -> bool:
-    """Whether an actuator is a position servo, whose force decreases with the position."""
+    """Whether an actuator's input is a position, at which it pulls with a fixed gain, at once or through a filter."""
+    return _pulls(model, index) and model.actuator_dyntype[index] != _INTEGRATOR
+
+
+def _pulls(model: mujoco.MjModel, index: int) -> bool:
+    """Whether an actuator's force is linear, and decreases with the position."""
     is_linear = model.actuator_gaintype[index] == _FIXED and model.actuator_biastype[index] == _AFFINE
-    return bool(is_linear and model.actuator_gainprm[index, 0] != 0 and model.actuator_biasprm[index, 1] < 0)
+    known = model.actuator_dyntype[index] in (_NO_DYNAMICS, _INTEGRATOR, *_FILTERS)
+    return bool(is_linear and known and model.actuator_gainprm[index, 0] != 0 and model.actuator_biasprm[index, 1] < 0)
 
 
 def _holding(model: mujoco.MjModel, index: int) -> tuple[float, float]:
-    """Slope and offset of the input with which a servo pulls its joint to a position."""
+    """Slope and offset of the input with which a servo pulls to a length: of its tendon, or gear times its joint's position."""
     gain, (bias, stiffness) = model.actuator_gainprm[index, 0], model.actuator_biasprm[index, :2]
-    return model.actuator_gear[index, 0] * (-stiffness / gain), -bias / gain
+    return -stiffness / gain, -bias / gain
 
 
-def rest_ctrl(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Inputs [nu] that hold a configuration: joint servos hold their joint, and others get 0."""
-    ctrl = np.zeros(model.nu)
-    for index in range(model.nu):
-        if is_servo(model, index) and (joint := _joint(model, index)) >= 0:
-            slope, offset = _holding(model, index)
-            ctrl[index] = slope * qpos[model.jnt_qposadr[joint]] + offset
-    limited = model.actuator_ctrllimited.astype(bool)
-    ctrl[limited] = np.clip(ctrl[limited], *model.actuator_ctrlrange[limited].T)
-    return ctrl
+class Holding:
+    """Inputs and activations that hold a configuration: servos at their present lengths. Other actuators get 0.
+
+    Args:
+      lengths: of the actuators, [nu].
+    """
+
+    def __init__(self, model: mujoco.MjModel, lengths: np.ndarray):
+        self.ctrl, self.act = np.zeros(model.nu), np.zeros(model.na)
+        self._followers: dict[int, list[tuple[Any, ...]]] = {}  # by index in qpos, servos of a joint
+        for i in filter(lambda i: _pulls(model, i), range(model.nu)):
+            slope, offset = _holding(model, i)
+            low, high = model.actuator_ctrlrange[i] if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
+            target = np.clip(slope * lengths[i] + offset, low, high)
+            activation = int(model.actuator_actadr[i])
+            if activation >= 0:
+                self.act[activation] = target
+            if is_servo(model, i):
+                self.ctrl[i] = target
+                if (joint := _joint(model, i)) >= 0:
+                    slope *= model.actuator_gear[i, 0]
+                    numbers = np.array([slope, offset, low, high], np.float32)
+                    self._followers.setdefault(int(model.jnt_qposadr[joint]), []).append((i, activation, numbers))
+
+    def at(self, places: Sequence[int], qpos: Array, ctrl: Array, act: Array) -> tuple[Array, Array]:
+        """Inputs and activations that also hold the joints with indices `places` in qpos at their positions in `qpos`."""
+        for place in places:
+            for i, activation, (slope, offset, low, high) in self._followers.get(place, []):
+                target = jnp.clip(slope * qpos[place] + offset, low, high)
+                ctrl = ctrl.at[i].set(target)
+                act = act if activation < 0 else act.at[activation].set(target)
+        return ctrl, act
 
 
 def _joint(model: mujoco.MjModel, index: int) -> int:
@@ -238,6 +288,6 @@ def _range(model: mujoco.MjModel, index: int) -> Any:
         return model.actuator_ctrlrange[index]
     if is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
         slope, offset = _holding(model, index)
-        return np.sort(slope * model.jnt_range[joint] + offset)
+        return np.sort(slope * model.actuator_gear[index, 0] * model.jnt_range[joint] + offset)
     name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")
     raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")

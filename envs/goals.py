@@ -101,7 +101,7 @@ class Rotation(Goal):
 
     Args:
       of: "site:NAME" or "body:NAME".
-      axis: axis [3] in the world about which goals turn, or None for any orientation.
+      axis: axis [3] in the world about which goals turn, from the world's orientation, or None for any orientation.
       threshold: rad.
     """
 
@@ -115,10 +115,12 @@ class Rotation(Goal):
         bound = super().bind(model)
         bound.place = Place(model, self.of)
         if self.axis is not None:
-            axis, _ = box("axis of the goal", 3, (self.axis, self.axis))
+            box("axis of the goal", 3, (self.axis, self.axis))
+            axis = np.array(self.axis, float)
             if not axis.any():
                 raise ValueError(f"axis of the goal must have a length; got {self.axis}")
-            bound.axis = axis / np.linalg.norm(axis)
+            axis /= np.abs(axis).max()
+            bound.axis = np.array(axis / np.linalg.norm(axis), np.float32).tolist()
         return bound
 
     def achieved(self, physics: Physics) -> Array:
@@ -129,7 +131,7 @@ class Rotation(Goal):
             quat = jax.random.normal(key, (4,), jnp.float32)
         else:
             half = jax.random.uniform(key, (), jnp.float32, -0.5 * jnp.pi, 0.5 * jnp.pi)
-            quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * np.asarray(self.axis)])
+            quat = jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * np.asarray(self.axis, np.float32)])
         return quat_to_matrix(quat)[:, :2].T.ravel()
 
     def describe(self) -> dict[str, Any]:
@@ -222,10 +224,10 @@ class Joints(Goal):
         bound.qpos, bound.size = model.jnt_qposadr[bound.joints], len(bound.joints)
         limits = model.jnt_range[bound.joints].T.copy()
         unlimited = ~model.jnt_limited[bound.joints].astype(bool)
-        if self.low is None and unlimited.any():
+        if (self.low is None or self.high is None) and unlimited.any():
             raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range; pass low and high")
         limits[:, unlimited] = [[-np.inf], [np.inf]]
-        low, high = limits if self.low is None or self.high is None else (self.low, self.high)
+        low, high = (limit if end is None else end for limit, end in zip(limits, (self.low, self.high)))
         bound.low, bound.high = box("goal", bound.size, (low, high))
         for i in np.flatnonzero((bound.low < limits[0] - 1e-6) | (bound.high > limits[1] + 1e-6))[:1]:
             raise ValueError(

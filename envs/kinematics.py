@@ -39,7 +39,9 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     """
     chosen: dict[int, None] = {}
     for pattern in str(patterns).split() or [""]:
-        fitting = {i for names in columns for i, name in enumerate(names) if name and _fits(name, pattern)}
+        found = [{i for i, name in enumerate(names) if name and _fits(name, pattern)} for names in columns]
+        plain = not set(pattern) & set("*?")  # then a name of the first column comes before an equal one of the second
+        fitting = next(filter(None, found), set()) if plain else set().union(*found)
         if not fitting:
             check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
         chosen |= dict.fromkeys(sorted(fitting))
@@ -47,7 +49,9 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
 
 
 def _fits(name: str, pattern: str) -> bool:
-    return pattern in ("*", name) if isinstance(name, Numbered) else fnmatch.fnmatchcase(name, pattern)
+    if isinstance(name, Numbered):
+        return pattern in ("*", name)
+    return fnmatch.fnmatchcase(name, pattern.replace("[", "[[]"))  # "[" is a part of names here
 
 
 class Place:
@@ -61,8 +65,12 @@ class Place:
     """
 
     def __init__(self, model: mujoco.MjModel, name: str):
-        kind, _, rest = name.rpartition(":")
-        kind = kind or ("site" if rest in names_of(model, "site") else "body")
+        if not isinstance(name, str):
+            raise ValueError(f"must be the name of a site or body, such as 'site:tip'; got {name!r}")
+        kind, colon, rest = name.partition(":")
+        plain = [each for each in ("site", "body") if name in names_of(model, each)]
+        if not colon or plain:
+            kind, rest = (*plain, "body")[0], name
         check_name(f"kind of {name!r}", kind, ("site", "body"))
         names = names_of(model, kind)
         check_name(kind, rest, names)

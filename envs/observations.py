@@ -52,6 +52,8 @@ class _Part:
         elif self.kind == "sensor":
             chosen = pick("sensor", name, names := names_of(model, "sensor"))
             sensors = [model.sensor(i) for i in chosen]
+            if clocks := [str(names[i]) for i in chosen if model.sensor_type[i] == int(mujoco.mjtSensor.mjSENS_CLOCK)]:
+                raise ValueError(f"observation {text!r}: sensor {clocks[0]!r} is a clock, and a state has no time")
             self.names = [str(names[i]) for i in chosen]
             self.index = np.concatenate([sensor.adr[0] + np.arange(sensor.dim[0]) for sensor in sensors])
             self.size = len(self.index)

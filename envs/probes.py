@@ -81,8 +81,10 @@ def _distance(model: mujoco.MjModel, start: np.ndarray, place: Place, goal: np.n
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     dofs = [joint.qvel for joint in place.joints]  # hinges and slides have one each
     joints = model.dof_jntid[dofs]
-    limited = model.jnt_limited[joints].astype(bool)
+    limited, slides = model.jnt_limited[joints].astype(bool), model.jnt_type[joints] == SLIDE
     low, high = np.where(limited, model.jnt_range[joints].T, [[-np.pi], [np.pi]])
+    ends = np.where(slides & ~limited, [[-np.inf], [np.inf]], [low, high])
+    most = np.where(slides, np.inf, 0.3)  # of a step; turns are linear over less
     at, jacobian, best = model.jnt_qposadr[joints], np.zeros((3, model.nv)), np.inf
     for attempt in range(_ATTEMPTS):
         data.qpos[:] = start
@@ -97,7 +99,7 @@ def _distance(model: mujoco.MjModel, start: np.ndarray, place: Place, goal: np.n
             mujoco.mj_jac(model, data, jacobian, None, point, place.body)
             part = jacobian[:, dofs]
             step = part.T @ np.linalg.solve(part @ part.T + 1e-4 * np.eye(3), error)
-            data.qpos[at] = np.clip(data.qpos[at] + np.clip(step, -0.3, 0.3), low, high)
+            data.qpos[at] = np.clip(data.qpos[at] + np.clip(step, -most, most), *ends)
         if best < 1e-3:
             break
     return best

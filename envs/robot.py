@@ -77,7 +77,10 @@ class RobotLoop:
             action = self.policy({"observation": np.asarray(observation), "desired_goal": desired})
             action = _checked("action of the policy", action, self.task.action_size)
             self._memory, controls = self._act(self._memory, physics, action)
-        return jax.tree.map(np.asarray, controls)
+        controls = jax.tree.map(np.asarray, controls)
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(controls)):
+            raise ValueError(f"the controls are not finite; qpos must have quaternions of length 1; got {qpos}")
+        return controls
 
     def _observe(self, memory: list[PyTree] | None, measured: dict[str, Array]) -> tuple[list[PyTree], Physics, PyTree]:
         """Memory of the wrappers, physics, and observation."""

@@ -222,7 +222,7 @@ def substeps_of(hz: float, timestep: float) -> int:
     check_number("hz", hz, "(0, inf)", float)
     substeps = round(1 / (hz * timestep))
     if substeps < 1 or abs(substeps * timestep * hz - 1) > 1e-6:
-        nearest = sorted({round(1 / (n * timestep), 4) for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})
+        nearest = sorted({float(f"{1 / (n * timestep):.9g}") for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})
         raise ValueError(f"hz must make a whole number of the model's timesteps of {timestep:g} s; got {hz}, near {nearest}")
     return substeps
 

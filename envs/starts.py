@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.controls import rest_ctrl
+from mjx_dher.envs.controls import Holding
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.goals import box
 from mjx_dher.envs.kinematics import FREE, HINGE, SLIDE, names_of
@@ -29,6 +30,7 @@ class Start:
       ranges: low and high, by the name of a free body (positions, [3] m each) or of a hinge or slide (rad or m). Starts are
         uniform between them.
       settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
+        Servos hold it, unless the keyframe has inputs or activations.
     """
 
     def __init__(self, keyframe: str | None = None, ranges: Mapping[str, tuple[Any, Any]] | None = None, settle: int = 0):
@@ -52,10 +54,15 @@ class Start:
                 raise ValueError(f"start: joint {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
             bound.drawn.append(drawn)
             data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
-        ctrl = data.ctrl if data.ctrl.any() else rest_ctrl(model, data.qpos)
+        given, ctrl, act = data.ctrl.any() or data.act.any(), data.ctrl.copy(), data.act.copy()
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
+            compute(model, data)  # the actuators' lengths
+        bound._holding = None if given else Holding(model, data.actuator_length)
+        if bound._holding:
+            ctrl, act = bound._holding.ctrl, bound._holding.act
         mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
         # NumPy arrays become constants of the programs that use them, on any device.
-        arrays: Any = [np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), data.act, ctrl, mocap)]
+        arrays: Any = [np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), act, ctrl, mocap)]
         bound.physics, bound.hold = Physics(*arrays[:4]), Controls(*arrays[4:])
         return bound
 
@@ -67,9 +74,20 @@ class Start:
             qpos = qpos.at[at : at + len(low)].set(part)
         return qpos
 
+    def held(self, physics: Physics) -> tuple[Physics, Controls]:
+        """A drawn start with activations that hold it, and the inputs that hold it. Both are the model's keyframe's if it has
+        inputs or activations.
+        """
+        hold = jax.tree.map(jnp.asarray, self.hold)
+        if self._holding is None:
+            return physics, hold
+        ctrl, act = self._holding.at([drawn.qpos for drawn in self.drawn], physics.qpos, hold.ctrl, physics.act)
+        return dataclasses.replace(physics, act=act), dataclasses.replace(hold, ctrl=ctrl)
+
     physics: Physics  # the start, with the middle of each range
     hold: Controls  # inputs that hold it
     drawn: list[Range]
+    _holding: Holding | None
 
 
 def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:

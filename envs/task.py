@@ -79,9 +79,10 @@ class MujocoTask(SimulatedTask):
         self._rest, self._hold = self.start.physics, self.start.hold
         self.rest_action = np.concatenate([part.rest(np.asarray(self._hold.ctrl)) for part in self.parts])  # keeps the start
         self._object = next((each for each in self.start.drawn if len(each.low) == 3), None)
-        texts = (self.observations,) if isinstance(self.observations, str) else tuple(self.observations)
+        given = self.observations
+        texts = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Sequence) else ()
         if not texts or len(set(texts)) < len(texts):
-            raise ValueError(f"observations must be one or more different names; got {texts}")
+            raise ValueError(f"observations must be one or more different names; got {given!r}")
         self._entries = [Entry(self.model, text) for text in texts]
         ends = np.cumsum([0, *(entry.size for entry in self._entries)]).tolist()
         self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
@@ -128,10 +129,8 @@ class MujocoTask(SimulatedTask):
 
     def start_physics(self, key: PRNGKey) -> Physics:
         """Draws the physics of a start."""
-        physics: Physics = dataclasses.replace(jax.tree.map(jnp.asarray, self._rest), qpos=self.start.draw(key))
-        if not self.start.settle:
-            return physics
-        hold = jax.tree.map(jnp.asarray, self._hold)
+        rest: Physics = jax.tree.map(jnp.asarray, self._rest)
+        physics, hold = self.start.held(dataclasses.replace(rest, qpos=self.start.draw(key), sensors=None))
         return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, hold), physics)
 
     def sample_goal(self, key: PRNGKey) -> Array:
@@ -152,6 +151,14 @@ class MujocoTask(SimulatedTask):
 
     def achieved(self, physics: Physics) -> Array:
         return self.goal.achieved(physics)
+
+    def advance(self, physics: Physics, action: Array) -> Physics:
+        controls = self.controls(physics, action)
+        following = self.engine.advance(physics, controls)
+        finite = jnp.all(jnp.isfinite(controls.ctrl)) & jnp.all(jnp.isfinite(controls.mocap))
+        # MuJoCo C treats NaN inputs as 0. Here the step fails, as after a NaN action.
+        following = dataclasses.replace(following, qvel=jnp.where(finite, following.qvel, jnp.nan))
+        return self._sensed(following, controls)
 
     def is_sound(self, physics: Physics) -> Array:
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(physics)]

@@ -120,6 +120,8 @@ def _choose(model: mujoco.MjModel, name: str, kind: str, patterns: str) -> list[
                 raise ValueError(f"varied: {name!r} changes motors and servos; {odd[0]!r} has another {field}")
     numbers = [np.asarray(getattr(model, field)) for field in _FIELDS[kind]]
     if kind == "damping":
+        if odd := [columns[0][i] for i in chosen if model.dof_dampingpoly[model.jnt_dofadr[i]].any()]:
+            raise ValueError(f"varied: {name!r} changes joints with linear damping; that of {odd[0]!r} is polynomial")
         chosen_numbers = [numbers[0][np.isin(model.dof_jntid, chosen)]]
     else:
         chosen_numbers = [each[chosen] for each in numbers if len(each) == len(columns[0])]
@@ -152,8 +154,10 @@ def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[fl
             raise ValueError(f"varied: {name!r} must be (low, high); got {given!r}")
         ends = [end.item() if isinstance(end, np.generic) else end for end in given]
         above = "(0" if name.startswith("mass:") else "[0"
-        check_number(f"varied {name!r}", ends[0], f"{above}, 1000]", float)
-        check_number(f"varied {name!r}", ends[1], f"[{ends[0]}, 1000]", float)
+        for end in ends:
+            check_number(f"varied {name!r}", end, f"{above}, 1000]", float)
+        if ends[0] > ends[1]:
+            raise ValueError(f"varied: {name!r} must be (low, high) with low <= high; got {given!r}")
         ranges[name] = (float(ends[0]), float(ends[1]))
     return ranges
 
