@@ -39,9 +39,9 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     """
     chosen: dict[int, None] = {}
     for pattern in str(patterns).split() or [""]:
-        found = [{i for i, name in enumerate(names) if name and _fits(name, pattern)} for names in columns]
+        matches = [{i for i, name in enumerate(names) if name and _fits(name, pattern)} for names in columns]
         plain = not set(pattern) & set("*?")  # then a name of the first column comes before an equal one of the second
-        fitting = next(filter(None, found), set()) if plain else set().union(*found)
+        fitting = next(filter(None, matches), set()) if plain else set().union(*matches)
         if not fitting:
             check_name(what, pattern, dict.fromkeys(name for names in columns for name in names if name))
         chosen |= dict.fromkeys(sorted(fitting))
