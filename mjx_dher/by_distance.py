@@ -34,7 +34,7 @@ def closest(
     del hparams
     mask = future_mask(achieved.shape[0], step, length)
     distance = jnp.where(mask, distances(metric, achieved, desired), jnp.inf)
-    return uniform(distance == jnp.min(distance))
+    return uniform(mask & (distance == jnp.min(distance)))  # all can be inf
 
 
 def epsilon_closest(
@@ -151,4 +151,4 @@ def weighted(
         return log_weights
     beyond = jnp.all(log_weights == -jnp.inf)
     relative = jnp.where(mask, relative, jnp.inf)
-    return jnp.where(beyond, uniform(relative == jnp.min(relative)), log_weights)
+    return jnp.where(beyond, uniform(mask & (relative == jnp.min(relative))), log_weights)

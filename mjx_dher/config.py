@@ -121,7 +121,7 @@ class HParams(NamedTuple):
     """Fraction of each batch drawn in proportion to episode priority. The rest is uniform."""
     epsilon: Share = 0.2
     """Probability that epsilon_closest draws a uniform future goal instead of the closest."""
-    temperature: Positive = 1.0
+    temperature: Annotated[float, Number("(0, inf]")] = 1.0
     """Temperature of weighted. Larger values give more even weights; inf equals future."""
     weight_scale: Annotated[float, Number("[1e-6, 1e6]")] = 0.05
     """Distance in metres that counts as 1, for weighted with weight_normalization none."""

@@ -177,7 +177,9 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 
 
 def make_custom(name: str, render_mode: str | None = None, **options: Any) -> gymnasium.Env[Obs, np.ndarray]:
-    """Makes a `GymEnv` that is truncated after its `episode_length`: the entry point of `ENV_ID`."""
+    """Makes a `GymEnv` that is truncated after its `episode_length`: the entry point of `ENV_ID`. For longer episodes pass
+    `episode_length`, because `max_episode_steps` of `gymnasium.make` can only shorten them.
+    """
     env = GymEnv(name, render_mode, **options)
     return TimeLimit(env, env._compiled.spec.episode_length)
 

@@ -208,7 +208,7 @@ def look_ahead(ring: ReplayState, sample: Sample, batch: Batch, context: Context
     powers = gamma ** jnp.arange(n_step, dtype=rewards.dtype)[:, None]
     end = jnp.minimum(sample.step + num_steps, last)
     ended_at_goal = jnp.any(reached & (counted > 0), axis=0) if context.ends_at_goal else False
-    terminal = ring.episodes.terminal[sample.row] & (end == last) if sample.ends else sample.terminal
+    terminal = ring.episodes.terminal[sample.row] & (end == last)
     return dataclasses.replace(
         batch,
         next_observation=jax.tree.map(lambda x: x[sample.row, end], ring.episodes.observation),

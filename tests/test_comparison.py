@@ -57,6 +57,28 @@ def test_a_setting_against_the_baseline_by_hand():
     assert fast.final_low <= fast.final_iqm <= fast.final_high
 
 
+def test_a_custom_sampler_is_compared_with_a_built_in_one():
+    cells = [cell("future", i, curve, source="task.py 01") for i, curve in enumerate(SLOW)]
+    cells += [cell("mine:soon", i, curve, source="task.py 01, mine.py 23") for i, curve in enumerate(FAST)]
+    cells += [cell("mine:late", i, curve, source="task.py 45, mine.py 23") for i, curve in enumerate(FAST)]  # another task
+    rows = comparison.compare(comparison.groups(cells)["push"], "future", 0.9)
+    better = {row.setting.split(",")[0]: row.better for row in rows}
+    assert better["mine:soon"] == 1.0
+    assert math.isnan(better["mine:late"])
+
+
+def test_a_setting_of_which_all_seeds_fail_counts_to_the_end():
+    short = [{**cell("weighted", i, curve[:2]), "status": "failed", "final": {}} for i, curve in enumerate(FAST)]
+    at_once = [{**one, "curve": {}} for one in short]
+    for failed, areas in ((short, [1.0 / 3, 0.95 / 3, 1.0 / 3]), (at_once, [0.0] * 3)):
+        cells = [{**one, "settings": {**one["settings"], "total_steps": 4000}} for one in (*CELLS[3:], *failed)]
+        row = comparison.compare(comparison.groups(cells)["push"], "future", 0.9)[1]
+        assert row.failed == 3
+        # (first + last) / 2 + the two between, divided by 3: the last two are 0.
+        assert row.area_gain == pytest.approx(np.mean(areas) - 3.65 / 9)
+        assert (row.epochs, row.env_steps) in ((2.0, 2000.0), (math.inf, math.inf))
+
+
 def test_p_values_are_corrected_over_the_settings_of_an_environment():
     cells = [*CELLS, *(cell("closest", i, [x / 2 for x in curve]) for i, curve in enumerate(SLOW))]
     rows = {row.setting: row for row in comparison.compare(comparison.groups(cells)["push"], "future", 0.9)}
@@ -148,7 +170,7 @@ def test_settings_that_print_alike_stay_apart():
 def test_own_code_that_changed_is_another_setting():
     cells = [cell("future", 0, SLOW[0], source=source) for source in ("", "task.py 0123456789", "task.py abcdef0123")]
     labels = [g.label for g in comparison.groups(cells)["push"]]
-    assert labels == ["future, source unknown", "future, task.py 0123456789", "future, task.py abcdef0123"]
+    assert labels == ["future", "future, task.py 0123456789", "future, task.py abcdef0123"]
 
 
 def test_no_seed_is_counted_twice():

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, testing, trainer
 from mjx_dher.contract import env_spec
@@ -127,6 +128,16 @@ def test_dicts_with_images_are_trained_on(tmp_path, monkeypatch):
         check_fits(policy, PointMass())
     obs = {"observation": jax.device_get(random_tree(jax.random.key(1), 5)), "desired_goal": np.ones((5, 2), np.float32)}
     np.testing.assert_allclose(policy(obs), learner.act(state, obs, HP), rtol=1e-5, atol=1e-6)
+    seen = obs["observation"]
+    for wrong, parts in (
+        ({"observation": seen}, ["desired_goal"]),
+        ({**obs, "observation": {"image": seen["image"]}}, ["observation", "structure"]),
+        ({**obs, "observation": {**seen, "vector": seen["vector"][:, :2]}}, ["observation", "(5, 2)"]),
+        ({**obs, "desired_goal": np.full((5, 2), np.nan)}, ["desired_goal", "finite"]),
+        ({**obs, "desired_goal": np.ones((4, 2))}, ["batch", "(4,)"]),
+    ):
+        with refuses(*parts):
+            policy(wrong)
 
 
 def test_only_dicts_lists_and_tuples_can_be_stored():

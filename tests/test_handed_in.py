@@ -20,6 +20,7 @@ from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program.loop import Progress
 from mjx_dher.samplers import Sampler, future
 from point_mass import PointMass
+from probes import Walk
 
 ENV = PointMass()
 T, N = ENV.episode_length, 6
@@ -278,8 +279,19 @@ def test_what_a_learner_gives_is_checked(name):
     train = make_train(ENV, SMALL, learner=own)
     with refuses(*parts):
         trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
-    with refuses(*parts):
+    with refuses(*parts, error=testing.ComponentError):
         testing.check_learner(lambda config, spec, networks: own, ENV, SMALL)
+
+
+def test_a_sampler_is_checked_with_the_length_of_short_episodes():
+    def future_in_the_end(achieved, desired, step, hparams, length=None):
+        weights = samplers.future(achieved, desired, step, hparams, length)
+        return weights if length is None else weights * jnp.nan
+
+    testing.check_sampler(future_in_the_end, ENV)
+    with refuses("sampler", "nan", error=testing.ComponentError):
+        testing.check_sampler(future_in_the_end, Walk())
+    assert "never" in testing.check_sampler("future", Walk())
 
 
 def test_a_learner_without_floating_point_numbers_is_finite():

@@ -129,3 +129,24 @@ def test_a_program_with_native_physics_is_kept_for_the_next_process(tmp_path):
     assert first == second
     assert int(hits) > int(none)
     assert list(tmp_path.glob("jit__lambda*"))
+
+
+ENDS = """
+import jax
+from mjx_dher import envs
+env = envs.make("reach", engine="native", num_threads=1)
+still = jax.numpy.zeros((8, 4))
+play = jax.jit(lambda state: jax.lax.fori_loop(0, 20_000, lambda i, state: jax.vmap(env.step)(state, still), state))
+states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 8))
+{} = play(states)
+{}
+print("end")
+"""
+
+
+@pytest.mark.parametrize("drop", ["", "del out"])
+def test_python_ends_in_order_while_a_program_simulates(drop):
+    ran = subprocess.run(
+        [sys.executable, "-c", ENDS.format("out", drop)], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (ran.returncode, ran.stdout.strip()) == (0, "end"), ran.stderr

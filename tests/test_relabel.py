@@ -1,4 +1,5 @@
 import collections
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -208,3 +209,16 @@ def test_one_step_ahead_is_the_transition(ring):
     np.testing.assert_array_equal(single.reward[once], several.reward[once])
     assert 0 < once.mean() < 1
     assert np.all(np.asarray(several.reward)[~once] <= np.asarray(single.reward)[~once])
+
+
+def test_returns_of_several_steps_end_at_a_failure_in_the_last_step():
+    """In a ring without `ends`, too."""
+    failed = dataclasses.replace(LINE, length=jnp.int32(4), terminal=jnp.array(True))
+    ring = replay.add(replay.init(failed, 1), jax.tree.map(lambda x: x[None], failed))
+    args = jax.random.key(0), (200,), samplers.make("future"), Context(near, HP._replace(gamma=0.5))
+    for n_step in (1, 3):
+        batch = draw_batches(ring, *args, replay.cumulative(ring), n_step)
+        at_end = np.asarray(batch.next_observation[:, 0]) == 40.0
+        assert at_end.any()
+        assert not np.asarray(batch.discount)[at_end].any()
+        assert np.asarray(batch.discount)[~at_end].all()

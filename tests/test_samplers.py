@@ -222,3 +222,18 @@ def test_the_papers_samplers_are_among_the_samplers():
     assert samplers.closest is by_distance.closest
     with pytest.raises(AttributeError, match="wieghted"):
         samplers.wieghted  # noqa: B018
+
+
+def test_goals_at_infinite_distances_are_of_the_future_alone():
+    achieved, desired = jnp.full((6, 1), 1e30), jnp.full(1, -1e30)
+    apart = lambda a, b: jnp.full(a.shape[:-1], jnp.inf)  # noqa: E731
+    numbers = HParams(temperature=1.0)
+    options = {"metric": apart}
+    chosen = [
+        by_distance.closest(achieved, desired, jnp.int32(2), numbers, **options),
+        by_distance.weighted(
+            achieved, desired, jnp.int32(2), numbers, by_distance.linear, normalization=by_distance.by_scale, **options
+        ),
+    ]
+    for weights in chosen:
+        np.testing.assert_allclose(samplers.probabilities(weights), [0, 0, 0, 1 / 3, 1 / 3, 1 / 3], atol=1e-6)

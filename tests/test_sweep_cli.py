@@ -9,6 +9,7 @@ from mjx_dher import HParams, cli, config
 from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.components import COMPONENTS, Component
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import tables
 
 
@@ -129,6 +130,8 @@ def test_a_signal_in_the_last_epoch_loses_nothing(tmp_path, point_mass, monkeypa
         (["--lanes", "0"], r"lanes must lie in \[1, .*; got 0"),
         (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
         (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 1\); got 1.5"),
+        (["--sweep.gamma"], r"sweep.gamma must be one or more numbers; got none"),
+        (["--seeds", "2", "--first-seed", "4294967295"], r"first_seed must lie in \[0, 4294967294\]; got 4294967295"),
         (["--batch-size", "0"], r"batch_size must lie in \[1, .*; got 0"),
     ],
 )
@@ -160,6 +163,15 @@ def test_every_number_and_every_size_can_be_set():
     assert len(trials) == 4 * 2 * 3
     assert {*vars(args.sweep)} == set(HParams._fields)
     assert {*vars(args.changes)} == {f.name for f in dataclasses.fields(config.Config)}
+
+
+def test_a_larger_sweep_has_the_trials_of_a_smaller_one():
+    """Also of samplers that do not read what is added, whatever comes first."""
+    plain = ["--sampler", "future", "--seeds", "1"]
+    more = ["--sampler", "weighted", "future", "--metric", "velocity", "--sweep.temperature", "3", "1", "--seeds", "1"]
+    small, large = ({fingerprint.trial_name(trial) for trial in cli_args(*argv)[1]} for argv in (plain, more))
+    assert small < large
+    assert len(large) == 3
 
 
 def cli_args(*argv):

@@ -7,10 +7,13 @@ binary interface.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import math
 import threading
+import time
 import weakref
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -24,6 +27,7 @@ from mjx_dher.types import Array
 _Function = Callable[[np.ndarray, np.ndarray], None]  # writes outputs [..., n] for inputs [..., m], float32
 _methods: dict[str, list[weakref.WeakMethod[_Function]]] = {}
 _lock = threading.Lock()
+_calls, _ends = 0, False  # calls so far; whether Python ends
 _TARGET = "mjx_dher_host"
 _MAJOR, _MINOR = 0, 1  # supported interface; later minor versions append fields to structs
 _METADATA, _EXECUTE = 1, 3
@@ -140,7 +144,22 @@ def _register_target() -> Any:
     """Registers `_handle` with XLA. Returns the C function, which must not be freed."""
     handler = ctypes.CFUNCTYPE(_pointer, _pointer)(_handle)
     jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(ctypes.cast(handler, _pointer)), platform="cpu")
+    atexit.register(_end)
     return handler
+
+
+def _end() -> None:
+    """Lets programs that still run fail at their next call: a call after the end of Python would crash or hang the process."""
+    global _ends  # noqa: PLW0603
+    jax.effects_barrier()
+    _ends = True
+    with contextlib.suppress(Exception):
+        jax.block_until_ready(jax.live_arrays())
+    seen = -1
+    for _ in range(100):  # programs without live outputs
+        if seen == (seen := _calls):
+            break
+        time.sleep(0.02)
 
 
 # Offsets in a frame, in words of 8 bytes: reading fields of ctypes structs takes longer than a small simulation.
@@ -154,7 +173,11 @@ _DATA, _RANK, _DIMS = (getattr(_Buffer, name).offset // 8 for name in ("data", "
 
 def _handle(address: int) -> int | None:
     """Answers a call of XLA with this version or the outputs. Returns None, or an error."""
+    global _calls  # noqa: PLW0603
+    _calls += 1
     try:
+        if _ends:
+            raise RuntimeError("Python ends")
         frame = _words(address)
         if frame[1] and (extension := ctypes.cast(frame[1], ctypes.POINTER(_Extension)).contents).type == _METADATA:
             version = extension.metadata.contents.version

@@ -142,8 +142,11 @@ def _check(args: SweepArgs) -> None:
     for field in GRID:
         if getattr(args, field) == ():
             raise ValueError(f"{field} must be one or more names; got none")
+    for field, values in vars(args.sweep).items():
+        if values == ():
+            raise ValueError(f"sweep.{field} must be one or more numbers; got none")
     check_count("seeds", args.seeds)
-    check_number("first_seed", args.first_seed, "[0, 4294967295]")
+    check_number("first_seed", args.first_seed, f"[0, {2**32 - args.seeds}]")
     if args.lanes is not None:
         check_count("lanes", args.lanes)
     check_devices(args.devices)
@@ -164,11 +167,13 @@ def _check(args: SweepArgs) -> None:
 
 def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     """All trials of the grid. Raises ValueError if one of them cannot run."""
-    specs = []
+    specs, unread = [], {}
     changes = {name: value for name, value in vars(args.changes).items() if value is not None}
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
     parts = [list(dict.fromkeys(getattr(args, field) or (None,))) for field in GRID]
     for env, *choice in itertools.product(*parts):
+        plain = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs)
+        unread[env] = dataclasses.replace(plain, config=dataclasses.replace(plain.config, **changes))
         named = {field: part for field, part in zip(GRID[1:], choice) if part is not None}
         base = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs, **named)
         base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))
@@ -176,7 +181,7 @@ def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
             run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))
             spec.validate(run)
             specs.append(run)
-    return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds))
+    return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds), unread)
 
 
 def sweep_command(argv: list[str], console: Console) -> int:

@@ -37,7 +37,15 @@ class LearnerPolicy:
         return self.spec.sizes
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Actions [..., A] for observations of one state or a batch."""
+        """Actions [..., A] for observations of one state or a batch. Raises ValueError for a missing key, another structure or
+        shape, or a number that is not finite.
+        """
+        goal = jax.ShapeDtypeStruct((self.spec.goal_size,), jnp.float32)
+        leading = {
+            key: _leading(key, obs, like) for key, like in (("observation", self.spec.observation), ("desired_goal", goal))
+        }
+        if len(set().union(*leading.values())) > 1:
+            raise ValueError(f"batch shapes differ: {leading}")
         return np.asarray(self.forward(jax.tree.map(jnp.asarray, obs["observation"]), jnp.asarray(obs["desired_goal"])))
 
     def forward(self, observation: Any, goal: Any, xp: Any = jnp) -> Array:
@@ -51,6 +59,24 @@ class LearnerPolicy:
         arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, env_spec=np.array(to_json(self.spec)), **arrays, **extra)
+
+
+def _leading(key: str, obs: Mapping[str, Any], like: PyTree) -> set[tuple[int, ...]]:
+    """Batch shapes of the arrays of an entry of `obs`. Raises ValueError if they do not fit `like`, or are not finite."""
+    if key not in obs:
+        raise ValueError(f"the policy needs {key!r}; got {sorted(obs)}")
+    given, expected = (str(jax.tree.structure(tree)) for tree in (obs[key], like))
+    if given != expected:
+        raise ValueError(f"{key} must have the structure {expected}; got {given}")
+    shapes = set()
+    for leaf, one in zip(map(np.asarray, jax.tree.leaves(obs[key])), jax.tree.leaves(like)):
+        split = leaf.ndim - len(one.shape)
+        if split < 0 or leaf.shape[split:] != one.shape:
+            raise ValueError(f"the last axes of {key} must be {list(one.shape)}; got shape {leaf.shape}")
+        if not np.isfinite(leaf).all():
+            raise ValueError(f"{key} must be finite")
+        shapes.add(leaf.shape[:split])
+    return shapes
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:

@@ -66,7 +66,8 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
 
 
 def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any], str]) -> str:
-    return ", ".join([trial["settings"]["sampler"], *(form(name, value) for name, value in own.items())])
+    told = (form(name, value) for name, value in own.items() if (name, value) != ("source", ""))
+    return ", ".join([trial["settings"]["sampler"], *told])
 
 
 def _format(name: str, value: Any) -> str:
@@ -94,6 +95,8 @@ def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, 
     trials = sorted(trials, key=lambda trial: trial["seed"])
     longest = max((trial["curve"] for trial in trials), key=lambda curve: len(curve.get("epoch", ())))
     longest = longest or {"epoch": [1], "env_steps": [0], "wall_seconds": [0.0]}
+    if all(trial["status"] == FAILED for trial in trials):
+        longest = _to_the_end(longest, trials[0]["settings"]["total_steps"])
     length = len(longest["epoch"])
     whole = [trial["curve"]["wall_seconds"] for trial in trials if len(trial["curve"].get("epoch", ())) == length]
     success = [trial["curve"].get("success_rate", []) for trial in trials]
@@ -113,6 +116,18 @@ def _group(env: str, label: str, others: dict[str, Any], trials: list[dict[str, 
         final=np.array([trial["final"].get("success_rate", 0.0) for trial in trials]),
         at_reset=float(np.mean(at_reset)) if at_reset else math.nan,
     )
+
+
+def _to_the_end(curve: dict[str, list[Any]], total_steps: int) -> dict[str, list[Any]]:
+    """A failed run's curve of epochs, steps and seconds, continued to the steps that it would have made."""
+    each = curve["env_steps"][0]
+    missing = max(0, math.ceil(total_steps / each) - len(curve["epoch"])) if each else 0
+    ahead = range(1, missing + 1)
+    return {
+        "epoch": [*curve["epoch"], *(curve["epoch"][-1] + i for i in ahead)],
+        "env_steps": [*curve["env_steps"], *(curve["env_steps"][-1] + i * each for i in ahead)],
+        "wall_seconds": [*curve["wall_seconds"], *curve["wall_seconds"][-1:] * missing],
+    }
 
 
 class Row(NamedTuple):
@@ -167,7 +182,10 @@ def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | 
     """Setting to compare `group` with, or None if there is none or `group` is the baseline."""
 
     def fits(other: Group) -> bool:
-        return all(group.others.get(name, value) == value for name, value in other.others.items())
+        # The baseline may lack the files of this setting's own components.
+        files_of = [set(filter(None, str(each.others.get("source", "")).split(", "))) for each in (other, group)]
+        rest = ((name, value) for name, value in other.others.items() if name != "source")
+        return files_of[0] <= files_of[1] and all(group.others.get(name, value) == value for name, value in rest)
 
     labelled = [other for other in settings if other.label == baseline]
     likely = labelled or [other for other in settings if other.sampler == baseline and fits(other)]
@@ -200,7 +218,7 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
         int(np.isfinite(reach).sum()),
         epochs,
         *stats.bootstrap_interval(reach, np.median),
-        epochs * steps_per_epoch,
+        epochs * steps_per_epoch if math.isfinite(epochs) else math.inf,
         *better,
         gain,
         p_value,

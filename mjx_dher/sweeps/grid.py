@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
@@ -14,13 +14,14 @@ from mjx_dher.system.files import FolderError
 CELLS = "cells"
 
 
-def trials(specs: Sequence[RunSpec], seeds: Sequence[int]) -> list[RunSpec]:
+def trials(specs: Sequence[RunSpec], seeds: Sequence[int], unread: Mapping[str, RunSpec] | None = None) -> list[RunSpec]:
     """Every setting with every seed, sorted by environment, then seed, so that runs to compare end together.
 
-    Settings that a run does not read get the values of the environment's first setting, and duplicates are dropped.
+    Settings that a run does not read get the values of the environment's run in `unread`, or else of its first setting, and
+    duplicates are dropped.
     """
     settings: dict[RunSpec, None] = {}
-    first: dict[str, RunSpec] = {}
+    first = dict(unread or {})
     for spec in specs:
         base = first.setdefault(spec.env, spec)
         settings[dataclasses.replace(fingerprint.with_unread_of(base, spec), seed=0)] = None

@@ -80,24 +80,28 @@ def check_sampler(
     if made.score is not None:
         score = attempt("sampler: score", samplers.score_episodes, made, episodes, trial.context)
 
-    def of_step(achieved: Any, desired: Any, score: Any, step: Any) -> Any:
-        return samplers.weigh(made, achieved, desired, step, numbers, score)
+    def of_step(achieved: Any, desired: Any, score: Any, length: Any, step: Any) -> Any:
+        return samplers.weigh(made, achieved, desired, step, numbers, score, length if ends else None)
 
-    of_episode = jax.vmap(of_step, in_axes=(None, None, None, 0))
-    asked = episodes.achieved_goal, episodes.desired_goal, score
-    log_weights = run("sampler", jax.vmap(of_episode, in_axes=(0, 0, 0, None)), *asked, steps)
+    ends = env_spec(trial.env).ends
+    of_episode = jax.vmap(of_step, in_axes=(None, None, None, None, 0))
+    asked = episodes.achieved_goal, episodes.desired_goal, score, episodes.length
+    log_weights = run("sampler", jax.vmap(of_episode, in_axes=(0, 0, 0, 0, None)), *asked, steps)
     alone = attempt("sampler, alone,", jax.jit(of_step), *(x[0] for x in asked), steps[-1])
-    return _check_log_weights(np.asarray(log_weights), np.asarray(alone))
+    played = np.asarray(steps < episodes.length[:, None])
+    return _check_log_weights(np.asarray(log_weights), np.asarray(alone), played)
 
 
-def _check_log_weights(values: NDArray, alone: NDArray) -> str:
-    """Checks log weights [N, T, T+1], and the weights of episode 0 at its last step, computed `alone`. Returns a line."""
-    wrong = np.argwhere(~(values < np.inf))  # NaN, too
+def _check_log_weights(values: NDArray, alone: NDArray, played: NDArray) -> str:
+    """Checks log weights [N, T, T+1] of the steps that were `played` [N, T], and the weights of episode 0 at its last step,
+    computed `alone`. Returns a line.
+    """
+    wrong = np.argwhere(~(values < np.inf) & played[..., None])  # NaN, too
     if len(wrong):
         n, t, i = wrong[0]
         expect(False, f"sampler: log weights must be finite or -inf; that of goal {i} at step {t} is {values[n, t, i]}")
     weights = _weights(values)
-    offers = (values > -np.inf).any(axis=-1)
+    offers = np.any(values > -np.inf, axis=-1)[played]
     expect(offers.any(), "sampler: it offers no goal at any step: all log weights are -inf")
     expect_same("sampler, alone and under jax.vmap,", _weights(alone), weights[0, -1])
     num_steps = values.shape[1]

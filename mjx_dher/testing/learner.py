@@ -60,14 +60,15 @@ def check_learner(
     played = jax.tree.map(hide, episodes.observation), batch.desired_goal, numbers, valid
     state = _step("update_normalizers", jax.jit(made.update_normalizers), state, *played)
     obs = _check_acting(made, state, episodes, spec, numbers)
-    updated, metrics = learners.check_update(state, run("learner.update", made.update, state, batch, numbers))
+    result = run("learner.update", made.update, state, batch, numbers)
+    updated, metrics = attempt("learner.update", learners.check_update, state, result)
     expect_finite("the state that learner.update gives", updated)
     same = all(bool(jnp.array_equal(a, b)) for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(updated)))
     expect(not same, "learner.update must change the state; nothing in it is changed")
     expect_finite("metrics of learner.update", metrics)
     moved = _step("update_target", jax.jit(made.update_target), updated, numbers)
     summary = attempt("learner.summary", jax.jit(made.summary), moved)
-    learners.check_metrics("summary", summary, metrics)
+    attempt("learner.summary", learners.check_metrics, "summary", summary, metrics)
     expect_finite("metrics of learner.summary", summary)
     _check_export(made, moved, obs, hparams)
 
@@ -85,7 +86,7 @@ def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> N
 def _step(name: str, function: Any, state: Any, *args: Any) -> Any:
     """State after a method of the learner. It must be finite and like `state`."""
     after = attempt(f"learner.{name}", function, state, *args)
-    check.kept(f"learner.{name}", state, after)
+    attempt(f"learner.{name}", check.kept, f"learner.{name}", state, after)
     expect_finite(f"the state that learner.{name} gives", after)
     return after
 
@@ -95,7 +96,7 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, spec: EnvSpec, h
     start: Any = {"observation": episodes.observation, "achieved_goal": episodes.achieved_goal}
     obs = {**jax.tree.map(lambda x: x[:, 0], start), "desired_goal": episodes.desired_goal}
     noise = attempt("learner.noise", made.noise, jax.random.key(2), spec.episode_length, EPISODES, hparams)
-    learners.check_noise(noise, spec.episode_length, EPISODES)
+    attempt("learner.noise", learners.check_noise, noise, spec.episode_length, EPISODES)
     explored = run("learner.explore", made.explore, state, obs, jax.tree.map(lambda x: x[0], noise), hparams)
     _check_actions("explore", explored, (EPISODES, spec.action_size))
     action = run("learner.act", made.act, state, obs, hparams)
