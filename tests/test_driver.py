@@ -119,7 +119,8 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
         assert group.failed == (1 if group.others["her_k"] == 7 else 0)
         if group.failed:
             assert group.final.tolist() == [0.0]
-            assert group.success.shape == (1, 1)
+            assert group.success.shape == (1, 3)
+            assert not group.success[0, 1:].any()
     assert any("(1 failed)" in cell for line in comparison.table(_rows(trials))[1] for cell in line)
 
 

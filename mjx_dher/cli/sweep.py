@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -167,21 +168,25 @@ def _check(args: SweepArgs) -> None:
 
 def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
     """All trials of the grid. Raises ValueError if one of them cannot run."""
-    specs, unread = [], {}
+    specs, plain = [], []
     changes = {name: value for name, value in vars(args.changes).items() if value is not None}
     axes = {name: values for name, values in vars(args.sweep).items() if values is not None}
     parts = [list(dict.fromkeys(getattr(args, field) or (None,))) for field in GRID]
     for env, *choice in itertools.product(*parts):
-        plain = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs)
-        unread[env] = dataclasses.replace(plain, config=dataclasses.replace(plain.config, **changes))
         named = {field: part for field, part in zip(GRID[1:], choice) if part is not None}
-        base = presets.preset(preset, env, engine=args.engine, env_kwargs=args.env_kwargs, **named)
-        base = dataclasses.replace(base, config=dataclasses.replace(base.config, **changes))
+        learns = {field: part for field, part in named.items() if field in ("learner", "networks")}
+        # A run's unread settings do not depend on the rest of the grid, so that a larger one has the same run.
+        make = functools.partial(presets.preset, preset, env, engine=args.engine, env_kwargs=args.env_kwargs)
+        base, unread = (
+            dataclasses.replace(run, config=dataclasses.replace(run.config, **changes))
+            for run in (make(**named), make(**learns))
+        )
         for point in itertools.product(*axes.values()):
             run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))
             spec.validate(run)
             specs.append(run)
-    return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds), unread)
+            plain.append(unread)
+    return grid.trials(specs, range(args.first_seed, args.first_seed + args.seeds), plain)
 
 
 def sweep_command(argv: list[str], console: Console) -> int:

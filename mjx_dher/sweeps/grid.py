@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
@@ -14,16 +14,16 @@ from mjx_dher.system.files import FolderError
 CELLS = "cells"
 
 
-def trials(specs: Sequence[RunSpec], seeds: Sequence[int], unread: Mapping[str, RunSpec] | None = None) -> list[RunSpec]:
+def trials(specs: Sequence[RunSpec], seeds: Sequence[int], plain: Sequence[RunSpec] | None = None) -> list[RunSpec]:
     """Every setting with every seed, sorted by environment, then seed, so that runs to compare end together.
 
-    Settings that a run does not read get the values of the environment's run in `unread`, or else of its first setting, and
+    Settings that a run does not read get the values of its run in `plain`, by default the environment's first one, and
     duplicates are dropped.
     """
     settings: dict[RunSpec, None] = {}
-    first = dict(unread or {})
-    for spec in specs:
-        base = first.setdefault(spec.env, spec)
+    first: dict[str, RunSpec] = {}
+    for number, spec in enumerate(specs):
+        base = plain[number] if plain else first.setdefault(spec.env, spec)
         settings[dataclasses.replace(fingerprint.with_unread_of(base, spec), seed=0)] = None
     grouped = itertools.groupby(settings, key=lambda spec: spec.env)
     return [
