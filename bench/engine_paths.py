@@ -1,7 +1,7 @@
 """Both paths of the engine warp against native: the difference of their coordinates, and their speed.
 
     PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu] [--models arm block_rotate_z] [--num-envs 1024 8192]
-    PYTHONPATH=.:tests python bench/engine_paths.py --models push --varied "mass:object0" "friction:object0"   and not varied
+    PYTHONPATH=.:tests python bench/engine_paths.py --models push --varied mass:object friction:object
 
 A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest of all coordinates within 8
 environment steps of 64 environments under random controls. A task has its own number of timesteps per step. The speed is
@@ -70,7 +70,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", default=[*MODELS, "docs/examples/arm.xml"])
     parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
-    parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object0"')
+    parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object"')
     args = parser.parse_args()
     print(f"{machine()}\n\n{HEAD}\n|{'---|' * 8}", flush=True)
     for name, varied in itertools.product(args.models, [[], args.varied] if args.varied else [[]]):

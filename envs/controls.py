@@ -253,7 +253,9 @@ class Holding:
         self._followers: dict[int, list[tuple[Any, ...]]] = {}  # by index in qpos, servos of a joint
         for i in filter(lambda i: _pulls(model, i), range(model.nu)):
             slope, offset = _holding(model, i)
-            low, high = model.actuator_ctrlrange[i] if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
+            part = "ctrl" if is_servo(model, i) else "act"  # a velocity servo's activation is its position
+            is_limited, ends = (getattr(model, f"actuator_{part}{field}")[i] for field in ("limited", "range"))
+            low, high = ends if is_limited else (-np.inf, np.inf)
             target = np.clip(slope * lengths[i] + offset, low, high)
             activation = int(model.actuator_actadr[i])
             if activation >= 0:

@@ -185,7 +185,7 @@ class _Best(NamedTuple):
 
 _DDPG = _Best("ddpg", "mlp", None)
 _HANDS = {
-    "cpu": _Best("tqc", "layer_norm", None),  # not tuned, but for hand_reach
+    "cpu": _Best("tqc", "layer_norm", None),  # not tuned; hand_reach has other settings
     "gpu": _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
 }
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset

@@ -44,7 +44,7 @@ def make(model, **declared):
         POSITION,
         '<position joint="j" kp="20" timeconst="0.1"/>',  # its input goes through a filter
         '<position tendon="pull" kp="80" ctrlrange="-2 2"/>',
-        '<intvelocity joint="j" kp="20" actrange="-2 2" ctrlrange="-1 1"/>',
+        '<intvelocity joint="j" kp="20" actrange="-2 2" ctrlrange="-0.5 0.5"/>',
     ],
 )
 def test_settling_holds_each_drawn_start(actuator):

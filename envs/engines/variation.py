@@ -141,8 +141,10 @@ def _of_field(model: mujoco.MjModel, field: str, of_kind: np.ndarray, none: int)
 
 
 def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[float, float]]:
-    """Lowest and highest factor by name, from a mapping or a text such as "mass:box=0.5-2, gain:*=0.9-1.1". Raises ValueError
-    if it has another form, or a range is invalid.
+    """Lowest and highest factor of each name, from a mapping or a text such as "mass:box=0.5-2, gain:*=0.9-1.1".
+
+    Raises:
+      ValueError: `varied` has another form, or a range is invalid.
     """
     if isinstance(varied, str):
         varied = _parsed(varied)
