@@ -33,9 +33,10 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
-    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", each once. They are in the order of the
-    patterns, and for one pattern in the columns' order. A name without "*" and "?" counts in the first column that has it. Raises ValueError if no name matches a pattern. The message lists
-    the names.
+    """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", each once.
+
+    They are in the order of the patterns, and for one pattern in the columns' order. A pattern without "*" and "?" counts in
+    the first column that has the name. Raises ValueError if no name matches a pattern. The message lists the names.
     """
     chosen: dict[int, None] = {}
     for pattern in str(patterns).split() or [""]:
