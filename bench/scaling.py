@@ -1,21 +1,27 @@
 """Scaling over devices: parallel runs, and one run split over devices.
 
-    python bench/scaling.py lanes --devices 2 --env push --lanes 40       # 40 lanes on one device, 80 on two
-    python bench/scaling.py lanes --devices 2 --env pick_and_place slide
-    python bench/scaling.py run --devices 2 --env push --times 1 2 4 8    # multiples of the environments and the batch
+    python bench/scaling.py lanes --devices 1 2 4 8 --env push pick_and_place slide   # 40 runs on one device, 320 on eight
+    python bench/scaling.py run --devices 1 2 4 8 --env push --times 1 8              # one run; multiples of the preset's sizes
+    python bench/scaling.py run --devices 8 --times 8 --updates-per-cycle 100 --profile
 
-`run` has three rows for each size: one device; all devices, with as many times the environments and batch; all devices, with
-the same. The third row shows the cost of the exchange if work is too small to share. A row is the median epoch of `--epochs`,
-without the first one. The rows of a size are measured in turn, `--rounds` times, and the best round of each counts.
+`run` measures one device, and for each larger number of devices a row with as many times the environments and batch (weak
+scaling) and one with the same (strong scaling). A row is the median epoch of `--epochs`, without the first one. All programs
+are compiled first. The rows of a size are measured in turn, `--rounds` times, and the best round of each counts. `--profile`
+adds an epoch of each row under jax.profiler: the shares of the first device's time in which it works, and exchanges.
 """
 
 from __future__ import annotations
 
 import argparse
+import concurrent.futures
 import dataclasses
 import statistics
+import sys
+import tempfile
+from pathlib import Path
 
 import jax
+from profile_epoch import busy, device_events
 from timing import print_table
 
 from mjx_dher import config as config_lib
@@ -30,19 +36,39 @@ class Case:
     """`runs` compiled runs of a spec on `devices` devices."""
 
     def __init__(self, env, spec, runs, devices):
-        self.env, self.spec, self.devices = env, spec, devices
+        self.env, self.spec, self.runs, self.devices = env, spec, runs, devices
         specs = [dataclasses.replace(spec, seed=seed) for seed in range(runs)]
-        self.program = program_lib.compile_runs(env, specs, runs, 1, lambda text: print(text, flush=True), mesh.find(devices))
-        self.runs = self.program.lanes
-        self.arguments = program_lib.stack(specs, self.program.choices, self.program.lanes)
+        choices, layout = program_lib.choices_of(specs), mesh.arrange(mesh.find(devices), runs)
+        self.arguments = program_lib.stack(specs, choices, runs)
+        updates = config_lib.num_updates(spec.config, env.episode_length)
+        self.compiled = loop.compile_program(
+            program_lib.make_loop(env, spec, choices, layout), *self.arguments, updates, layout
+        )
         self.seconds = float("inf")  # of an epoch
+        self.working = self.exchanging = float("nan")  # shares of a profiled epoch
+        print(f"{spec.env}: {runs} runs on {devices} devices compiled", file=sys.stderr, flush=True)
+
+    def train(self, epochs):
+        """The progress of `epochs` epochs of new runs."""
+        config = dataclasses.replace(
+            self.spec.config, total_steps=epochs * config_lib.steps_per_epoch(self.spec.config, self.env.episode_length)
+        )
+        return loop.run(self.env, config, self.compiled, loop.Start(self.compiled.init(*self.arguments)))
 
     def measure(self, epochs):
-        steps = (1 + epochs) * config_lib.steps_per_epoch(self.spec.config, self.env.episode_length)
-        config = dataclasses.replace(self.spec.config, total_steps=steps)
-        start = loop.Start(self.program.compiled.init(*self.arguments))
-        seconds = [progress.epoch_seconds for progress in loop.run(self.env, config, self.program.compiled, start)]
+        seconds = [progress.epoch_seconds for progress in self.train(1 + epochs)]
         self.seconds = min(self.seconds, statistics.median(seconds[1:]))
+
+    def profile(self):
+        epochs = self.train(3)
+        next(epochs), next(epochs)
+        with tempfile.TemporaryDirectory() as folder:
+            with jax.profiler.trace(folder, create_perfetto_trace=False):
+                seconds = next(epochs).epoch_seconds
+            events = list(device_events(Path(folder), gpu=0))
+        exchange = [event for event in events if "nccl" in event[0].lower()]
+        self.working = busy(event for event in events if event not in exchange) / 1e6 / seconds
+        self.exchanging = busy(exchange) / 1e6 / seconds
 
     @property
     def steps(self):
@@ -56,14 +82,23 @@ class Case:
         return self.runs * config.cycles_per_epoch * config.updates_per_cycle * config.batch_size / self.seconds
 
 
+def compile_all(*arguments):
+    """Cases of (env, spec, runs, devices), compiled side by side."""
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        return list(pool.map(lambda own: Case(*own), arguments))
+
+
 def measure(cases, args):
     for _ in range(args.rounds):
         for case in cases:
             case.measure(args.epochs)
+    for case in cases if args.profile else ():
+        case.profile()
 
 
-def resized(spec, args, times=1):
-    """The spec with the command line's changes, and `times` the environments and the batch."""
+def resized(name, args, times=1):
+    """The preset's run of a task with the command line's changes, and `times` the environments and the batch."""
+    spec = presets.preset(args.preset, name, engine=args.engine)
     changes = {name: getattr(args, name) for name in ("num_envs", "batch_size", "updates_per_cycle", "cycles_per_epoch")}
     changes = {name: value for name, value in changes.items() if value is not None}
     if args.hidden_sizes:
@@ -74,39 +109,61 @@ def resized(spec, args, times=1):
 
 
 def lanes(args):
+    tasks = [(envs.make(name, engine=args.engine), resized(name, args)) for name in args.env]
+    cases = compile_all(*[(env, spec, n * args.lanes, n) for env, spec in tasks for n in args.devices])
     rows = []
     for name in args.env:
-        spec = resized(presets.preset(args.preset, name, engine=args.engine), args)
-        env = envs.make(name, engine=args.engine)
-        cases = [Case(env, spec, n * args.lanes, n) for n in (1, args.devices)]
-        measure(cases, args)
-        for case in cases:
-            ratio = case.seconds / cases[0].seconds
-            rows.append((name, case.devices, case.runs, f"{case.seconds:.3f}", f"{case.steps:,.0f}", f"{ratio:.3f}"))
-    print_table(("env", "devices", "lanes", "s an epoch", "env steps/s", "time, of one device's"), rows)
+        own = [case for case in cases if case.spec.env == name]
+        measure(own, args)
+        for case in own:
+            times = case.steps / own[0].steps
+            told = (name, case.devices, case.runs, f"{case.seconds:.3f}", f"{case.steps:,.0f}", f"{times:.2f}")
+            rows.append((*told, *shares(case, args)))
+    print_table(("env", "devices", "lanes", "s an epoch", "env steps/s", "of the first row's", *SHARES[args.profile]), rows)
 
 
 def one_run(args):
-    rows = []
+    rows, wanted = [], []
     for name in args.env:
         env = envs.make(name, engine=args.engine)
         for times in args.times:
-            one = resized(presets.preset(args.preset, name, engine=args.engine), args, times)
-            more = resized(presets.preset(args.preset, name, engine=args.engine), args, times * args.devices)
-            cases = [Case(env, spec, 1, devices) for spec, devices in ((one, 1), (more, args.devices), (one, args.devices))]
-            measure(cases, args)
-            for case in cases:
-                sizes = (case.spec.config.num_envs, case.spec.config.batch_size, max(case.spec.config.hidden_sizes))
-                ratios = (f"{case.steps / cases[0].steps:.2f}", f"{case.transitions / cases[0].transitions:.2f}")
-                rows.append((name, case.devices, *sizes, f"{case.seconds:.3f}", f"{case.steps:,.0f}", *ratios))
-    head = ("env", "devices", "environments", "batch", "units", "s an epoch", "env steps/s", "steps, of one's", "transitions")
-    print_table(head, rows)
+            sizes = [(times * n, n) for n in args.devices] + [(times, n) for n in args.devices if n > 1]
+            wanted += [(env, resized(name, args, own), 1, n) for own, n in sizes]
+    cases = compile_all(*wanted)
+    number = len(cases) // (len(args.env) * len(args.times))
+    for first in range(0, len(cases), number):
+        own = cases[first : first + number]
+        measure(own, args)
+        for case in own:
+            sizes = (case.spec.config.num_envs, case.spec.config.batch_size, max(case.spec.config.hidden_sizes))
+            ratios = (f"{case.steps / own[0].steps:.2f}", f"{case.transitions / own[0].transitions:.2f}")
+            told = (case.spec.env, case.devices, *sizes, f"{case.seconds:.3f}", f"{case.steps:,.0f}")
+            rows.append((*told, *ratios, *shares(case, args)))
+    head = (
+        "env",
+        "devices",
+        "environments",
+        "batch",
+        "units",
+        "s an epoch",
+        "env steps/s",
+        "of the first row's",
+        "transitions",
+    )
+    print_table((*head, *SHARES[args.profile]), rows)
+
+
+SHARES = {False: (), True: ("works", "exchanges")}
+
+
+def shares(case, args):
+    return (f"{case.working:.2f}", f"{case.exchanging:.2f}") if args.profile else ()
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("lanes", "run"))
-    parser.add_argument("--devices", type=int, default=2)
+    parser.add_argument("--devices", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--env", nargs="+", default=["push"])
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="gpu")
@@ -114,6 +171,7 @@ def main():
     parser.add_argument("--times", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--epochs", type=int, default=5)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--profile", action="store_true")
     for name in ("--num-envs", "--batch-size", "--updates-per-cycle", "--cycles-per-epoch"):
         parser.add_argument(name, type=int, help="in place of the preset's")
     parser.add_argument("--hidden-sizes", type=int, nargs="+", help="in place of the preset's")

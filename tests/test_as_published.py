@@ -1,4 +1,4 @@
-"""bench/as_published.py, td_controls.py, unseen.py and modern_critics.py: the runs that docs/experiments plans."""
+"""bench/as_published.py, td_controls.py, unseen.py, modern_critics.py and hands.py: the runs that docs/experiments plans."""
 
 from conftest import ROOT, refuses
 
@@ -9,13 +9,14 @@ def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
     """Each group is one program, arms differ, and numbers are those of the plan."""
     monkeypatch.syspath_prepend(ROOT / "bench")
     import as_published
+    import hands
     import modern_critics
     import td_controls
     import unseen
 
     k_of = dict.fromkeys([arm.name for arm in as_published.METHODS], 8)
     monkeypatch.setattr(as_published, "best_k", lambda task, method: k_of[method])
-    for experiment in (*as_published.EXPERIMENTS.values(), td_controls.CONTROLS, modern_critics.CRITICS):
+    for experiment in (*as_published.EXPERIMENTS.values(), td_controls.CONTROLS, modern_critics.CRITICS, hands.HANDS):
         learner = experiment.learners[0]
         for task in experiment.tasks:
             specs = [experiment.spec_of(learner, task, arm, False) for arm in experiment.arms]

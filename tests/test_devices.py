@@ -55,3 +55,35 @@ def test_lanes_of_a_checkpoint_are_filled_up_or_left_out():
         assert found.keys() == expected.keys()
         for name in expected:
             np.testing.assert_array_equal(found[name], expected[name], err_msg=name)
+
+
+def dealt(cursors, sizes, rows, devices):
+    """Actions, which name their episodes, cursors and sizes after `_deal`. The rings are as `replay.add` fills them."""
+    number, own = len(cursors), rows // len(cursors)
+    before = {
+        ".env_steps": np.int32(600),
+        ".replay.priority": np.zeros(rows, np.float32),
+        ".replay.cursor": np.array(cursors, np.int32).reshape(() if number == 1 else number),
+        ".replay.size": np.array(sizes, np.int32).reshape(() if number == 1 else number),
+        ".replay.episodes.action": np.zeros((rows, 2), np.float32),
+    }
+    for ring, (cursor, size) in enumerate(zip(cursors, sizes)):
+        for age in range(size):
+            before[".replay.episodes.action"][ring * own + (cursor - 1 - age) % own] = 100 * (ring + 1) + age
+    counter = np.zeros(() if devices == 1 else devices, np.int32)
+    after = before | {".replay.cursor": counter, ".replay.size": counter}
+    found = restoring._deal({name: np.asarray(x) for name, x in before.items()}, after)
+    assert found.keys() == before.keys()
+    assert all(found[name].shape == after[name].shape and found[name].dtype == after[name].dtype for name in after)
+    rings = found[".replay.episodes.action"][:, 0].reshape(devices, -1).tolist()
+    return rings, found[".replay.cursor"].tolist(), found[".replay.size"].tolist(), int(found[".env_steps"])
+
+
+def test_rings_are_dealt_to_other_devices():
+    """100 is the newest episode of the first ring, 201 the second newest of the second."""
+    # The first ring was full and has wrapped, the second is not full. One device has made as many steps as both.
+    assert dealt([1, 2], [4, 2], 8, 1) == ([[103, 102, 201, 101, 200, 100, 0, 0]], 6, 6, 1200)
+    # One ring to two: every other episode, oldest first, so that the next write replaces the oldest.
+    assert dealt([1], [6], 6, 2) == ([[104, 102, 100], [105, 103, 101]], [0, 0], [3, 3], 300)
+    # Four rings to two; an empty one has no part.
+    assert dealt([1, 0, 1, 1], [1, 0, 2, 1], 8, 2) == ([[400, 100, 0, 0], [301, 300, 0, 0]], [2, 2], [2, 2], 1200)

@@ -13,7 +13,7 @@ from rich.console import Console
 from mjx_dher import envs, lookup, spec
 from mjx_dher.cli import common, settings
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import Physics, Trust, make_env, settle_compiler
+from mjx_dher.cli.common import Devices, Physics, Trust, make_env, settle_compiler
 from mjx_dher.cli.train import train_into
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.runs.options import Options
@@ -21,6 +21,7 @@ from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.caches import prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.validation import check_devices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,8 @@ class ResumeArgs:
     trust: Trust = False
     distributed: bool = False
     """Train together with the other processes of this job: the same command on each (docs/scaling.md)."""
+    devices: Devices | None = None
+    """Number of devices, or all, that share the run. Default: as before."""
     total_steps: int | None = None
     """Environment steps of the whole run, including earlier ones. Default: as before."""
     curve: bool = True
@@ -50,6 +53,8 @@ def resume_command(argv: list[str], console: Console) -> int:
     content = reading.read_config(asked.run)
     args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
     common.check_engine(args.engine)
+    if args.devices is not None:
+        check_devices(args.devices)
     settle_compiler(args.engine or content["physics"])
     described = {name: str(value) for name, value in vars(args).items()} | {"digest": content["digest"]}
     screen = common.join(args.distributed, described, console)
@@ -60,7 +65,8 @@ def resume_command(argv: list[str], console: Console) -> int:
         run, options = _to_resume(args, asked.options.stop_at, content, screen)
         prepare()
         env = make_env(run, args.engine or (content["physics"] if envs.takes_engine(run.env) else None))
-        return train_into(env, run, args.run, options, args.curve, screen, content.get("devices", 1))
+        devices = content.get("devices", 1) if args.devices is None else args.devices
+        return train_into(env, run, args.run, options, args.curve, screen, devices)
 
 
 def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any], console: Console) -> tuple[RunSpec, Options]:

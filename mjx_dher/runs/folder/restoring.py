@@ -16,7 +16,8 @@ from mjx_dher.runs.folder.run_folder import checkpoints_to_resume, epoch_of
 from mjx_dher.system.files import FolderError
 
 _HPARAMS = ".hparams."
-_CURSOR, _STEPS = ".replay.cursor", ".env_steps"
+_RING, _STEPS = ".replay.", ".env_steps"
+_CURSOR, _SIZE, _PRIORITY = f"{_RING}cursor", f"{_RING}size", f"{_RING}priority"
 _EARLIER = (".replay.episodes.length", ".replay.episodes.terminal")  # missing in checkpoints of 0.2.0
 
 
@@ -82,8 +83,7 @@ def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.nda
             raise CheckpointError(f"{path} was written as {saved} but read as {held}")
     shapes = to_shapes(template)
     arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
-    _check_devices(path, arrays, shapes)
-    return _fit(path, arrays, shapes)
+    return _fit(path, _deal(arrays, shapes), shapes)
 
 
 def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
@@ -100,12 +100,42 @@ def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: i
     return {name: (array if saved else array[None])[lanes] for name, array in arrays.items()}
 
 
-def _check_devices(path: Path, arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any]) -> None:
-    """Raises CheckpointError if another number of devices shared each run. Each device has a ring with a cursor."""
-    if all(name in known for name in (_CURSOR, _STEPS) for known in (arrays, shapes)):
-        before, now = (known[_CURSOR].size // max(1, known[_STEPS].size) for known in (arrays, shapes))
-        if before != now:
-            raise CheckpointError(f"{path}: devices must be {before} per run, as when it was written; got {now}")
+def _deal(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Arrays with each run's episodes dealt to the rings of as many devices as in `shapes`, if their number differs.
+
+    Each device that shares a run has a ring with a cursor. The new rings start with their oldest episode.
+    """
+    if not all(name in known for name in (_CURSOR, _STEPS) for known in (arrays, shapes)):
+        return arrays  # not a TrainState
+    before, now = (known[_CURSOR].size // max(1, known[_STEPS].size) for known in (arrays, shapes))
+    if before == now or arrays[_PRIORITY].shape != shapes[_PRIORITY].shape:
+        return arrays  # `_fit` compares the shapes
+    lanes, rows = arrays[_STEPS].size, arrays[_PRIORITY].shape[-1]
+    cursors, sizes = (arrays[name].reshape(lanes, before) for name in (_CURSOR, _SIZE))
+    source = np.full((lanes, now, rows // now), -1)  # old row of each new one
+    for lane in range(lanes):
+        newest = _newest_first(cursors[lane], sizes[lane], rows // before)
+        for device in range(now):
+            own = newest[device::now]
+            source[lane, device, : len(own)] = own[::-1]
+    held = (source >= 0).sum(-1, dtype=sizes.dtype)
+    source = source.reshape(lanes, rows, 1)
+
+    def moved(x: np.ndarray) -> np.ndarray:
+        taken = np.take_along_axis(x.reshape(lanes, rows, -1), np.maximum(source, 0), 1)
+        taken[source[..., 0] < 0] = 0
+        return taken.reshape(x.shape)
+
+    dealt = {name: moved(x) if name.startswith(_RING) and name not in (_CURSOR, _SIZE) else x for name, x in arrays.items()}
+    counters = {_CURSOR: held % (rows // now), _SIZE: held, _STEPS: arrays[_STEPS] * before // now}  # steps of one device
+    return dealt | {name: counter.reshape(shapes[name].shape) for name, counter in counters.items()}
+
+
+def _newest_first(cursors: np.ndarray, sizes: np.ndarray, rows: int) -> np.ndarray:
+    """Rows of all episodes of rings with `rows` each, by age."""
+    ages = [np.arange(size) for size in sizes]
+    each = [ring * rows + (cursor - 1 - age) % rows for ring, (cursor, age) in enumerate(zip(cursors, ages))]
+    return np.concatenate(each)[np.argsort(np.concatenate(ages), kind="stable")]
 
 
 def _fit(path: Path, arrays: dict[str, np.ndarray], shapes: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
