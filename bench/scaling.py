@@ -104,8 +104,8 @@ def resized(name, args, times=1):
     if args.hidden_sizes:
         changes["hidden_sizes"] = tuple(args.hidden_sizes)
     config = dataclasses.replace(spec.config, **changes)
-    config = dataclasses.replace(config, num_envs=times * config.num_envs, batch_size=times * config.batch_size)
-    return dataclasses.replace(spec, config=config)
+    larger = {name: times * getattr(config, name) for name in ("num_envs", "batch_size", "replay_size")}
+    return dataclasses.replace(spec, config=dataclasses.replace(config, **larger))
 
 
 def lanes(args):

@@ -24,6 +24,8 @@ from as_published import EXPERIMENTS as PUBLISHED
 from bakeoff_arms import BAKEOFF, Experiment
 from bakeoff_report import ALPHA, Row, compare, corrected, forest
 from bakeoff_runs import by_arm, load
+from crl import CONTRASTIVE
+from hands import HANDS
 
 EXPERIMENTS, IMAGES, SCRIPT, SEEDS = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py", 10
 COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
@@ -54,6 +56,15 @@ PAGES = (
     Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
     Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
     Page(PUBLISHED["cher"], EXPERIMENTS / "as_published.md", DOCS / "as_published_cher_runs.csv", "cher", pictures=False),
+    Page(
+        PUBLISHED["next_future"],
+        EXPERIMENTS / "as_published.md",
+        DOCS / "as_published_next_future_runs.csv",
+        "next_future",
+        pictures=False,
+    ),
+    Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
+    Page(HANDS, EXPERIMENTS / "preset_hands.md", DOCS / "hands_runs.csv", "hands", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
 

@@ -7,6 +7,7 @@ Only the state is passed in and out. `mjx.step` would pass some 170 arrays betwe
 import concurrent.futures
 import copy
 import threading
+import warnings
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -89,7 +90,7 @@ class WarpEngine:
             defaults = (model.opt.iterations, model.opt.ls_iterations)
         else:
             most_contacts, defaults = 0, (simulation.ITERATIONS, simulation.LS_ITERATIONS)
-        self._contacts, self._constraints = contacts or most_contacts, constraints or rows
+        self._contacts, self._constraints, self._asked = contacts or most_contacts, constraints or rows, bool(constraints)
         self._model.opt.iterations, self._model.opt.ls_iterations = iterations or defaults[0], ls_iterations or defaults[1]
         self._begin()
 
@@ -164,8 +165,11 @@ class WarpEngine:
         return [x[0] for x in self._call(*rows, jnp.concatenate(inputs)[None])]
 
     def check(self) -> None:
-        """Checks that no contacts were lost since the last call. Waits for the kernel to compile. Raises ValueError if memory
-        did not suffice. The message has a sufficient size.
+        """Checks that no contacts were lost since the last call. Waits for the kernel to compile.
+
+        Raises ValueError if the size that the engine was made with did not suffice, with a sufficient one. If the fused kernel
+        had no room by default, which is rare, a warning says so. The states of these environments have become NaN, so their
+        episodes are discarded.
         """
         self._wait()
         with self._lock:
@@ -177,6 +181,13 @@ class WarpEngine:
             fits, enough = simulation.rows_for(self._model, simulation.shared_memory()), simulation.most_rows(self._model)
             most = f"constraints={enough} are always enough" if fits == enough else "path='graph' has room for more"
             cure = f"constraints={self._constraints}; {most}"
+            if not self._asked:
+                warnings.warn(
+                    "the fused kernel had no room for all contacts of some environments. Their states became NaN, and their"
+                    f" episodes are discarded; {most}",
+                    stacklevel=2,
+                )
+                return
         else:
             cure = f"contacts={self._contacts} and constraints={self._constraints}; try twice as many"
         raise ValueError(f"the warp engine left out contacts that there was no room for: it was made with {cure}")

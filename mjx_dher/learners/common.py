@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import optax
 from flax import struct
@@ -154,8 +155,11 @@ class ActorCriticBase(Learner):
         return params if self.networks.project is None else self.networks.project(params)
 
     def mean(self, gradients: Tree) -> Tree:
-        """Mean of the gradients over the devices that share the run."""
-        return gradients if self.axis_name is None else jax.lax.pmean(gradients, self.axis_name)
+        """Mean of the gradients over the devices that share the run. They exchange one array, because each takes its time."""
+        if self.axis_name is None:
+            return gradients
+        flat, restore = jax.flatten_util.ravel_pytree(gradients)
+        return restore(jax.lax.pmean(flat, self.axis_name))
 
     def normal(self, key: PRNGKey, shape: tuple[int, ...]) -> Array:
         """Standard normal numbers of `shape` [B, ...]. Devices that share a run get different rows of one draw."""

@@ -7,7 +7,7 @@ A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' 
 from mjx_dher.envs.engines.fused.contacts import tangent, tangent_of
 from mjx_dher.envs.engines.fused.dynamics import times
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, Softness, World
-from mjx_dher.envs.engines.fused.threads import sync
+from mjx_dher.envs.engines.fused.threads import give_up, sync
 from mjx_dher.system.warp_setup import wp
 
 _TINY = wp.constant(1e-15)  # MuJoCo's smallest number
@@ -155,7 +155,7 @@ def number(
 ):
     """Gives a row to each joint at its limit, and a number of rows to each contact within its margin.
 
-    Contacts that do not fit are left out and counted in `lost`.
+    Contacts that do not fit are counted in `lost`.
     """
     for s in range(thread, contacts.slots, threads):
         pair = contacts.pair[s]
@@ -174,7 +174,7 @@ def number(
         for s in range(contacts.slots):
             edges = memory.touching[s]
             if edges > 0 and rows + edges > world.rows:
-                wp.atomic_add(lost, 0, 1)
+                give_up(memory, lost)
             elif edges > 0:
                 memory.touching[touching] = s
                 memory.slot[touching] = rows

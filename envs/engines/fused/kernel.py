@@ -33,8 +33,11 @@ def _begin(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: in
 
 @wp.func
 def _end(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: int, threads: int):
-    """Copies an environment's state out of its memory."""
+    """Copies an environment's state out of its memory. If it is not finite, all coordinates become NaN."""
     copy(memory.qpos, qpos, thread, threads)
+    if wp.isnan(memory.qvel[0]):
+        for i in range(thread, qpos.shape[0], threads):
+            qpos[i] = wp.nan
     copy(memory.qvel, qvel, thread, threads)
     copy(memory.qacc, guess, thread, threads)
 

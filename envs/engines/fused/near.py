@@ -9,7 +9,7 @@ the rows of constraints, and keeps those that touch. All lists are in the order 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of
 from mjx_dher.envs.engines.fused.model import Contacts, Floats, Ints, Layout, Memory
-from mjx_dher.envs.engines.fused.threads import all_of, earlier, floats, ints, sync, vec3s
+from mjx_dher.envs.engines.fused.threads import all_of, earlier, floats, give_up, ints, sync, vec3s
 from mjx_dher.system.warp_setup import wp
 
 PAIR_WORDS, SLOT_WORDS = 7, 7  # memory of a pair, and of a slot, in floats
@@ -63,7 +63,7 @@ def near_pairs(
                 near.pair[at] = p
                 near.margin[at] = contacts.margin[p]
             else:
-                wp.atomic_add(lost, 0, 1)
+                give_up(memory, lost)
                 if at < most:
                     near.most[at] = 0
                     near.kind[at] = -1
@@ -138,7 +138,7 @@ def keep(
                         memory.normal[at] = scratch.normal[s]
                         held.pair[at] = near.pair[i]
                     else:
-                        wp.atomic_add(lost, 0, 1)
+                        give_up(memory, lost)
                     at += 1
         kept += all_of(number, threads)
     held.slots = wp.min(kept, contacts.slots)

@@ -5,6 +5,7 @@
 loop that begins at `thread` and advances by `threads`.
 """
 
+from mjx_dher.envs.engines.fused.model import Ints, Memory
 from mjx_dher.system.warp_setup import wp
 
 _GROUP = "const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) << (threadIdx.x & 31 & ~(threads - 1));"
@@ -126,3 +127,10 @@ def spatials(spare: wp.array(dtype=float), size: int, begin: int, length: int, t
 ):
     """Returns `length` values that begin at a place in the environment's memory."""
     ...
+
+
+@wp.func
+def give_up(memory: Memory, lost: Ints):
+    """Counts a contact that there is no room for. A NaN tells `kernel._end` that the state is wrong."""
+    wp.atomic_add(lost, 0, 1)
+    memory.qvel[0] = wp.nan
