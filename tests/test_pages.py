@@ -7,6 +7,7 @@ import make_comparison_tables
 import make_preference_figure
 import make_results_figures
 import make_samplers_figure
+import make_scaling_figure
 import numpy as np
 import paper_analysis
 import paper_set
@@ -87,6 +88,11 @@ def test_each_table_of_results_with_numbers_is_made_from_the_curves():
 def test_the_table_of_readings_is_what_the_weights_are():
     page = make_samplers_figure.PAGE.read_text()
     assert make_samplers_figure.with_table(page) == page
+
+
+def test_the_tables_of_scaling_are_of_the_file():
+    page = make_scaling_figure.PAGE.read_text()
+    assert make_scaling_figure.with_table(page) == page
 
 
 @pytest.mark.parametrize("page", make_comparison_tables.PAGES, ids=lambda page: page.name)
