@@ -26,7 +26,7 @@ class Outcome(NamedTuple):
     success: Array  # 1.0 if the goal is reached at the last step
     reset_success: Array  # 1.0 if it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
-    valid: Array  # whether all observations, actions and rewards are finite and the environment is not `failed`, bool
+    valid: Array  # whether all observations, actions and rewards are finite and no state is `failed`, bool
     bad_rewards: Array  # fraction of rewards outside the reward range
     length: Array  # steps that were played, int32
 
@@ -37,6 +37,7 @@ class _Playing(NamedTuple):
     state: PyTree  # of the environments
     over: Array  # [N] whether the episode has ended, bool
     length: Array  # [N] int32
+    failed: Array  # [N] whether a state so far is `failed`, bool
 
 
 def rollout(
@@ -96,7 +97,8 @@ def record_rollout(
         following, played = _step(env, spec, policy, playing, step_inputs)
         return following, (*played, record(playing.state))
 
-    start = _Playing(first, jnp.zeros(num_envs, bool), jnp.zeros(num_envs, jnp.int32))
+    none = jnp.zeros(num_envs, bool)
+    start = _Playing(first, none, jnp.zeros(num_envs, jnp.int32), none | getattr(first, "failed", False))
     end, played = jax.lax.scan(step, start, inputs, length=spec.episode_length)
     (observation, achieved_goal, action, reward, recorded), last = played, end.state
 
@@ -108,7 +110,7 @@ def record_rollout(
         length=end.length,
         terminal=jnp.broadcast_to(getattr(last, "terminal", False), (num_envs,)),
     )
-    valid = ~jnp.broadcast_to(getattr(last, "failed", False), (num_envs,)) & _is_finite((episodes, jnp.moveaxis(reward, 0, 1)))
+    valid = ~end.failed & _is_finite((episodes, jnp.moveaxis(reward, 0, 1)))
     outcome = Outcome(
         success=jnp.where(valid, last.success, 0.0),
         reset_success=first.success,
@@ -135,7 +137,8 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
     played = (state.obs["observation"], state.obs["achieved_goal"], action, reward)
     length = playing.length + (~playing.over).astype(jnp.int32)
     terminated, done = ended(env, spec, following)
-    return _Playing(following, playing.over | terminated | done, length), played
+    failed = playing.failed | getattr(following, "failed", False)
+    return _Playing(following, playing.over | terminated | done, length, failed), played
 
 
 def _whole(steps: Array, end: Array) -> Array:

@@ -124,6 +124,17 @@ def test_episodes_that_blow_up_leave_no_trace(value):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.learner, metrics)))
 
 
+def test_an_episode_with_a_failure_that_the_environment_forgets_is_discarded():
+    class Forgets(Explodes):
+        def step(self, state, action):
+            return super().step(dataclasses.replace(state, failed=jnp.zeros((), bool)), action)
+
+    episodes, outcome = rollout(Forgets(None), lambda _, obs: jnp.zeros((16, 2)), jax.random.key(0), 16)
+    breaks = episodes.achieved_goal[:, 0, 0] > Explodes.EDGE
+    assert 0 < breaks.sum() < 16
+    np.testing.assert_array_equal(outcome.valid, ~breaks)
+
+
 def test_without_any_valid_episode_nothing_is_learned():
     program = make_train(Explodes(jnp.nan, edge=-1.0), SMALL)
     first = program.init(jax.random.key(0), HParams())
