@@ -271,7 +271,9 @@ def _goals(loop: Loop, state: TrainState, context: Context) -> Callable[[GoalObs
 
     def goals_of(obs: GoalObs) -> Array:
         own = obs["desired_goal"]
-        goals = check.array("generator: goals [N, G]", generator(key, obs, state.replay, context), own.shape)
+        # A start that is not finite, of an episode to discard, must not spoil the goals of the others.
+        seen = jax.tree.map(lambda x: jnp.nan_to_num(x, posinf=0.0, neginf=0.0), obs)
+        goals = check.array("generator: goals [N, G]", generator(key, seen, state.replay, context), own.shape)
         return jnp.where(jnp.all(jnp.isfinite(goals), axis=-1, keepdims=True), goals.astype(own.dtype), own)
 
     return goals_of

@@ -58,9 +58,9 @@ def test_a_rollout_is_played_for_the_goals_that_are_given():
     assert outcome.valid.all()
 
 
-def played_for(generate):
+def played_for(generate, env=ENV):
     """Goals of the episodes of a run's first cycle."""
-    train = make_train(ENV, dataclasses.replace(SMALL, cycles_per_epoch=1, total_steps=40), generator=generate)
+    train = make_train(env, dataclasses.replace(SMALL, cycles_per_epoch=1, total_steps=40), generator=generate)
     state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
     return state.replay.episodes.desired_goal[: SMALL.num_envs]
 
@@ -74,6 +74,20 @@ def test_a_goal_that_is_not_finite_leaves_the_reset_s():
     found = played_for(some)
     own = played_for(lambda key, obs, ring, context: obs["desired_goal"])
     np.testing.assert_array_equal(found, own.at[0].set(0.1))
+
+
+@pytest.mark.slow
+def test_a_start_that_is_not_finite_does_not_spoil_the_goals_of_others():
+    class Broken(PointMass):
+        """Half of the starts, those at the right, are NaN."""
+
+        def reset(self, key):
+            state = super().reset(key)
+            start = state.obs["achieved_goal"]
+            return self._state(jnp.where(start[0] > 0, jnp.nan, start), state.obs["desired_goal"])
+
+    found = played_for(lambda key, obs, ring, context: 0.1 + 0.0 * (obs["desired_goal"] + obs["achieved_goal"].sum()), Broken())
+    assert 0 < (found == jnp.float32(0.1)).all(axis=1).sum() < SMALL.num_envs  # the others were discarded
 
 
 @pytest.mark.parametrize(
