@@ -237,6 +237,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
           ValueError: there are not N seeds, `options` is not empty, or `GoalEnv.check` found a fault.
         """
         streams = zip(_check_reset(options, seed, self.num_envs), zip(self._np_random, self._np_random_seed))
+        self._compiled.check()
         self._np_random, self._np_random_seed = zip(*(old if one is None else seeding.np_random(one) for one, old in streams))
         obs, _, infos = self._restart()
         return obs, infos
@@ -250,6 +251,8 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         """
         actions = _checked(actions, self.action_space, self._states)
         restarted = self._ended
+        if restarted.any():
+            self._compiled.check()
         if restarted.all():
             obs, rewards, infos = self._restart()
         else:
@@ -271,7 +274,6 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return np.fromiter(drawn, np.int32, self.num_envs)
 
     def _restart(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
-        self._compiled.check()
         self._states = self._compiled.reset_all(self._seeds(np.ones(self.num_envs, bool)))
         self._steps, self._ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         return self._results()

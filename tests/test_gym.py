@@ -332,3 +332,16 @@ def test_terminated_and_truncated_are_those_of_the_task(ends_at_goal):
         assert (rewards[was_over] == 0).all()
         seen.add((bool(terminated), bool(truncated)))
     assert seen == {(False, False), (True, False), (False, True)}
+
+
+def test_a_fault_is_told_when_any_copy_restarts(monkeypatch):
+    """Copies of a task that ends early hardly ever restart together."""
+    many = mjx_dher.gym.GymVectorEnv("probes:Walk", num_envs=2)
+    many.reset(seed=0)
+    checks = Counter()
+    monkeypatch.setattr(many._compiled.env, "check", lambda: checks.update(made=1), raising=False)
+    one_ends = np.array([[1.5, 0.0], [0.0, 0.0]])
+    assert many.step(one_ends)[3].tolist() == [True, False]
+    assert not checks
+    many.step(np.zeros((2, 2)))
+    assert checks["made"] == 1
