@@ -123,16 +123,20 @@ class SimulatedTask(GoalEnv):
         return dataclasses.replace(physics, factors=draw(self._ranges, key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """First state of an episode that starts from `physics`, with a goal [G]."""
+        """First state of an episode that starts from `physics`, with a goal [G]. If `physics` has diverged, it is like a state
+        from `step`.
+        """
         physics = self._sensed(physics)
+        sound = self.is_sound(physics)
+        physics = self._or_rest(physics, sound)
         obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
         return State(
             physics=physics,
             obs=obs,
             reward=jnp.zeros((), jnp.float32),
-            success=self._success(obs["achieved_goal"], obs["desired_goal"]),
+            success=jnp.where(sound, self._success(obs["achieved_goal"], obs["desired_goal"]), 0.0),
             step=jnp.zeros((), jnp.int32),
-            failed=jnp.zeros((), bool),
+            failed=~sound,
         )
 
     def with_goal(self, state: State, goal: Array) -> State:
@@ -149,8 +153,7 @@ class SimulatedTask(GoalEnv):
         action = jnp.clip(self.check_action(action), -1.0, 1.0)
         physics = self.advance(state.physics, action)
         sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C treats NaN inputs as 0
-        rest = dataclasses.replace(self._rest, factors=physics.factors)
-        physics = jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, rest)
+        physics = self._or_rest(physics, sound)
         failed = state.failed | ~sound
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
         return State(
@@ -190,6 +193,11 @@ class SimulatedTask(GoalEnv):
         """Physics one step later."""
         controls = self.controls(physics, action)
         return self._sensed(self.engine.advance(physics, controls), controls)
+
+    def _or_rest(self, physics: Physics, sound: Array) -> Physics:
+        """The physics if it is sound, else the start's."""
+        rest = dataclasses.replace(self._rest, factors=physics.factors)
+        return jax.tree.map(lambda new, start: jnp.where(sound, new, start), physics, rest)
 
     def observed(self, physics: Physics) -> Physics:
         """Physics that is observed after a step. By default unchanged."""

@@ -220,6 +220,19 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
         assert np.isfinite(np.append(state.obs["observation"], 0 if state.failed else np.nan)).all()
 
 
+def test_a_start_that_diverged_fails_and_shows_the_rest():
+    class Settles(Machine):
+        start = task.Start("bent")
+
+        def start_physics(self, key):
+            physics = super().start_physics(key)
+            return dataclasses.replace(physics, qpos=jnp.full_like(physics.qpos, jnp.nan))
+
+    state = Settles(engine="native").reset(jax.random.key(0))
+    assert (bool(state.failed), float(state.success)) == (True, 0.0)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state.obs, state.physics)))
+
+
 @pytest.mark.parametrize(
     ("declared", "parts"),
     [
