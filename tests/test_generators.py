@@ -20,6 +20,7 @@ from mjx_dher.runs.program.loop import state_template
 from mjx_dher.samplers import LearnedMetric
 from mjx_dher.testing import ComponentError
 from point_mass import PointMass
+from probes import Walk
 
 ENV = PointMass()
 CONTEXT = Context(ENV.compute_reward, HParams())
@@ -211,6 +212,27 @@ def test_a_task_that_changes_more_than_the_goal_is_named():
         testing.check_env(Moves())
     with pytest.raises(testing.ComponentError, match="desired_goal differs"):
         testing.check_env(Ignores())
+
+
+def test_a_task_whose_terminal_states_or_observations_depend_on_the_goal_is_named():
+    """After relabelling, both would still be those of the goal before."""
+
+    class Shows(PointMass):
+        def step(self, state, action):
+            following = super().step(state, action)
+            left = following.obs["desired_goal"] - following.obs["achieved_goal"]
+            return following.replace(obs={**following.obs, "observation": left})
+
+    class Ends(Walk):
+        def _walk(self, position, goal):
+            state = super()._walk(position, goal)
+            return state.replace(terminal=state.success > 0)
+
+    with pytest.raises(testing.ComponentError, match=r"step after with_goal.*observation differs"):
+        testing.check_env(Shows())
+    with pytest.raises(testing.ComponentError, match=r"step after with_goal.*terminal differs"):
+        testing.check_env(Ends())
+    testing.check_env(Walk())
 
 
 def test_every_part_by_name_shares_a_program_with_its_kind():

@@ -35,7 +35,8 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     - If all rewards are at an end of the range, success is never 1 at the low end, and not always 0 at the high end. They need
       not agree at each step, because an environment may require more for a success, such as rest.
     - An episode has at least one step. States after its end (`EnvSpec.ends`) and states with `failed` are ignored.
-    - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else.
+    - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else. A step to a state
+      that reaches it differs only in reward and success: `terminal` holds for every goal, and observations do not have it.
 
     Args:
       env: the environment. Its method `check()`, if present, is called at the end.
@@ -158,15 +159,16 @@ def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tol
         expect(np.all(np.isfinite(value)), f"step with an action of +-3: {name} must be finite; it is {value}")
     if not hasattr(env, "with_goal"):
         return
-    first = jax.tree.map(lambda x: x[0], states)
-    goals = np.roll(first.obs["desired_goal"], 1, axis=0)
+    first, goals = jax.tree.map(lambda x: x[0], states), states.obs["achieved_goal"][1]  # reached after the first step
     changed = run("with_goal", jax.vmap(env.with_goal), first, goals)
     attempt("with_goal", check.kept, "with_goal", first, changed, 1)
-    given = {name: value for name, value in _outputs(first).items() if name not in DERIVED}
-    kept = {name: value for name, value in _outputs(changed).items() if name not in DERIVED}
-    expect_same("with_goal, which changes the desired goal alone,", kept, {**given, "desired_goal": goals}, 0.0)
-    following = program(keys[0], jax.tree.map(lambda x: x[0], changed), np.zeros_like(actions[0, 0]))["step"]
-    expect_same("step after with_goal", following["desired_goal"], goals[0], 0.0)
+    following = program(keys[0], jax.tree.map(lambda x: x[0], changed), actions[0, 0])["step"]
+    for what, given, result, goal, allowed in (
+        ("with_goal, which changes the desired goal alone,", first, _outputs(changed), goals, 0.0),
+        ("step after with_goal, but for reward and success,", at(1, 0), following, goals[0], tolerance),
+    ):
+        own = {name: value for name, value in {**_outputs(given), "desired_goal": goal}.items() if name not in DERIVED}
+        expect_same(what, {name: result[name] for name in own}, own, allowed)
 
 
 def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:
