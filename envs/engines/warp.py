@@ -190,7 +190,7 @@ class WarpEngine:
                 return
         else:
             cure = f"contacts={self._contacts} and constraints={self._constraints}; try twice as many"
-        raise ValueError(f"the warp engine left out contacts that there was no room for: it was made with {cure}")
+        raise ValueError(f"the warp engine had no room for all contacts: it was made with {cure}")
 
     def _begin_loading(self) -> None:
         """Compiles the kernel in a thread while XLA compiles the rest. Takes a quarter of a minute, once per machine."""
