@@ -183,6 +183,7 @@ def test_a_dry_run_refuses_what_a_run_would(command, tmp_path, capsys):
         (["--out", str(taken / "file" / "x")], ["out", taken / "file"]),
         (["--out", "/proc/x"], ["out", "/proc"]),  # also when root asks, who has all permissions
         (["--out", str(tmp_path / "new"), "--replay-size", str(10**10), "--env", "reach"], ["replay_size"]),
+        (["--out", str(tmp_path / "new"), "--devices", "2", "--env", "reach", "--engine", "native"], ["devices", 2]),
     ):
         assert cli.main([*command, "--dry-run", *argv]) == 2
         names(capsys.readouterr().err, *parts)

@@ -5,6 +5,7 @@ import signal
 import pytest
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 
+import point_mass as point_mass_module
 from mjx_dher import HParams, cli, config
 from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
@@ -139,6 +140,17 @@ def test_bad_arguments_are_refused_before_anything_is_written(tmp_path, argument
     assert cli.main(["sweep", "--out", str(tmp_path / "new"), *arguments]) == 2
     assert not (tmp_path / "new").exists()
     assert re.search(said, capsys.readouterr().err)
+
+
+def test_what_a_later_program_cannot_train_is_refused_before_the_first_one_trains(tmp_path, point_mass, monkeypatch, capsys):
+    """A cycle of the second task does not fit into its ring."""
+    monkeypatch.setattr(point_mass_module, "Long", lambda: point_mass_module.PointMass(60), raising=False)
+    monkeypatch.setitem(COMPONENTS["env"], "long", Component("point_mass:Long", ""))
+    own = ["--env", "point_mass", "long", "--seeds", "1", "--out", str(tmp_path / "new" / "sweep")]
+    for more in ([], ["--dry-run"]):
+        assert cli.main([*COMMAND, *own, *more]) == 2
+        assert re.search("replay_size must hold at least one cycle of 8 episodes x 60 steps", capsys.readouterr().err)
+        assert not any(tmp_path.iterdir())
 
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path, capsys):

@@ -95,22 +95,19 @@ def amount(config: Config, episode_length: int, runs: int = 1) -> str:
     )
 
 
-def memory_lines(env: Any, specs: Sequence[RunSpec]) -> list[str]:
-    """Lines about the memory of runs of one program, without compiling it. Raises ValueError if the components do not fit
-    together, or one run exceeds the memory.
-    """
+def memory_lines(env: Any, specs: Sequence[RunSpec], lanes: int | None, devices: int | str) -> list[str]:
+    """Lines about the memory of runs of one program, without compiling it. Raises ValueError if they cannot be trained."""
     import jax
 
-    from mjx_dher.runs.program import loop, program
+    from mjx_dher.runs.program import program
     from mjx_dher.system import memory
 
-    train = program.make_loop(env, specs[0], program.choices_of(specs))
-    loop.check_memory(train, specs[0].config)
+    train = program.check_runs(env, specs, lanes, devices)
     leaves = jax.tree.leaves(jax.eval_shape(train.learner.init, jax.random.key(0)))
     learner = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
     available = memory.available_bytes()
     free = "unknown" if available is None else memory.format_bytes(available)
-    each = " a run" if len(specs) > 1 else ""
+    each = (" a run" if len(specs) > 1 else "") + (" on each device" if train.axis_name else "")
     return [
         f"memory{each}: replay ring {memory.format_bytes(train.replay_bytes)}, learner {memory.format_bytes(learner)};"
         f" the compiled program needs more; {free} is free",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -207,16 +208,17 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     from mjx_dher.parallel import processes
 
     places = {trial: place for place, trial in enumerate(trials)}
+    with contextlib.ExitStack() as stack:
 
-    def begin() -> list[int]:
-        files.make_folder(args.out / grid.CELLS)
-        return [places[trial] for trial in _announce(args, trials, console)]
+        def begin() -> list[int]:
+            stack.enter_context(files.made(args.out / grid.CELLS))
+            return [places[trial] for trial in _announce(args, trials, console)]
 
-    todo = [trials[place] for place in processes.broadcast(begin)]
-    if todo:
-        _train(args, todo, console)
-    number = processes.highest(signals.asked() or 0)
-    return int(processes.broadcast(lambda: _end(args, trials, todo, number, console)))
+        todo = [trials[place] for place in processes.broadcast(begin)]
+        if todo:
+            _train(args, todo, console)
+        number = processes.highest(signals.asked() or 0)
+        return int(processes.broadcast(lambda: _end(args, trials, todo, number, console)))
 
 
 def _sweep_fleet(args: SweepArgs, console: Console) -> int:
@@ -271,11 +273,10 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     for group in groups:
         program = group[0].program
         env = make_env(program)
-        for run in group:
-            spec.validate(run, env.episode_length)
+        memory = settings.memory_lines(env, group, args.lanes, 1 if args.distributed else args.devices)
         samplers = ", ".join(dict.fromkeys(run.sampler for run in group))
         console.print(f"{program.env}, learner {program.learner}: {len(group)} runs; samplers {samplers}", soft_wrap=True)
-        for line in (settings.amount(program.config, env.episode_length, len(group)), *settings.memory_lines(env, group)):
+        for line in (settings.amount(program.config, env.episode_length, len(group)), *memory):
             console.print(f"  {line}", soft_wrap=True)
     lanes = args.lanes or "one on a CPU, as many as fit into memory on a GPU"
     console.print(f"programs: {len(groups)}; parallel runs: {lanes}; nothing was written", soft_wrap=True)

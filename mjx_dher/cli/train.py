@@ -103,7 +103,7 @@ def _dry_run(args: TrainArgs, console: Console) -> int:
     settle_compiler(args.spec.engine)
     check_platform()
     env = make_env(args.spec)
-    memory = settings.memory_lines(env, [args.spec])
+    memory = settings.memory_lines(env, [args.spec], None, 1 if args.distributed else args.devices)
     for title, values in fingerprint.groups(args.spec).items():
         console.print(f"{title}: {'; '.join(f'{name} {fingerprint.text(x)}' for name, x in values.items())}")
     amount = settings.amount(args.spec.config, env.episode_length)

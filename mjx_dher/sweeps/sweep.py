@@ -12,6 +12,7 @@ from typing import Any
 
 from mjx_dher.parallel import processes
 from mjx_dher.runs.driver import Result, train_runs
+from mjx_dher.runs.program import program
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.types import Env
@@ -34,7 +35,10 @@ def run(
     """
     options |= {"should_stop": should_stop, "shared": folder / UNFINISHED, "sweep": True}
     results: list[Result] = []
-    for trials in grid.by_program(specs):
+    groups = grid.by_program(specs)
+    for trials in groups[1:]:  # before the first ones train, which may take days
+        program.check_runs(make_env(trials[0]), trials, options.get("lanes"), options.get("devices", 1))
+    for trials in groups:
         if results and processes.any_process(should_stop()):
             break
         results += train_runs(make_env(trials[0]), trials, [grid.folder_of(folder, spec) for spec in trials], **options)

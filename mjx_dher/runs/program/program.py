@@ -17,6 +17,7 @@ import numpy as np
 from mjx_dher import config as config_lib
 from mjx_dher import evaluate as evaluate_lib
 from mjx_dher import learners, priorities, samplers, trainer, validation
+from mjx_dher import spec as spec_lib
 from mjx_dher.config import HParams
 from mjx_dher.contract import check_steps, env_spec
 from mjx_dher.learners import Learner
@@ -97,6 +98,24 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     return train._replace(init=lambda key, hparams: train.add(train.init(key, hparams), episodes))
 
 
+def check_runs(env: Env, specs: Sequence[RunSpec], lanes: int | None = None, devices: int | str = 1) -> Train:
+    """Training loop of runs that share a program. Raises ValueError, before compilation, if they cannot be trained with these
+    arguments of `train_runs`.
+    """
+    for spec in specs:
+        spec_lib.validate(spec, env.episode_length)
+    placed_on = mesh.find(devices)
+    return _plan(env, specs, mesh.most_lanes(lanes, placed_on), placed_on)[0]
+
+
+def _plan(env: Env, specs: Sequence[RunSpec], max_lanes: int | None, devices: Sequence[Any]) -> tuple[Train, Layout]:
+    """Training loop of runs and its layout. Raises ValueError like `compile_runs`."""
+    layout = mesh.arrange(devices, min(len(specs), max_lanes or len(specs)))
+    train = make_loop(env, specs[0], choices_of(specs), layout)
+    loop.check_memory(train, specs[0].config, layout.sharers)
+    return train, layout
+
+
 def compile_runs(
     env: Env,
     specs: Sequence[RunSpec],
@@ -111,11 +130,8 @@ def compile_runs(
     for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
-    most = min(len(specs), max_lanes or len(specs))
-    layout = mesh.arrange(devices, most)
-    train = make_loop(env, spec, choices, layout)
-    loop.check_memory(train, spec.config, layout.sharers)
-    lanes = math.ceil(most / layout.lanes)  # per device, like the bytes
+    train, layout = _plan(env, specs, max_lanes, devices)
+    lanes = math.ceil(min(len(specs), max_lanes or len(specs)) / layout.lanes)  # per device, like the bytes
     available = memory.available_bytes()
     if available is not None:  # the rings must fit before anything is compiled
         available //= layout.sharers
