@@ -142,12 +142,16 @@ def test_an_edited_config_is_taken_as_it_is_and_wrong_numbers_in_it_are_named(tr
     file.write_text(json.dumps({**content, "hparams": {**content["hparams"], "gamma": 0.25}}))
     assert cli.main(["--config", str(file), "--dry-run"]) == 0
     assert "edited since" in capsys.readouterr().out
+    file.write_text(json.dumps({**content, "devices": 4}))  # the run has one again, unless --devices says otherwise
+    assert cli.main(["--config", str(file), "--dry-run"]) == 0
+    assert "physics none, on 4 devices\n" in capsys.readouterr().out
     for change, parts in (
         ({"hparams": {**content["hparams"], "gamma": 2}}, ["gamma", 2]),
         ({"hparams": {**content["hparams"], "gama": 0.5}}, ["gama"]),
         ({"config": {**content["config"], "num_envs": 10**20}}, ["num_envs", 10**20]),
         ({"env_kwargs": "episode_length=6"}, ["env_kwargs"]),
         ({"env_kwargs": [1]}, ["env_kwargs"]),
+        ({"devices": "all"}, ["devices", "all"]),
     ):
         file.write_text(json.dumps({**content, **change}))
         assert cli.main(["--config", str(file)]) == 2

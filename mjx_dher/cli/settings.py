@@ -46,12 +46,14 @@ def _origin(file: Path, content: dict[str, Any], run: RunSpec) -> str:
     version = content.get("versions", {}).get("mjx_dher", "unknown")
     now = fingerprint.digest(reading.identity_of(content, run))
     edited = "; edited since" if content["digest"] != now else ""
+    devices = content.get("devices", 1) // content.get("lanes", 1)  # not a setting, but batches depend on it
+    shared = f", on {devices} devices" if devices > 1 else ""
     lacking = fingerprint.settings(run).keys() - {*content, *content["config"], *content["hparams"]} if edited else ()
     if lacking:
         edited += f"; it lacks {', '.join(sorted(lacking))}, for which defaults are used"
     return (
         f"settings of {file}: {run.env}, sampler {run.sampler}, seed {run.seed}; written by mjx-dher {version}, physics"
-        f" {content['physics']}{edited}"
+        f" {content['physics']}{shared}{edited}"
     )
 
 

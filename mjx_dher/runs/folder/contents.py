@@ -28,6 +28,7 @@ CONFIG: Form = {
     "earlier?": [_DIGEST],
     "jax_flags?": dict,
     "lanes?": _LANES,
+    "devices?": _LANES,
     "interface?": dict,
     "versions?": {"*": str},
 }
