@@ -276,6 +276,10 @@ def test_eval_reads_all_runs_before_it_plays_one(trained, tmp_path, capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "is not a run folder" in captured.err
+    assert cli.main(["eval", "reach", str(trained), "--env-kwargs", "reward_type=dense", "--json"]) == 2  # the point has none
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    names(captured.err, "point_mass:PointMass", "reward_type")
     assert cli.main(["eval"]) == 2
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -50,22 +51,23 @@ def eval_command(argv: list[str], console: Console) -> int:
     runs = [common.changed_arguments(common.read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:
         common.settle_compiler(args.engine or run.engine)
-    from mjx_dher.policy.load import load_policy
+    from mjx_dher.policy.load import check_fits, load_policy
 
     policies = [load_policy(folder) for folder in folders]  # all, before any is played
     keep_compiled_programs()
+    key_of = operator.attrgetter("env", "engine", "env_kwargs")
+    made = {key: common.played_env(run, args.engine) for key, run in {key_of(run): run for run in runs}.items()}
+    for run, policy in zip(runs, policies):
+        check_fits(policy, made[key_of(run)])
     for path, run, policy in zip(args.runs, runs, policies):
-        _evaluate(args, path, run, policy, console)
+        _evaluate(args, path, run, policy, made[key_of(run)], console)
     return 0
 
 
-def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, console: Console) -> None:
+def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, env: Any, console: Console) -> None:
     """Plays the policy of one run and prints the summary."""
     from mjx_dher.evaluate import play_policy, summarize
-    from mjx_dher.policy.load import check_fits
 
-    env = common.played_env(run, args.engine)
-    check_fits(policy, env)
     physics = run_folder.engine_name(env)
     if args.json:
         head = {"run": str(path), "env": run.env, "env_kwargs": run.env_arguments, "physics": physics, "seed": args.seed}
