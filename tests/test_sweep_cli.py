@@ -11,7 +11,7 @@ from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.components import COMPONENTS, Component
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.sweeps import tables
+from mjx_dher.sweeps import grid, tables
 
 
 @pytest.mark.slow
@@ -151,6 +151,13 @@ def test_what_a_later_program_cannot_train_is_refused_before_the_first_one_train
         assert cli.main([*COMMAND, *own, *more]) == 2
         assert re.search("replay_size must hold at least one cycle of 8 episodes x 60 steps", capsys.readouterr().err)
         assert not any(tmp_path.iterdir())
+
+
+def test_a_run_that_shares_a_checkpoint_does_not_resume_alone(tmp_path, capsys):
+    trials = make_grid(static=LONGER, seeds=(0,), env="point_mass:PointMass")
+    cut_short(tmp_path, trials, 1, lanes=2)
+    assert cli.main(["resume", str(grid.folder_of(tmp_path, trials[0]))]) == 2
+    assert "the sweep's command resumes them" in capsys.readouterr().err
 
 
 def test_a_folder_that_holds_something_else_is_refused(tmp_path, capsys):
