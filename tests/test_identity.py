@@ -14,6 +14,7 @@ from test_driver import rows_of
 
 import mjx_dher
 from mjx_dher import HParams, RunSpec, cli, envs
+from mjx_dher.runs import driver
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import files
@@ -182,6 +183,12 @@ def test_parts_of_another_kind_are_named(stopped, capsys):
         assert (status, message in text, "Traceback" in text) == (2, True, False), text
         assert cli.main(["eval", str(stopped)]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_fewer_steps_than_any_checkpoint_s_are_refused_before_anything_is_compiled(stopped, capsys, monkeypatch):
+    monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))
+    status, text = resume(stopped, capsys, "--total-steps", "80")
+    assert (status, "nothing is left to train: 4 epochs have ended, and total_steps 80 takes 2" in text) == (2, True)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from mjx_dher.runs.folder.run_folder import FAILED, FINISHED, Claims, Run, named
 from mjx_dher.runs.options import Options
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program import program as program_lib
-from mjx_dher.runs.program.loop import Progress, Start
+from mjx_dher.runs.program.loop import Progress
 from mjx_dher.runs.program.program import Program
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files, signals
@@ -112,6 +112,9 @@ def train_runs(
     waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
     if not waiting:
         return []
+    if len(waiting) == 1 and not sweep:  # before compilation
+        saved = [run_folder.epoch_of(path) for path in run_folder.checkpoints(waiting[0][1])]
+        _refuse_ended(specs[0], saved, config_lib.num_epochs(specs[0].config, env.episode_length))
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
         program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
@@ -164,7 +167,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     num_epochs = config_lib.num_epochs(specs[0].config, session.env.episode_length)
     will_save = 0 < options.checkpoint_every < num_epochs
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
-    _refuse_ended(specs[0], start, num_epochs)
+    _refuse_ended(specs[0], [start.epoch], num_epochs)
     for folder in folders if processes.leads() else ():  # before any file that a result describes changes
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
@@ -218,11 +221,11 @@ def _success_rates(folder: Path, ended: int) -> list[float]:
     return [row["success_rate"] for row in results.read_metrics(folder)]
 
 
-def _refuse_ended(spec: RunSpec, start: Start, num_epochs: int) -> None:
-    """Raises ValueError if all epochs of `total_steps` have ended."""
-    if start.epoch >= num_epochs:
+def _refuse_ended(spec: RunSpec, ended: Sequence[int], num_epochs: int) -> None:
+    """Raises ValueError if all epochs of `total_steps` had `ended` at each checkpoint, of which the newest may be damaged."""
+    if ended and min(ended) >= num_epochs:
         raise ValueError(
-            f"nothing is left to train: {start.epoch} epochs have ended, and total_steps {spec.config.total_steps} takes"
+            f"nothing is left to train: {max(ended)} epochs have ended, and total_steps {spec.config.total_steps} takes"
             f" {num_epochs}"
         )
 
