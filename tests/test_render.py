@@ -35,6 +35,15 @@ import jax
 def picture(env, qpos, goal):
     return next(render.draw_frames(env, [qpos], goal, 320, 240))
 
+if sys.argv[2] == "commands":
+    small = ["--width", "96", "--height", "64"]
+    codes = [
+        cli.main(["render", str(folder / "run"), "--out", str(folder / "run.gif"), "--episodes", "2", *small]),
+        cli.main(["render", "--env", "reach", "--out", str(folder / "reach.png"), "--episodes", "1", *small]),
+    ]
+    assert codes == [0, 0]
+    sys.exit()
+
 frames = {}
 for name in ('pick_and_place', 'push', 'reach', 'slide'):
     env = envs.make(name, engine="native")
@@ -49,19 +58,12 @@ for key, shift in (("near", 0.1), ("far", -0.1)):  # along x, away from the robo
     qpos[place : place + 2] = 1.3 + shift, 0.6
     frames["object_" + key] = picture(env, qpos, np.array([1.3, 0.9, 0.425]))
 np.savez(folder / "frames.npz", **frames)
-
-small = ["--width", "96", "--height", "64"]
-codes = [
-    cli.main(["render", str(folder / "run"), "--out", str(folder / "run.gif"), "--episodes", "2", *small]),
-    cli.main(["render", "--env", "reach", "--out", str(folder / "reach.png"), "--episodes", "1", *small]),
-]
-assert codes == [0, 0]
 """
 
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory):
-    """(folder, pictures by name, what the commands printed) of SCRIPT."""
+    """Folder of SCRIPT, and what its commands printed."""
     folder = tmp_path_factory.mktemp("render")
     run_folder.write_config(folder / "run", RunSpec(env="push", engine="native"), "native", {})
     still = policy.Policy(
@@ -74,12 +76,26 @@ def drawn(tmp_path_factory):
         obs_clip=200.0,
     )
     save_policy(folder / "run", still)
-    done = subprocess.run([sys.executable, "-c", SCRIPT, str(folder)], cwd=ROOT, capture_output=True, text=True, check=False)
+    return folder, draw(folder, "commands")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Pictures of SCRIPT by name."""
+    folder = tmp_path_factory.mktemp("pictures")
+    draw(folder, "pictures")
+    with np.load(folder / "frames.npz") as file:
+        return dict(file)
+
+
+def draw(folder, what):
+    """What a part of SCRIPT prints."""
+    command = [sys.executable, "-c", SCRIPT, str(folder), what]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode == NO_GL:
         pytest.skip(f"nothing on this machine can draw: {done.stdout.strip()}")
     assert done.returncode == 0, done.stdout + done.stderr
-    with np.load(folder / "frames.npz") as file:
-        return folder, dict(file), done.stdout
+    return done.stdout
 
 
 def centre(picture, colour):
@@ -91,8 +107,7 @@ def centre(picture, colour):
 
 
 @pytest.mark.slow
-def test_every_task_shows_its_goal_and_its_object(drawn):
-    _, frames, _ = drawn
+def test_every_task_shows_its_goal_and_its_object(frames):
     for name in ("pick_and_place", "push", "reach", "slide"):
         assert frames[name].shape == (240, 320, 3)
         assert centre(frames[name], "red") is not None, name
@@ -101,24 +116,23 @@ def test_every_task_shows_its_goal_and_its_object(drawn):
 
 @pytest.mark.parametrize(("what", "colour"), [("goal", "red"), ("object", "blue")])
 @pytest.mark.slow
-def test_a_thing_moved_is_drawn_moved(drawn, what, colour):
-    _, frames, _ = drawn
+def test_a_thing_moved_is_drawn_moved(frames, what, colour):
     near, far = (centre(frames[f"{what}_{where}"], colour) for where in ("near", "far"))
     assert near[0] > far[0] + 20  # the camera looks at the robot: nearer to the camera is lower in the picture
 
 
 def test_the_command_writes_every_frame(drawn):
-    folder, _, printed = drawn
+    folder, printed = drawn
     assert frames_in(folder / "run.gif", 96, 64) == 2 * (51 + 10)
     assert "push: 2 episodes, seed 1, physics native, drawn with " in printed
     assert f"of 2; wrote {folder / 'run.gif'}\n" in printed
 
 
 def test_without_a_run_a_task_is_played_with_random_actions(drawn):
-    folder, _, printed = drawn
+    folder, printed = drawn
     assert frames_in(folder / "reach.png", 96 * render.STILLS, 64) == 1
     assert "reach: 1 episodes of random actions, seed 1, physics native" in printed
-    assert {path.name for path in folder.iterdir()} == {"run", "run.gif", "reach.png", "frames.npz"}
+    assert {path.name for path in folder.iterdir()} == {"run", "run.gif", "reach.png"}
 
 
 def frames_in(path, width, height):
