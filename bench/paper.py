@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import os
 import signal
 import subprocess
@@ -125,7 +126,7 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
         episodes = EPISODES[sweep.task]
         cycles = "" if sweep.own_cycles else f"{FAST} --num-envs {episodes}"
         seeds = f"--seeds {sweep.seeds} --first-seed {sweep.first_seed}"
-        sizes = f"--preset paper --checkpoint-every 0 --lanes 40 {cycles} --env {sweep.task} {seeds}"
+        sizes = f"--preset paper --checkpoint-every 0 --lanes {_LANES} {cycles} --env {sweep.task} {seeds}"
         options = f"--total-steps {sweep.epochs * episodes * 50} {sweep.options}"
     threshold = "0.6" if sweep.task == "slide" else "0.9"
     baseline = "future" if "future" in sweep.options else sweep.options.split()[1]
@@ -142,6 +143,8 @@ _UPDATE = 23.8e-6  # seconds of gradients and drawing per run and update of 2,04
 _FLOAT32 = 82.2e-6  # the same in float32 with 20 parallel runs
 _STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
 _MORE = 1.25  # whole epochs over the sum of their parts, in the sweeps of 2026-11-22
+_CYCLES = 2.5  # seconds of an epoch with own cycles, whatever the number of runs: from three sweeps on an H100
+_LANES = 40
 _AROUND = 38.0  # seconds per command: compiling (24 to 47), imports, last evaluations, tables (12)
 
 
@@ -151,7 +154,9 @@ def estimate(sweep: Sweep) -> float:
     steps = (EPISODES[sweep.task] + 100) * 50  # with the evaluation
     update = _FLOAT32 if sweep.own_cycles else _UPDATE
     epoch = 2000 * workers * update + steps / _STEPS_A_SECOND[sweep.task]
-    return _AROUND + _MORE * epoch * sweep.epochs * sweep.settings * sweep.seeds
+    runs = sweep.settings * sweep.seeds
+    waiting = _CYCLES * workers * sweep.epochs * math.ceil(runs / _LANES) if sweep.own_cycles else 0.0
+    return _AROUND + _MORE * epoch * sweep.epochs * runs + waiting
 
 
 def chosen(names: Iterable[str]) -> list[Sweep]:
