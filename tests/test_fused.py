@@ -238,3 +238,12 @@ def test_the_engine_follows_native():
     assert error[:, :3].max() < 2e-3  # grip, m
     assert np.median(error[:, 3:6].max(axis=1)) < 1e-3  # puck, m
     warp.check()
+
+
+@pytest.mark.slow
+def test_the_kernel_compiles_for_a_gpu(tmp_path):
+    """Warp compiles CUDA code without a GPU, too. The code is that for one thread an environment."""
+    engine = envs.make("push", engine="warp", allow_cpu=True).engine
+    wp.compile_aot_module(engine._made(1)._kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (ptx,) = tmp_path.glob("*.sm90.ptx")
+    assert ".visible .entry" in ptx.read_text()
