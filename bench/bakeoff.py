@@ -174,14 +174,13 @@ def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
 def _runs(which: tuple[str, str, str], trials: list[dict[str, Any]], threshold: float) -> list[Run]:
     (groups,) = comparison.groups(trials).values()
     (group,) = groups
-    area = stats.area_under_curve(group.epoch, group.success)
     reach = stats.first_reach(group.env_steps, group.success, threshold)
     by_seed = {trial["seed"]: trial for trial in trials}
     return [
         Run(
             *which, seed, Path(by_seed[seed]["folder"]).name, int(by_seed[seed]["status"] == results.FAILED), *map(float, found)
         )
-        for seed, *found in zip(group.seeds, area, group.final, reach)
+        for seed, *found in zip(group.seeds, comparison.areas_of(group), group.final, reach)
     ]
 
 

@@ -93,8 +93,11 @@ def _success(d: Difference, sign: int, p: float | None = None) -> list[str]:
 
 
 def _epochs(d: Difference, claimed: float) -> list[str]:
-    """Cells of a claim that at least `claimed` epochs are saved. The plan does not test epochs, so there is no p."""
-    verdict = "**refuted**" if d.high < claimed else "not shown" if d.low <= 0 else "**confirmed**"
+    """Cells of a claim that at least `claimed` epochs are saved. The plan does not test epochs, so there is no p.
+
+    A difference is NaN if a run never reaches the threshold.
+    """
+    verdict = "**refuted**" if d.high < claimed else "**confirmed**" if d.low > 0 else "not shown"
     mean, interval, _ = signed(d, 1)
     return [str(len(d.each)), f"{mean} epochs sooner", interval, "", verdict]
 

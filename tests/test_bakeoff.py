@@ -10,7 +10,7 @@ from conftest import ROOT, names
 
 from mjx_dher.components import COMPONENTS
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.spec import validate
+from mjx_dher.spec import RunSpec, validate
 
 
 @pytest.fixture
@@ -258,6 +258,12 @@ def ended(ablation):
     ]
 
 
+def test_an_arm_whose_runs_all_fail_at_once_scores_nothing(bakeoff):
+    run = {"settings": fingerprint.settings(RunSpec()), "seed": 3, "folder": "a", "status": "failed", "lanes": 1}
+    runs = bakeoff._runs(("paper", "push", "future"), [{**run, "curve": {}, "final": {}}], 0.9)
+    assert [run[3:] for run in runs] == [(3, "a", 1, 0.0, 0.0, math.inf)]
+
+
 def test_runs_are_read_as_they_were_written(ablation, ended, tmp_path):
     import bakeoff_runs
 
@@ -328,8 +334,7 @@ def test_one_stops_and_goes_on_and_reports(bakeoff, ablation, tmp_path, which):
     with (tmp_path / f"{which}.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["arm"] for row in rows] == [arm.name for arm in experiment.arms]
-    assert {row["seeds"] for row in rows} == {"2"}
-    assert {row["failed"] for row in rows} == {"0"}
+    assert {(row["seeds"], row["failed"]) for row in rows} == {("2", "0")}
     assert isinstance(bakeoff.parse(argv, experiment), argparse.Namespace)
     assert bakeoff.main(argv, experiment) == 0  # nothing is left, and it says the same
 

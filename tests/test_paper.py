@@ -196,6 +196,13 @@ def test_verdicts_of_intervals():
     assert paper_set.verdict(0.001, 0.03, 0.06) == "not shown"
 
 
+def test_epochs_to_a_threshold_that_a_run_never_reaches_confirm_nothing():
+    for low, high, verdict in ((0.5, 3.0, "**confirmed**"), (0.5, 1.9, "**refuted**"), (-1, 3, "not shown")):
+        assert make_results_figures._epochs(paper_analysis.Difference(np.zeros(2), 1.0, low, high, 1.0), 2)[-1] == verdict
+    never = paper_analysis.difference(np.array([3.0, np.inf]), np.array([1.0, 2.0]))
+    assert make_results_figures._epochs(never, 2)[-1] == "not shown"
+
+
 def test_curves_out_of_order_are_refused(tmp_path):
     path = tmp_path / "curves.csv"
     path.write_text("sweep,setting,seed,epoch,success_rate\na,b,0,1,0.5\na,b,0,3,0.5\n")

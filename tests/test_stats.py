@@ -121,9 +121,12 @@ def test_paired_p_value_by_hand():
     assert stats.paired_p_value([1, 2], [1, 2]) == 1
     # Differences 3, 1 and -1: of the eight sign flips, six have a sum of at least 3 in absolute value.
     assert stats.paired_p_value([3, 1, 0], [0, 0, 1]) == pytest.approx(6 / 8)
-    # Equal differences: only two of 2^16 changes of sign are as extreme, and none of a hundred random ones.
+    # Equal differences: only two of 2^16 changes of sign are as extreme, and of a hundred random ones
+    # only the scores themselves.
     assert stats.paired_p_value(np.ones(16), np.zeros(16)) == pytest.approx(2 / 2**16)
-    assert stats.paired_p_value(np.ones(16), np.zeros(16), repeats=100) == pytest.approx(2 / 101)
+    assert stats.paired_p_value(np.ones(16), np.zeros(16), repeats=100) == pytest.approx(1 / 100)
+    # Differences -0.2, 0.3, -0.3 and 0.2 sum to 0: all flips are at least as large, whatever rounding makes of their sums.
+    assert stats.paired_p_value([0.4, 0.8, 0.0, 0.5], [0.6, 0.5, 0.3, 0.3]) == 1
     with refuses("finite"):
         stats.paired_p_value([np.inf, 1], [1, 2])
     for a, b in (([1, 2, 3], [1, 2]), ([1], [2])):

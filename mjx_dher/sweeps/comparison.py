@@ -193,14 +193,14 @@ def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | 
 
 
 def _row(group: Group, base: Group | None, threshold: float) -> Row:
-    areas = _areas(group)
+    areas = areas_of(group)
     reach = stats.first_reach(group.epoch, group.success, threshold)
     epochs = float(np.median(reach))
     steps_per_epoch = group.env_steps[0] / group.epoch[0]
     nan = math.nan
     better, gain, p_value = (nan, nan, nan), nan, nan
     if base is not None:
-        others = _areas(base)
+        others = areas_of(base)
         better = (stats.probability_of_improvement(areas, others), *stats.improvement_interval(areas, others))
         if base.seeds == group.seeds and len(areas) > 1:
             gain, p_value = float(np.mean(areas - others)), stats.paired_p_value(areas, others)
@@ -226,7 +226,8 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
     )
 
 
-def _areas(group: Group) -> NDArray:
+def areas_of(group: Group) -> NDArray:
+    """Mean success [S] over the epochs, by trapezoids."""
     if len(group.epoch) < 2:
         return group.success.mean(axis=1)
     return stats.area_under_curve(group.epoch, group.success)
