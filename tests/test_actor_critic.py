@@ -142,6 +142,15 @@ def made(name, **changes):
     return learners.make(name, config, SPEC, "layer_norm"), config
 
 
+@pytest.mark.parametrize(
+    ("name", "judging"), [("td3", 1), ("ctd3", 1), ("sac", 3), ("csac", 3), ("redq", 3), ("tqc", 3), ("dtqc", 3)]
+)
+def test_the_actor_of_td3_in_both_forms_is_judged_by_the_first_critic(name, judging):
+    learner, _ = made(name)
+    params = learner.init(jax.random.key(0)).params.critic
+    assert {len(x) for x in jax.tree.leaves(learner.critics.judges(params))} == {judging}
+
+
 @pytest.mark.slow  # the soft value is the same way
 @pytest.mark.parametrize("name", ["dtqc", "td3", "ctd3"])
 def test_critics_learn_a_known_value(name):

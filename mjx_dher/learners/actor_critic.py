@@ -183,7 +183,7 @@ def csac(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
 
 def ctd3(config: Config, spec: EnvSpec, networks: NetworksFn) -> ActorCritic:
     """TD3 with critics that classify the return into `num_bins` values (`Categorical`)."""
-    return _make("ctd3", config, spec, networks, Deterministic(), _bins(config))
+    return _make("ctd3", config, spec, networks, Deterministic(), dataclasses.replace(_bins(config), num_judges=1))
 
 
 def _bins(config: Config) -> Critics:
