@@ -56,7 +56,8 @@ class Gaussian:
     ) -> tuple[Array, Metrics]:
         """Loss mean(alpha log pi - Q) plus the loss of alpha, with alpha and the entropy as metrics.
 
-        Haarnoja et al. 2018 ("Algorithms and Applications"), equations 7 and 18. `action_l2` is as in other learners.
+        Haarnoja et al. 2018 ("Algorithms and Applications"), equations 7 and 18, the latter with log alpha, as in their code.
+        `action_l2` is as in other learners.
         """
         action, log_prob = sample_action(network, params, observation, goal, normal)
         alpha = _alpha(params, hparams)
