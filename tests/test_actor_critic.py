@@ -205,7 +205,7 @@ def learned_value(learner, updates=1500):
     return value
 
 
-@pytest.mark.parametrize("name", at_night("csac", "dtqc"))
+@pytest.mark.parametrize("name", at_night("dtqc"))
 def test_the_best_action_of_a_bandit_is_found(name):
     """The reward is -|a - 0.5| / 4 for each number of the action, and the next state is worth the same as all others."""
     learner, _ = made(name)

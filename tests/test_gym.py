@@ -279,6 +279,7 @@ twin.close()
 """
 
 
+@pytest.mark.slow
 def test_pictures_follow_the_state():
     done = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode == 77:

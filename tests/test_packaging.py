@@ -39,6 +39,7 @@ print(*sorted(own), len(own), lines)
     assert int(lines) <= 10_400, names
 
 
+@pytest.mark.slow
 def test_loading_everything_prints_nothing():
     code = (
         "import mjx_dher; [getattr(mjx_dher, n) for n in mjx_dher.__all__];"

@@ -242,7 +242,7 @@ CLOTH = """
 """
 
 
-@pytest.mark.parametrize("xml", [FALLING, CLOTH], ids=["box", "cloth"])
+@pytest.mark.parametrize("xml", [FALLING, pytest.param(CLOTH, marks=pytest.mark.slow)], ids=["box", "cloth"])
 def test_every_derived_field_is_what_mujoco_computes_or_rejected(xml):
     """Of two simulations in turn on one thread, so that one's numbers would show in the other's."""
     model = mujoco.MjModel.from_xml_string(xml)

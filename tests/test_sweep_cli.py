@@ -153,6 +153,7 @@ def test_what_a_later_program_cannot_train_is_refused_before_the_first_one_train
         assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_that_shares_a_checkpoint_does_not_resume_alone(tmp_path, capsys):
     trials = make_grid(static=LONGER, seeds=(0,), env="point_mass:PointMass")
     cut_short(tmp_path, trials, 1, lanes=2)

@@ -247,6 +247,7 @@ def begun(*argv, **variables):
     return process, lines
 
 
+@pytest.mark.slow
 def test_the_demo_ends_with_ctrl_c_and_leaves_nothing(port):
     process, lines = begun("demo", "--port", str(port), PYTHONFAULTHANDLER="1")
     assert lines[-1] == f"showing push: http://127.0.0.1:{port} (Ctrl-C ends it)\n"
