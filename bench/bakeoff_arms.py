@@ -169,7 +169,7 @@ class Size:
 # The fast sweeps of docs/results.md, cut when `future` has learned: 7.0, 16.1 and 39.9 s per run of 50, 50 and 200 epochs.
 _FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
 # From five parallel runs in bench/README.md: 4.4, 11.8 and 40.2 s per run of 1.54, 1.02 and 8.19 million steps. The hand:
-# four runs of 4.1 million steps took 198 s (docs/experiments/preset_hands.md).
+# four runs of 4.1 million steps took 198 s, and five of `hand_reach` 55 s (docs/experiments/preset_hands.md).
 SIZES = {
     ("paper", "push"): Size({**_FAST, "total_steps": 1_000_000}, 7.0 * 25 / 50),
     ("paper", "pick_and_place"): Size({**_FAST, "num_envs": 1600, "total_steps": 2_000_000}, 16.1 * 25 / 50),
@@ -177,6 +177,7 @@ SIZES = {
     ("best", "push"): Size({"cycles_per_epoch": 1, "total_steps": 819_200}, 4.4 * 0.819 / 1.536),
     ("best", "pick_and_place"): Size({"total_steps": 640_000}, 11.8 * 0.64 / 1.024),
     ("best", "slide"): Size({"cycles_per_epoch": 1, "total_steps": 1_740_800}, 40.2 * 1.741 / 8.192),
+    ("best", "hand_reach"): Size({"total_steps": 1_024_000}, 11.0),
     ("best", "block_rotate_z"): Size({"cycles_per_epoch": 1, "total_steps": 1_536_000}, 49.5 * 1.536 / 4.1),
 }
 COMPILE_SECONDS = 30.0  # per program

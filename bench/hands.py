@@ -1,7 +1,7 @@
-"""What helps on the Shadow hand: samplers, k and priorities against `future`, by the preset `gpu`.
+"""Samplers, k and priorities against `future` on the Shadow hand, with the preset `gpu`.
 
     python bench/hands.py --out hands --first-seed 310 --plan
-    python bench/hands.py --out hands --first-seed 310 --minutes 9   trains for 9 minutes and reports; run it again to resume
+    python bench/hands.py --out hands --first-seed 310 --minutes 9   trains for 9 minutes and reports. Run it again to resume
     python bench/hands.py --out toy --toy --seeds 2                  the same on the point mass, on a CPU
 
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/preset_hands.md has the plan.
@@ -13,7 +13,8 @@ import dataclasses
 import sys
 
 import bakeoff
-from bakeoff_arms import COMPILE_SECONDS, TOY, Arm, Experiment
+from ablation import numbered, sized
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes
 
 from mjx_dher import presets
 from mjx_dher.spec import RunSpec
@@ -26,9 +27,6 @@ ARMS = (
     Arm("eventful", "plain", numbers=HALF),
     Arm("td_error", "errors", {"priority": "td_error"}, HALF),
 )
-STEPS = {"hand_reach": 1_024_000, "block_rotate_z": 1_536_000}
-SIZES = {"hand_reach": {}, "block_rotate_z": {"cycles_per_epoch": 1}}  # 20 and 15 epochs
-SECONDS = {"hand_reach": 11.0, "block_rotate_z": 18.5}  # of a run among others, from docs/experiments/preset_hands.md
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
@@ -36,19 +34,19 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     del learner
     parts = {"sampler": "future", "priority": "eventful", **arm.parts}
     run = dataclasses.replace(presets.preset("gpu", "hand_reach" if toy else task, **parts), env=task)
-    changes = TOY if toy else {**SIZES[task], "total_steps": STEPS[task], "replay_size": STEPS[task]}
-    numbers = {"her_k": 4.0, "priority_fraction": 0.0, **arm.numbers}
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **changes), hparams=run.hparams._replace(**numbers))
+    sizes = TOY if toy else SIZES["best", task].changes
+    run = sized(run, **{"replay_size": sizes["total_steps"], **sizes})
+    return numbered(run, **{"her_k": 4.0, "priority_fraction": 0.0, **arm.numbers})
 
 
-def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Minutes of one H200 for the runs, compilation included."""
-    del learners
-    programs = len(tasks) * len({arm.group for arm in arms})
-    return (sum(SECONDS[task] for task in tasks) * len(arms) * seeds + COMPILE_SECONDS * programs) / 60
-
-
-HANDS = Experiment(ARMS, ("gpu",), tuple(STEPS), spec_of, minutes, "hands.csv")
+HANDS = Experiment(
+    arms=ARMS,
+    learners=("gpu",),
+    tasks=("hand_reach", "block_rotate_z"),
+    spec_of=spec_of,
+    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    table="hands.csv",
+)
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, HANDS, __doc__))

@@ -26,14 +26,14 @@ from mjx_dher.contract import env_spec
 from mjx_dher.trainer import make_train
 
 
-def device_events(folder: Path, gpu: int = 0):
-    """(name, start, duration), both in µs, of a GPU's activities."""
+def device_events(folder: Path):
+    """(name, start, duration), both in µs, of the first GPU's activities."""
     (path,) = folder.rglob("*.trace.json.gz")
     trace = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
     names = {e["pid"]: e["args"]["name"] for e in trace if e.get("name") == "process_name"}
     lines = {(e["pid"], e["tid"]): e["args"]["name"] for e in trace if e.get("name") == "thread_name"}
     for event in trace:
-        if event.get("ph") != "X" or not names.get(event["pid"], "").endswith(f"GPU:{gpu}"):
+        if event.get("ph") != "X" or not names.get(event["pid"], "").endswith("GPU:0"):
             continue
         if lines.get((event["pid"], event["tid"]), "").startswith("Stream"):
             yield event["name"], event["ts"], event["dur"]

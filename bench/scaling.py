@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import dataclasses
+import itertools
 import statistics
 import sys
 import tempfile
@@ -65,10 +66,10 @@ class Case:
         with tempfile.TemporaryDirectory() as folder:
             with jax.profiler.trace(folder, create_perfetto_trace=False):
                 seconds = next(epochs).epoch_seconds
-            events = list(device_events(Path(folder), gpu=0))
-        exchange = [event for event in events if "nccl" in event[0].lower()]
-        self.working = busy(event for event in events if event not in exchange) / 1e6 / seconds
-        self.exchanging = busy(exchange) / 1e6 / seconds
+            events = {True: [], False: []}
+            for event in device_events(Path(folder)):
+                events["nccl" in event[0].lower()].append(event)
+        self.exchanging, self.working = (busy(own) / 1e6 / seconds for own in events.values())
 
     @property
     def steps(self):
@@ -111,53 +112,51 @@ def resized(name, args, times=1):
 def lanes(args):
     tasks = [(envs.make(name, engine=args.engine), resized(name, args)) for name in args.env]
     cases = compile_all(*[(env, spec, n * args.lanes, n) for env, spec in tasks for n in args.devices])
-    rows = []
-    for name in args.env:
-        own = [case for case in cases if case.spec.env == name]
+    head, rows = "env | devices | lanes | s an epoch | env steps/s | of the first row's", []
+    for own in groups(cases, len(args.devices)):
         measure(own, args)
         for case in own:
-            times = case.steps / own[0].steps
-            told = (name, case.devices, case.runs, f"{case.seconds:.3f}", f"{case.steps:,.0f}", f"{times:.2f}")
-            rows.append((*told, *shares(case, args)))
-    print_table(("env", "devices", "lanes", "s an epoch", "env steps/s", "of the first row's", *SHARES[args.profile]), rows)
+            rows.append(
+                (case.spec.env, case.devices, case.runs, *speeds(case), f"{case.steps / own[0].steps:.2f}", *shares(case))
+            )
+    show(head, rows, args)
 
 
 def one_run(args):
-    rows, wanted = [], []
-    for name in args.env:
-        env = envs.make(name, engine=args.engine)
-        for times in args.times:
-            sizes = [(times * n, n) for n in args.devices] + [(times, n) for n in args.devices if n > 1]
-            wanted += [(env, resized(name, args, own), 1, n) for own, n in sizes]
-    cases = compile_all(*wanted)
-    number = len(cases) // (len(args.env) * len(args.times))
-    for first in range(0, len(cases), number):
-        own = cases[first : first + number]
+    tasks = [(name, envs.make(name, engine=args.engine)) for name in args.env]
+    sizes = [(n, n) for n in args.devices] + [(1, n) for n in args.devices if n > 1]  # multiples of the work, devices
+    each = itertools.product(tasks, args.times, sizes)
+    cases = compile_all(*[(env, resized(name, args, times * work), 1, n) for (name, env), times, (work, n) in each])
+    head = "env | devices | environments | batch | units | s an epoch | env steps/s | of the first row's | transitions"
+    rows = []
+    for own in groups(cases, len(sizes)):
         measure(own, args)
         for case in own:
-            sizes = (case.spec.config.num_envs, case.spec.config.batch_size, max(case.spec.config.hidden_sizes))
+            config = case.spec.config
             ratios = (f"{case.steps / own[0].steps:.2f}", f"{case.transitions / own[0].transitions:.2f}")
-            told = (case.spec.env, case.devices, *sizes, f"{case.seconds:.3f}", f"{case.steps:,.0f}")
-            rows.append((*told, *ratios, *shares(case, args)))
-    head = (
-        "env",
-        "devices",
-        "environments",
-        "batch",
-        "units",
-        "s an epoch",
-        "env steps/s",
-        "of the first row's",
-        "transitions",
-    )
-    print_table((*head, *SHARES[args.profile]), rows)
+            told = (case.spec.env, case.devices, config.num_envs, config.batch_size, max(config.hidden_sizes))
+            rows.append((*told, *speeds(case), *ratios, *shares(case)))
+    show(head, rows, args)
 
 
-SHARES = {False: (), True: ("works", "exchanges")}
+def groups(cases, size):
+    """Cases whose rows are compared. The first one is the baseline."""
+    return [cases[first : first + size] for first in range(0, len(cases), size)]
 
 
-def shares(case, args):
-    return (f"{case.working:.2f}", f"{case.exchanging:.2f}") if args.profile else ()
+def speeds(case):
+    return f"{case.seconds:.3f}", f"{case.steps:,.0f}"
+
+
+def shares(case):
+    return f"{case.working:.2f}", f"{case.exchanging:.2f}"
+
+
+def show(head, rows, args):
+    """Prints a table, with the last two columns, the shares, only if there are profiles."""
+    columns = [*head.split(" | "), "works", "exchanges"]
+    number = len(columns) if args.profile else -2
+    print_table(columns[:number], [row[:number] for row in rows])
 
 
 def main():

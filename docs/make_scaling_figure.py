@@ -38,13 +38,10 @@ def blocks() -> dict[str, str]:
             strong = runs["strong", task, *sizes]
             name = ", ".join(f"{int(size):,}" for size in sizes)
             for n in each:
-                steps = [f"{own[n][1]:,} | {own[n][1] / own[1][1]:.2f}" for own in (each, strong)]
-                one.append([name if n == 1 else "", str(n), *" | ".join(steps).split(" | ")])
+                steps = [cell for own in (each, strong) for cell in (f"{own[n][1]:,}", f"{own[n][1] / own[1][1]:.2f}")]
+                one.append([name if n == 1 else "", str(n), *steps])
     head = "40 runs on each GPU | one GPU: s an epoch | two | four | eight | steps per second of eight against the fewest"
-    return {
-        "lanes": table(head, lanes),
-        "one": table(ONE, one),
-    }
+    return {"lanes": table(head, lanes), "one": table(ONE, one)}
 
 
 def with_table(page: str) -> str:
@@ -59,6 +56,7 @@ def draw() -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    runs = read()
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.4), layout="constrained", sharey=True)
     labels = {"weak": "more work", "strong": "the same work", "lanes": "runs side by side"}
     lines = {"weak": "-", "strong": ":", "lanes": "-"}
@@ -66,7 +64,7 @@ def draw() -> None:
     for axis, kinds in zip(axes, (("lanes",), ("weak", "strong"))):
         axis.plot([1, 8], [1, 8], color="#8a8f98", linewidth=0.8)
         for kind in kinds:
-            for colour, (key, each) in zip(colours, ((k, e) for k, e in read().items() if k[0] == kind)):
+            for colour, (key, each) in zip(colours, ((k, e) for k, e in runs.items() if k[0] == kind)):
                 least = min(each)
                 name = NAMES[key[1]] if kind == "lanes" else f"{int(key[2]):,} envs, {key[4]} units, {labels[kind]}"
                 ratios = [least * each[n][1] / each[least][1] for n in each]
@@ -75,8 +73,7 @@ def draw() -> None:
         axis.set_xticklabels(["1", "2", "4", "8"])
         axis.set_yticklabels(["1", "2", "4", "8"])
         axis.minorticks_off()
-        axis.legend(fontsize=7, frameon=False)
-    axes[1].legend(fontsize=7, frameon=False, loc="lower left")
+        axis.legend(fontsize=7, frameon=False, loc="lower left" if len(kinds) > 1 else "upper left")
     axes[0].set(ylim=(0.15, 9.0), title="Runs side by side", ylabel="steps per second, of one GPU's")
     axes[1].set(title="One run of Push")
     figure.savefig(PICTURE, dpi=120)

@@ -144,7 +144,7 @@ class ActorCriticBase(Learner):
         """Takes one step of Adam down `loss`, a function of `params` that gives (loss [], more).
 
         Returns:
-          The parameters and Adam's moments after the step, the loss before it, and what `loss` gave more.
+          The parameters and Adam's moments after the step, the loss before it, and the second value of `loss`.
         """
         (value, more), gradient = jax.value_and_grad(loss, has_aux=True)(params)
         updates, moments = adam(rate, hparams.adam_eps).update(self.mean(gradient), moments)

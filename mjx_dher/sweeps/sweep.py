@@ -35,11 +35,11 @@ def run(
     """
     options |= {"should_stop": should_stop, "shared": folder / UNFINISHED, "sweep": True}
     results: list[Result] = []
-    groups = grid.by_program(specs)
-    for trials in groups[1:]:  # before the first ones train, which may take days
-        program.check_runs(make_env(trials[0]), trials, options.get("lanes"), options.get("devices", 1))
-    for trials in groups:
+    groups = [(make_env(trials[0]), trials) for trials in grid.by_program(specs)]
+    for env, trials in groups[1:]:  # before the first ones train, which may take days
+        program.check_runs(env, trials, options.get("lanes"), options.get("devices", 1))
+    for env, trials in groups:
         if results and processes.any_process(should_stop()):
             break
-        results += train_runs(make_env(trials[0]), trials, [grid.folder_of(folder, spec) for spec in trials], **options)
+        results += train_runs(env, trials, [grid.folder_of(folder, spec) for spec in trials], **options)
     return results

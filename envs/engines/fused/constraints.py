@@ -222,7 +222,7 @@ def touch(
     """Sets the rows of contacts: the edges of friction pyramids, normal plus and minus friction times tangent.
 
     Args:
-      elliptic: whether rows are those of elliptic cones instead, mu times the normal, and friction times tangent.
+      elliptic: whether rows have elliptic cones instead: mu times the normal, and friction times tangent.
       capsules: whether there may be some on planes.
       rolling: whether there may be rolling friction.
     """

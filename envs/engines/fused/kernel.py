@@ -33,7 +33,7 @@ def _begin(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: in
 
 @wp.func
 def _end(memory: Memory, qpos: Floats, qvel: Floats, guess: Floats, thread: int, threads: int):
-    """Copies an environment's state out of its memory. If it is not finite, all coordinates become NaN."""
+    """Copies an environment's state out of its memory. If `give_up` was called, all coordinates become NaN."""
     copy(memory.qpos, qpos, thread, threads)
     if wp.isnan(memory.qvel[0]):
         for i in range(thread, qpos.shape[0], threads):

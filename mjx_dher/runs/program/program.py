@@ -108,12 +108,13 @@ def check_runs(env: Env, specs: Sequence[RunSpec], lanes: int | None = None, dev
     return _plan(env, specs, mesh.most_lanes(lanes, placed_on), placed_on)[0]
 
 
-def _plan(env: Env, specs: Sequence[RunSpec], max_lanes: int | None, devices: Sequence[Any]) -> tuple[Train, Layout]:
-    """Training loop of runs and its layout. Raises ValueError like `compile_runs`."""
-    layout = mesh.arrange(devices, min(len(specs), max_lanes or len(specs)))
+def _plan(env: Env, specs: Sequence[RunSpec], max_lanes: int | None, devices: Sequence[Any]) -> tuple[Train, Layout, int]:
+    """Training loop of runs, its layout, and the most lanes per device. Raises ValueError like `compile_runs`."""
+    most = min(len(specs), max_lanes or len(specs))
+    layout = mesh.arrange(devices, most)
     train = make_loop(env, specs[0], choices_of(specs), layout)
     loop.check_memory(train, specs[0].config, layout.sharers)
-    return train, layout
+    return train, layout, math.ceil(most / layout.lanes)
 
 
 def compile_runs(
@@ -130,8 +131,7 @@ def compile_runs(
     for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
-    train, layout = _plan(env, specs, max_lanes, devices)
-    lanes = math.ceil(min(len(specs), max_lanes or len(specs)) / layout.lanes)  # per device, like the bytes
+    train, layout, lanes = _plan(env, specs, max_lanes, devices)  # lanes per device, like the bytes
     available = memory.available_bytes()
     if available is not None:  # the rings must fit before anything is compiled
         available //= layout.sharers
