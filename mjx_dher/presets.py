@@ -151,8 +151,8 @@ def _cpu_hand_reach(env: str) -> Settings:
 
 
 def _gpu_slide(env: str) -> Settings:
-    base = _with(_gpu(env), updates_per_cycle=1000, total_steps=8_000_000, n_step=3)
-    return _with(base, hidden_sizes=(512, 512, 512), target_noise=0.0)
+    base = _with(_gpu(env), updates_per_cycle=1000, total_steps=8_000_000, n_step=3, renewals=5)
+    return _with(base, hidden_sizes=(512, 512, 512), target_noise=0.0, policy_delay=2, learner_dtype="bfloat16")
 
 
 def _cpu_slide(env: str) -> Settings:

@@ -24,7 +24,7 @@ from mjx_dher.learners.actors import ActorKind, Deterministic
 from mjx_dher.learners.common import ActorCriticBase, Params
 from mjx_dher.learners.critics import Categorical, Critics
 from mjx_dher.learners.gaussian import Gaussian
-from mjx_dher.networks import Heads, Networks, NetworksFn, check_heads, zeros
+from mjx_dher.networks import Heads, NetworksFn, check_heads, zeros
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
 
@@ -81,11 +81,11 @@ class ActorCritic(ActorCriticBase):
         inputs = *self.normalize(state, obs["observation"], obs["desired_goal"], hparams), action
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[action.ndim - 1 :]), inputs)
         judges = self.critics.judges(state.params.critic)
-        return self.critics.judge(self.returns(self.networks, judges, hparams, *flat)).reshape(action.shape[:-1])
+        return self.critics.judge(self.returns(judges, hparams, *flat)).reshape(action.shape[:-1])
 
-    def returns(self, networks: Networks, params: PyTree, hparams: HParams, *inputs: PyTree) -> Array:
+    def returns(self, params: PyTree, hparams: HParams, *inputs: PyTree) -> Array:
         """Estimated returns [C, B, K] by critics with `params`, of normalized observations and goals, and actions."""
-        outputs = critics.values(networks.critic, params, *inputs)
+        outputs = critics.values(self.learning.critic, params, *inputs)
         return self.critics.returns(outputs, *self.return_bounds(hparams))
 
     def update(
@@ -123,7 +123,7 @@ class ActorCritic(ActorCriticBase):
         params = state.target.actor if self.actor.has_target else state.params.actor
         inputs, normal = (batch.next_observation, batch.desired_goal), self.normal(action_key, batch.action.shape)
         action, cost = self.actor.next_action(self.learning.actor, params, *inputs, normal, hparams)
-        following = self.returns(self.learning, state.target.critic, hparams, *inputs, action)
+        following = self.returns(state.target.critic, hparams, *inputs, action)
         future = (self.critics.combine(following, combine_key) - cost[:, None]).T  # [K, B]
         return jnp.clip(batch.reward + batch.discount * future, *self.return_bounds(hparams)).T
 
@@ -134,7 +134,7 @@ class ActorCritic(ActorCriticBase):
         judges = self.critics.judges(state.params.critic)
 
         def judge(action: Array) -> Array:
-            return self.critics.judge(self.returns(self.learning, judges, hparams, *inputs, action))
+            return self.critics.judge(self.returns(judges, hparams, *inputs, action))
 
         def actor_loss(actor: PyTree) -> tuple[Array, Metrics]:
             return self.actor.loss(self.learning.actor, actor, *inputs, judge, normal, hparams)

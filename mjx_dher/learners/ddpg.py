@@ -82,7 +82,7 @@ class DDPG(ActorCriticBase):
     def value(self, state: DDPGState, obs: GoalObs, action: Array, hparams: HParams) -> Array:
         """Q value [...] of actions [..., A]."""
         inputs = self.normalize(state, obs["observation"], obs["desired_goal"], hparams)
-        return cast(Array, self.networks.critic.apply(state.params.critic, *inputs, action))
+        return cast(Array, self.learning.critic.apply(state.params.critic, *inputs, action))
 
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
         """Takes one Adam step for critic and actor, both from the old parameters."""
