@@ -202,15 +202,20 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
     return parts
 
 
+_AS_OF_2026_11_25: dict[str, dict[str, Any]] = {
+    "pick_and_place": {"num_envs": 512, "replay_size": 4_000_000},
+    "slide": {"policy_delay": 1, "renewals": 0, "learner_dtype": "float32"},
+}
+
+
 def tuned(task: str, **parts: str) -> RunSpec:
     """The run of the preset `gpu` that these experiments start from, with `parts` replaced.
 
-    For PickAndPlace it is that preset as of 2026-11-25: `frugal` with 512 environments and a larger ring.
+    For PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments and a
+    larger ring.
     """
-    if task != "pick_and_place":
-        return presets.preset("gpu", task, **parts)
-    run = presets.preset("frugal", task, **parts)
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, num_envs=512, replay_size=4_000_000))
+    run = presets.preset("frugal" if task == "pick_and_place" else "gpu", task, **parts)
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **_AS_OF_2026_11_25.get(task, {})))
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
