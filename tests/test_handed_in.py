@@ -23,6 +23,7 @@ from point_mass import PointMass
 from probes import Walk
 
 ENV = PointMass()
+TRIAL = testing.trial.Trial(ENV)  # its episodes are played once
 T, N = ENV.episode_length, 6
 
 CONTEXT = Context(ENV.compute_reward, HParams())
@@ -30,7 +31,7 @@ CONTEXT = Context(ENV.compute_reward, HParams())
 
 @pytest.fixture(scope="module")
 def episodes():
-    return testing.trial.random_episodes(ENV)
+    return TRIAL.episodes
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +281,7 @@ def test_what_a_learner_gives_is_checked(name):
     with refuses(*parts):
         trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
     with refuses(*parts, error=testing.ComponentError):
-        testing.check_learner(lambda config, spec, networks: own, ENV, SMALL)
+        testing.check_learner(lambda config, spec, networks: own, TRIAL, SMALL)
 
 
 def test_a_sampler_is_checked_with_the_length_of_short_episodes():
@@ -288,7 +289,7 @@ def test_a_sampler_is_checked_with_the_length_of_short_episodes():
         weights = samplers.future(achieved, desired, step, hparams, length)
         return weights if length is None else weights * jnp.nan
 
-    testing.check_sampler(future_in_the_end, ENV)
+    testing.check_sampler(future_in_the_end, TRIAL)
     with refuses("sampler", "nan", error=testing.ComponentError):
         testing.check_sampler(future_in_the_end, Walk())
     assert "never" in testing.check_sampler("future", Walk())
@@ -321,7 +322,7 @@ def test_checks_take_episodes_of_one_step_and_observations_of_their_kind():
 
 def test_a_kernel_s_weights_and_a_priority_of_0_are_told():
     assert "weights 2, 1 and 0 at relative distances 0, 1 and 2" in testing.check_kernel("linear")
-    told = testing.check_priority(lambda episode, context: jnp.zeros(()), ENV)
+    told = testing.check_priority(lambda episode, context: jnp.zeros(()), TRIAL)
     assert "while none is above 0, episodes are drawn uniformly" in told
 
 
@@ -334,7 +335,7 @@ def test_what_is_to_be_left_out_is_left_out():
         return kind(*(getattr(made, field.name) for field in dataclasses.fields(made)))
 
     with refuses("learner.update_normalizers", "finite"):
-        testing.check_learner(make, ENV, SMALL)
+        testing.check_learner(make, TRIAL, SMALL)
 
 
 def test_a_place_is_told_wherever_the_code_lies(tmp_path, monkeypatch):
@@ -344,4 +345,4 @@ def test_a_place_is_told_wherever_the_code_lies(tmp_path, monkeypatch):
     (folder / "lies_in_jax.py").write_text("def sampler(achieved, desired, step, hparams):\n    return achieved.nothing\n")
     monkeypatch.syspath_prepend(folder)
     with refuses("AttributeError", "lies_in_jax.py", "line 2"):
-        testing.check_sampler("lies_in_jax:sampler", ENV)
+        testing.check_sampler("lies_in_jax:sampler", TRIAL)

@@ -29,17 +29,19 @@ from mjx_dher.testing import (
     check_priority,
     check_sampler,
 )
+from mjx_dher.testing.trial import Trial
 from point_mass import PointMass, soon
 
 ENV = PointMass()
+TRIAL = Trial(ENV)  # its episodes are played once
 CHECKS = {
-    "sampler": (mistakes.SAMPLERS, lambda part: check_sampler(part, ENV)),
-    "metric": (mistakes.METRICS, lambda part: check_metric(part, ENV)),
+    "sampler": (mistakes.SAMPLERS, lambda part: check_sampler(part, TRIAL)),
+    "metric": (mistakes.METRICS, lambda part: check_metric(part, TRIAL)),
     "weight_kernel": (mistakes.KERNELS, check_kernel),
     "weight_normalization": (mistakes.NORMALIZATIONS, check_normalization),
-    "priority": (mistakes.PRIORITY, lambda part: check_priority(part, ENV)),
-    "learner": (mistakes.LEARNERS, lambda part: check_learner(part, ENV, SMALL)),
-    "networks": (mistakes.NETWORKS, lambda part: check_learner("ddpg", ENV, SMALL, networks=part)),
+    "priority": (mistakes.PRIORITY, lambda part: check_priority(part, TRIAL)),
+    "learner": (mistakes.LEARNERS, lambda part: check_learner(part, TRIAL, SMALL)),
+    "networks": (mistakes.NETWORKS, lambda part: check_learner("ddpg", TRIAL, SMALL, networks=part)),
     "env": (mistakes.ENVS, lambda part: check_env(part())),
 }
 TABLE = [(kind, name) for kind, (table, _) in CHECKS.items() for name in table]
@@ -103,23 +105,23 @@ def always(index):
 calls = itertools.count()
 MORE = {  # what a check is handed, and a word of what it says
     "the same normalized distance": (lambda: check_normalization(deaf), "tells no distances apart"),
-    "one transition": (lambda: check_priority(always(lambda i, key: 0 * i), ENV), "all 8 are one"),
+    "one transition": (lambda: check_priority(always(lambda i, key: 0 * i), TRIAL), "all 8 are one"),
     "one transition at random": (
-        lambda: check_priority(always(lambda i, key: 0 * i + jax.random.randint(key, (), 0, 32)), ENV),
+        lambda: check_priority(always(lambda i, key: 0 * i + jax.random.randint(key, (), 0, 32)), TRIAL),
         "all 8 are one",
     ),
-    "the first of each": (lambda: check_priority(always(lambda i, key: 4 * i), ENV), "keeps the first of each 4"),
-    "no candidate": (lambda: check_priority(always(lambda i, key: 5 * i - 1), ENV), r"indices of 32 candidates; one is \[-1\]"),
+    "the first of each": (lambda: check_priority(always(lambda i, key: 4 * i), TRIAL), "keeps the first of each 4"),
+    "no candidate": (lambda: check_priority(always(lambda i, key: 5 * i - 1), TRIAL), r"indices of 32 candidates; one is \[-1\]"),
     "another sampler each time": (
-        lambda: check_sampler(lambda achieved, desired, step, hparams: next(calls) * achieved[:, 0], ENV),
+        lambda: check_sampler(lambda achieved, desired, step, hparams: next(calls) * achieved[:, 0], TRIAL),
         "sampler, called twice .* same result",
     ),
     "another generator each time": (
-        lambda: check_generator(lambda key, obs, ring, context: obs["desired_goal"] + next(calls), ENV),
+        lambda: check_generator(lambda key, obs, ring, context: obs["desired_goal"] + next(calls), TRIAL),
         "generator, called twice .* same result",
     ),
     "another weight each time": (
-        lambda: check_priority(lambda episode, context: jnp.zeros(()) + next(calls), ENV),
+        lambda: check_priority(lambda episode, context: jnp.zeros(()) + next(calls), TRIAL),
         "priority, called twice .* same result",
     ),
 }
@@ -136,7 +138,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("dpp", "td_error
 
 @pytest.mark.parametrize("name", ["curriculum", "not_misleading", *SLOW])
 def test_built_in_choices_pass(name):
-    assert "8 of 32 transitions chosen" in check_priority(name, ENV)
+    assert "8 of 32 transitions chosen" in check_priority(name, TRIAL)
 
 
 FLAGS = configs.flags(SMALL)[2:]  # all but the environment
