@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from configs import SHORT, flags
 from conftest import EXAMPLES, names
+from sweep_helpers import compile_once  # noqa: F401
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec

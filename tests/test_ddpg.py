@@ -222,7 +222,8 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
     def passes(networks):
         action = networks.actor.apply(params.actor, observation, goal)
         assert action.dtype == networks.critic.apply(params.critic, observation, goal, action).dtype == jnp.float32
-        gradients, losses = ddpg.compute_gradients(networks, params, params, batch, (-50.0, 0.0), hparams)
+        compute = jax.jit(lambda params, batch: ddpg.compute_gradients(networks, params, params, batch, (-50.0, 0.0), hparams))
+        gradients, losses = compute(params, batch)
         return losses.critic_loss, ravel_pytree(gradients.critic)[0], ravel_pytree(gradients.actor)[0]
 
     (loss, *gradients), (near, *others) = passes(exact), passes(rounded)

@@ -121,8 +121,8 @@ def test_files_that_cannot_be_used_are_refused(file, tmp_path):
 def test_the_ring_holds_them_and_the_normalizers_have_seen_them():
     episodes = played()
     train = trainer.make_train(ENV, TINY)
-    empty = train.init(jax.random.key(0), HParams())
-    state = train.add(empty, episodes)
+    empty = jax.jit(train.init)(jax.random.key(0), HParams())
+    state = jax.jit(train.add)(empty, episodes)
     assert (int(empty.replay.size), int(state.replay.size)) == (0, 6)
     same(jax.tree.map(lambda x: np.asarray(x[:6]), state.replay.episodes), episodes)
     np.testing.assert_allclose(state.learner.observation_norm.mean, episodes.observation.mean((0, 1)), rtol=1e-5)

@@ -6,6 +6,7 @@ import sys
 import pytest
 from configs import SHORT, flags
 from conftest import EXAMPLES, names, refuses
+from sweep_helpers import compile_once  # noqa: F401
 from test_driver import result_of, rows_of
 
 import mjx_dher

@@ -111,7 +111,10 @@ MORE = {  # what a check is handed, and a word of what it says
         "all 8 are one",
     ),
     "the first of each": (lambda: check_priority(always(lambda i, key: 4 * i), TRIAL), "keeps the first of each 4"),
-    "no candidate": (lambda: check_priority(always(lambda i, key: 5 * i - 1), TRIAL), r"indices of 32 candidates; one is \[-1\]"),
+    "no candidate": (
+        lambda: check_priority(always(lambda i, key: 5 * i - 1), TRIAL),
+        r"indices of 32 candidates; one is \[-1\]",
+    ),
     "another sampler each time": (
         lambda: check_sampler(lambda achieved, desired, step, hparams: next(calls) * achieved[:, 0], TRIAL),
         "sampler, called twice .* same result",

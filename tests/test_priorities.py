@@ -108,10 +108,8 @@ def test_batches_are_drawn_in_proportion_to_the_weights():
     empty = replay.init(jax.tree.map(lambda x: x[0], EPISODES), 4)
     ring = replay.add(empty, EPISODES.replace(action=EPISODES.action + jnp.arange(3.0)[:, None, None]), weights(distance))
     hparams = HP._replace(priority_fraction=0.75)
-    cumulative = replay.cumulative(ring)
-    batch = relabel.draw_batches(
-        ring, jax.random.key(0), (9, 1000), samplers.make("future"), Context(REWARD, hparams), cumulative
-    )
+    args = (9, 1000), samplers.make("future"), Context(REWARD, hparams)
+    batch = jax.jit(lambda ring, key: relabel.draw_batches(ring, key, *args, replay.cumulative(ring)))(ring, jax.random.key(0))
     found = np.bincount(np.asarray(batch.action[..., 0], int).ravel(), minlength=3)
     expected = 9000 * (0.25 / 3 + 0.75 * np.array([1 / 7, 6 / 7, 0]))
     assert np.sum((found - expected) ** 2 / expected) < 13.8  # 99.9 % point at 2 degrees of freedom

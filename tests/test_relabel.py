@@ -18,6 +18,7 @@ from probes import Clock
 HP = HParams()
 ENV = Clock(episode_length=12)
 CONTEXT = Context(ENV.compute_reward, HP)
+sample_of = jax.jit(replay.sample, static_argnums=2)
 Numbered = collections.namedtuple("Numbered", (*HParams._fields, "choice"))
 
 
@@ -26,8 +27,13 @@ def ring():
     """Episodes of a random walk: no two achieved goals are alike, but for the origin where all begin."""
 
     steps = jax.random.normal(jax.random.key(0), (12, 64, 2))
-    episodes, _ = rollout(ENV, lambda step, obs: step, jax.random.key(0), 64, steps)
-    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 80), episodes)
+
+    @jax.jit
+    def make(steps):
+        episodes, _ = rollout(ENV, lambda step, obs: step, jax.random.key(0), 64, steps)
+        return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 80), episodes)
+
+    return make(steps)
 
 
 def index_of(goal, episode_goals):
@@ -37,12 +43,13 @@ def index_of(goal, episode_goals):
 
 
 def goals_of(ring, sample, sampler, hparams, key):
-    return hindsight_goals(add_choices(ring, sample, sampler, None, key), sampler, hparams, key).goals
+    draw = lambda ring, sample, key: hindsight_goals(add_choices(ring, sample, sampler, None, key), sampler, hparams, key)  # noqa: E731
+    return jax.jit(draw)(ring, sample, key).goals
 
 
 @pytest.mark.parametrize("name", COMPONENTS["sampler"])
 def test_goals_come_from_where_the_sampler_may_look(ring, name):
-    sample = replay.sample(ring, jax.random.key(1), 5000)
+    sample = sample_of(ring, jax.random.key(1), 5000)
     goals = goals_of(ring, sample, samplers.make(name), HP, jax.random.key(2))
     index, step = index_of(goals, sample.episode_goals), np.asarray(sample.step)
     if name == "random":
@@ -62,17 +69,22 @@ def test_goals_come_from_where_the_sampler_may_look(ring, name):
 
 @pytest.mark.parametrize(("gives", "log_weights"), [("[]", lambda a, d, s, h: s * 0.0), ("[13, 2]", lambda a, d, s, h: a)])
 def test_a_sampler_s_log_weights_are_one_for_each_goal(ring, gives, log_weights):
-    sample = replay.sample(ring, jax.random.key(1), 5)
+    sample = sample_of(ring, jax.random.key(1), 5)
     with pytest.raises(ValueError, match="log weights") as error:
         hindsight_goals(sample, samplers.Sampler(log_weights), HP, jax.random.key(0))
     assert "[13]" in str(error.value)
     assert gives in str(error.value)
 
 
+@jax.jit
+def relabelled(sample, k, key):
+    return relabel(sample, samplers.make("future"), Context(ENV.compute_reward, HP._replace(her_k=k)), key).batch
+
+
 @pytest.mark.parametrize("k", [0.0, 1.0, 4.0, np.inf])
 def test_relabelled_share(ring, k):
-    sample = replay.sample(ring, jax.random.key(3), 20_000)
-    batch = relabel(sample, samplers.make("future"), Context(ENV.compute_reward, HP._replace(her_k=k)), jax.random.key(4)).batch
+    sample = sample_of(ring, jax.random.key(3), 20_000)
+    batch = relabelled(sample, k, jax.random.key(4))
     kept = np.all(np.asarray(batch.desired_goal == sample.desired_goal), axis=-1)
     expected = 1.0 if k == np.inf else k / (k + 1)
     assert abs((1 - kept.mean()) - expected) <= 4 * np.sqrt(expected * (1 - expected) / 20_000)
@@ -99,7 +111,7 @@ def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
 
 
 def test_weighted_prefers_goals_near_the_desired_one(ring):
-    sample = replay.sample(ring, jax.random.key(6), 20_000)
+    sample = sample_of(ring, jax.random.key(6), 20_000)
 
     def mean_distance(name):
         goals = goals_of(ring, sample, samplers.make(name), HP, jax.random.key(7))
@@ -112,9 +124,8 @@ def test_a_sampler_measures_by_the_goal_distance_of_the_context():
     """Achieved goals 0, 9, 2, 4 on a circle of 10: from goal 0, the 9 is at distance 1, where the line's nearest is 2."""
     circle = lambda achieved, desired: jnp.minimum(d := jnp.abs(achieved - desired)[..., 0], 10 - d)  # noqa: E731
     goals = jnp.array([[[0.0], [9.0], [2.0], [4.0]]])
-    ring = replay.init(Episode(goals[0], goals[0], jnp.zeros(1), jnp.zeros((3, 1))), 1)
-    ring = replay.add(ring, Episode(goals, goals, jnp.zeros((1, 1)), jnp.zeros((1, 3, 1))))
-    sample = replay.sample(ring, jax.random.key(0), 64)
+    ring = ring_of(Episode(goals, goals, jnp.zeros((1, 1)), jnp.zeros((1, 3, 1))))
+    sample = sample_of(ring, jax.random.key(0), 64)
     on_line = Context(lambda achieved, desired: -(achieved - desired)[..., 0], HP._replace(her_k=jnp.inf))
     first = np.asarray(sample.step) == 0
     joined = samplers.join([samplers.make("closest"), samplers.make("final")])
@@ -125,7 +136,8 @@ def test_a_sampler_measures_by_the_goal_distance_of_the_context():
         (samplers.make("closest", metric=samplers.position), on_line._replace(goal_distance=circle), 2.0),
         (joined, on_line._replace(goal_distance=circle, hparams=Numbered(*on_line.hparams, 0)), 9.0),
     ]:
-        chosen = relabel(sample, sampler, context, jax.random.key(1)).batch.desired_goal
+        draw = jax.jit(lambda sample, key, of=(sampler, context): relabel(sample, *of, key).batch.desired_goal)
+        chosen = draw(sample, jax.random.key(1))
         assert set(np.asarray(chosen)[first].ravel()) == {expected}
 
 
@@ -133,7 +145,7 @@ def test_one_of_several_samplers_draws_what_it_would_alone(ring):
     """Whichever a run is told to use by its number, to the bit; `random`, which looks elsewhere in the ring, too."""
     names = ("future", "random", "weighted", "closest", "final")
     together = samplers.join([samplers.make(name) for name in names])
-    sample = replay.sample(ring, jax.random.key(0), 64)
+    sample = sample_of(ring, jax.random.key(0), 64)
     goals = set()
     for choice, name in enumerate(names):
         numbers = Numbered(*HParams(), choice)
@@ -157,6 +169,16 @@ def near(achieved, desired):
     return -(jnp.abs(achieved - desired)[..., 0] > 0.5).astype(jnp.float32)
 
 
+@jax.jit
+def ring_of(episodes):
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 3), episodes)
+
+
+@jax.jit
+def three_ahead(ring, sample, one):
+    return look_ahead(ring, sample, one, Context(near, HP._replace(gamma=0.5)), 3)
+
+
 @pytest.mark.parametrize(
     ("step", "goal", "reward", "num_steps"),
     [
@@ -172,7 +194,7 @@ def near(achieved, desired):
 )
 def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
     """gamma 1/2, up to three steps; the second row of the ring holds the episode."""
-    ring = replay.add(replay.init(LINE, 3), jax.tree.map(lambda x: jnp.stack([x + 99, x]), LINE))
+    ring = ring_of(jax.tree.map(lambda x: jnp.stack([x + 99, x]), LINE))
     sample = replay.Sample(
         observation=LINE.observation[step][None],
         next_observation=LINE.observation[step + 1][None],
@@ -186,7 +208,7 @@ def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
     )
     ends = sample.observation, sample.next_observation
     one = Batch(*ends, jnp.array([[goal]]), sample.action, jnp.array([9.0]), jnp.array([0.5]), sample.row)
-    batch = look_ahead(ring, sample, one, Context(near, HP._replace(gamma=0.5)), 3)
+    batch = three_ahead(ring, sample, one)
     np.testing.assert_allclose(batch.reward, [reward])
     np.testing.assert_allclose(batch.discount, [0.5**num_steps])
     np.testing.assert_array_equal(batch.next_observation, LINE.observation[step + num_steps][None])
@@ -214,10 +236,10 @@ def test_one_step_ahead_is_the_transition(ring):
 def test_returns_of_several_steps_end_at_a_failure_in_the_last_step():
     """In a ring without `ends`, too."""
     failed = dataclasses.replace(LINE, length=jnp.int32(4), terminal=jnp.array(True))
-    ring = replay.add(replay.init(failed, 1), jax.tree.map(lambda x: x[None], failed))
+    ring = ring_of(jax.tree.map(lambda x: x[None], failed))
     args = jax.random.key(0), (200,), samplers.make("future"), Context(near, HP._replace(gamma=0.5))
     for n_step in (1, 3):
-        batch = draw_batches(ring, *args, replay.cumulative(ring), n_step)
+        batch = jax.jit(lambda ring, n=n_step: draw_batches(ring, *args, replay.cumulative(ring), n))(ring)
         at_end = np.asarray(batch.next_observation[:, 0]) == 40.0
         assert at_end.any()
         assert not np.asarray(batch.discount)[at_end].any()

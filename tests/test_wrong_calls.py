@@ -14,6 +14,7 @@ import pytest
 import wrong_calls
 from configs import SHORT as CONFIG
 from conftest import ROOT, refuses
+from sweep_helpers import compile_once  # noqa: F401
 
 import mjx_dher
 from mjx_dher import Options, cli, envs
