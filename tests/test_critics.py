@@ -100,9 +100,9 @@ def plain_loss(values, atoms):
 
 def test_quantile_huber_and_its_gradient_are_those_of_the_formula(backend):
     values, atoms = (2.0 * jax.random.normal(jax.random.key(i), shape) for i, shape in enumerate(((3, 5, 4), (5, 7))))
-    ours, formula = (jax.value_and_grad(loss)(values, atoms) for loss in (critics.quantile_huber, plain_loss))
+    ours, formula = (jax.jit(jax.value_and_grad(loss))(values, atoms) for loss in (critics.quantile_huber, plain_loss))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-7), ours, formula)
-    lanes = jax.vmap(jax.grad(critics.quantile_huber))(jnp.stack([values, -values]), jnp.stack([atoms, atoms]))
+    lanes = jax.jit(jax.vmap(jax.grad(critics.quantile_huber)))(jnp.stack([values, -values]), jnp.stack([atoms, atoms]))
     np.testing.assert_allclose(lanes[0], formula[1], rtol=2e-5, atol=1e-7)
     assert not np.any(jax.grad(critics.quantile_huber, argnums=1)(values, atoms))  # a target stays where it is
 
@@ -167,8 +167,8 @@ def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1():
     )
     ones = jnp.ones((8, 2))
     batch = Batch(ones, ones, ones, ones, -ones[:, 0], ones[:, 0], jnp.arange(8))
-    before = learner.init(jax.random.key(0)).params
-    params = jax.jit(learner.update)(learner.init(jax.random.key(0)), batch, HParams())[0].params
+    state = jax.jit(learner.init)(jax.random.key(0))
+    before, params = state.params, jax.jit(learner.update)(state, batch, HParams())[0].params
     for tree, start in ((params.critic, before.critic), (params.actor, before.actor)):
         layers, old = tree["params"], start["params"]
         for name in ("Dense_0", "Dense_1"):

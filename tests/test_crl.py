@@ -1,6 +1,7 @@
 """Contrastive RL: losses and energies by hand, a known optimum, goals of the batch, lanes, rejected settings."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -55,9 +56,10 @@ def test_energies_by_hand(name, expected):
     phi, psi = jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])
     np.testing.assert_allclose(crl.energy(name, phi, psi), expected, rtol=1e-5)
     phi, psi = jax.random.normal(KEY, (2, 5, 3))
-    one_by_one = [[crl.energy(name, x, y) for y in psi] for x in phi]
+    energy = jax.jit(functools.partial(crl.energy, name))
+    one_by_one = [[energy(x, y) for y in psi] for x in phi]
     np.testing.assert_allclose(crl.energies(name, phi, psi), one_by_one, rtol=1e-4, atol=1e-5)
-    gradient = jax.grad(lambda x: crl.energies(name, x, phi * jnp.arange(5)[:, None]).sum())(phi)
+    gradient = jax.jit(jax.grad(lambda x: crl.energies(name, x, phi * jnp.arange(5)[:, None]).sum()))(phi)
     assert np.all(np.isfinite(gradient))  # also where a distance, or a length, is 0
 
 
@@ -128,11 +130,16 @@ def test_the_critic_learns_from_the_sampler_s_goals_and_the_actor_from_the_batch
 def test_a_batch_has_the_sampler_s_goal_whether_or_not_it_is_taken():
     achieved = jnp.arange(6.0)[:, None]
     episode = Episode(achieved, achieved, jnp.array([9.0]), jnp.zeros((5, 1)))
-    ring = replay.add(replay.init(episode, 1), jax.tree.map(lambda x: x[None], episode))
-    sample = replay.sample(ring, KEY, 64)
-    for k, own in ((0.0, True), (jnp.inf, False)):
+
+    @jax.jit
+    def draw(episode, k):
+        ring = replay.add(replay.init(episode, 1), jax.tree.map(lambda x: x[None], episode))
+        sample = replay.sample(ring, KEY, 64)
         context = Context(lambda achieved, desired: -jnp.ones(len(desired)), HParams(her_k=k))
-        batch = relabel.relabel(sample, "geometric", context, KEY).batch
+        return sample, relabel.relabel(sample, "geometric", context, KEY).batch
+
+    for k, own in ((0.0, True), (jnp.inf, False)):
+        sample, batch = draw(episode, k)
         assert np.all(batch.hindsight_goal[:, 0] > sample.step)
         assert np.all(batch.desired_goal == 9.0) if own else np.all(batch.desired_goal == batch.hindsight_goal)
 

@@ -23,6 +23,7 @@ from point_mass import PointMass
 from probes import Walk
 
 ENV = PointMass()
+TRIAL = testing.trial.Trial(ENV)  # its episodes are played once
 CONTEXT = Context(ENV.compute_reward, HParams())
 
 
@@ -43,9 +44,8 @@ def first_of(env=ENV, number=5):
 
 def test_a_rollout_takes_keys_of_either_kind():
     actions = jnp.zeros((ENV.episode_length, 5, 2))
-    typed, numbers = (
-        rollout(ENV, lambda action, obs: action, key, 5, actions)[0] for key in (jax.random.key(0), jax.random.PRNGKey(0))
-    )
+    play = jax.jit(lambda key: rollout(ENV, lambda action, obs: action, key, 5, actions)[0])
+    typed, numbers = map(play, (jax.random.key(0), jax.random.PRNGKey(0)))
     np.testing.assert_array_equal(typed.observation, numbers.observation)
 
 
@@ -144,7 +144,7 @@ def test_what_is_half_a_priority_is_refused():
     ):
         with pytest.raises(ValueError, match=message):
             priorities.make(wrong)
-    ring = testing.trial.Trial(ENV).ring
+    ring = TRIAL.ring
     with pytest.raises(ValueError, match=r"weights \[E\] .*\[32\]; got .*\[2\]"):
         priorities.renew(Priority(renew=lambda ring, context: jnp.ones(2)), ring, CONTEXT)
     nan = priorities.renew(Priority(renew=lambda ring, context: jnp.full(32, jnp.nan)), ring, CONTEXT)
@@ -158,10 +158,14 @@ def test_what_is_half_a_priority_is_refused():
 
 
 def _candidates(ring):
-    sample = replay.sample(ring, jax.random.key(0), 16)
     from mjx_dher.relabel import relabel
 
-    return sample, relabel(sample, samplers.make("future"), CONTEXT, jax.random.key(1)).batch
+    @jax.jit
+    def draw(ring):
+        sample = replay.sample(ring, jax.random.key(0), 16)
+        return sample, relabel(sample, samplers.make("future"), CONTEXT, jax.random.key(1)).batch
+
+    return draw(ring)
 
 
 def test_a_score_of_the_wrong_kind_is_refused():
@@ -174,7 +178,7 @@ def test_a_score_of_the_wrong_kind_is_refused():
 
 
 def test_trials_name_what_is_wrong():
-    trial = testing.trial.Trial(ENV)
+    trial = TRIAL
     for wrong, message in (
         (lambda key, obs, ring, context: obs["achieved_goal"][:, 0], r"goals \[N, G\]"),
         (lambda key, obs, ring, context: jnp.full((16, 2), jnp.nan), "no goal is finite"),
@@ -194,7 +198,7 @@ def test_trials_name_what_is_wrong():
 
 
 def test_built_in_parts_pass_their_trials():
-    trial = testing.trial.Trial(ENV)
+    trial = TRIAL
     assert "chosen" in testing.check_priority("td_error", trial)
     assert "goals of the past never" in testing.check_sampler(samplers.make("weighted", metric="time_to_goal"), trial)
 

@@ -62,18 +62,19 @@ def test_a_pen_s_third_angle_does_not_count():
         angles, others = (Rotation.from_quat(quat, scalar_first=True).as_euler("XYZ") for quat in (first, second))
         want.append(signed_angle(from_euler([*angles[:2], others[2]]), second))
     goals = [jnp.float32(np.concatenate([np.zeros((200, 3)), quat], axis=1)) for quat in (a, b)]
-    np.testing.assert_allclose(hand.ObjectPose("xyz", ignores_z=True).distance(*goals), want, atol=1e-4)
+    np.testing.assert_allclose(jax.jit(hand.ObjectPose("xyz", ignores_z=True).distance)(*goals), want, atol=1e-4)
 
 
 def test_a_pen_reaches_its_own_goal_and_others_with_its_direction():
     env = envs.make("pen_rotate", engine="native")
     state = jax.tree.map(jnp.asarray, env._rest)
+    pose_of = jax.jit(lambda quat: env.achieved(state.replace(qpos=state.qpos.at[27:].set(quat))))
+    reached = jax.jit(env.reached)
     for quat in unit(np.random.default_rng(2), 20):
-        pose = env.achieved(state.replace(qpos=state.qpos.at[27:].set(quat)))
-        assert env.reached(pose, pose)
+        pose = pose_of(quat)
+        assert reached(pose, pose)
         angles = Rotation.from_quat(quat, scalar_first=True).as_euler("XYZ")
-        turned = env.achieved(state.replace(qpos=state.qpos.at[27:].set(from_euler([*angles[:2], 0.3]))))
-        assert env.reached(turned, pose)
+        assert reached(pose_of(from_euler([*angles[:2], 0.3])), pose)
 
 
 def test_a_position_counts_as_much_as_an_angle(block):
@@ -139,9 +140,9 @@ def test_fingertips_are_seen_one_timestep_late():
     mujoco.mj_step(env.model, data)
     physics = jax.tree.map(jnp.asarray, env._rest).replace(qpos=jnp.float32(data.qpos), qvel=jnp.float32(data.qvel))
     want = np.concatenate([data.site(name).xpos for name in hand.TIPS])  # of the state before the step
-    np.testing.assert_allclose(env.achieved(physics), want, atol=1e-6)
-    np.testing.assert_allclose(env.observe(physics)[48:], want, atol=1e-6)
-    goals = np.array(jax.vmap(env.sample_goal)(jax.random.split(jax.random.key(0), 2000))).reshape(-1, 5, 3)
+    np.testing.assert_allclose(jax.jit(env.achieved)(physics), want, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(env.observe)(physics)[48:], want, atol=1e-6)
+    goals = np.array(jax.jit(jax.vmap(env.sample_goal))(jax.random.split(jax.random.key(0), 2000))).reshape(-1, 5, 3)
     moved = np.linalg.norm(goals - env.goal.first, axis=-1) > 1e-6
     stays = ~moved.any(axis=1)
     assert abs(stays.mean() - 0.1) < 0.03

@@ -1,5 +1,6 @@
 """The published methods, beside numbers by hand."""
 
+import functools
 import itertools
 import math
 
@@ -19,12 +20,14 @@ from probes import Clock
 
 HP = HParams()
 REWARD = Clock().compute_reward  # 0 within 0.1, else -1
+reward_of = jax.jit(REWARD)
 
 
 def episode_of(achieved, desired=None):
-    achieved = jnp.asarray(achieved, jnp.float32)
-    desired = jnp.zeros(achieved.shape[1]) if desired is None else jnp.asarray(desired, jnp.float32)
-    return Episode(achieved, achieved, desired, jnp.zeros((len(achieved) - 1, 2))).filled()
+    achieved = np.asarray(achieved, np.float32)
+    desired = np.asarray(np.zeros(achieved.shape[1]) if desired is None else desired, np.float32)
+    actions = np.zeros((len(achieved) - 1, 2), np.float32)
+    return jax.tree.map(jnp.asarray, Episode(achieved, achieved, desired, actions)).filled()
 
 
 def test_next_future_mixes_in_the_future_of_a_short_episode():
@@ -112,8 +115,18 @@ def test_diversity_is_a_sum_of_determinants():
 
 def ring_with(paths, rows=None):
     each = [episode_of(path) for path in paths]
-    ring = replay.init(each[0], rows or len(each))
-    return replay.add(ring, jax.tree.map(lambda *x: jnp.stack(x), *each))
+    return in_ring(jax.tree.map(lambda *x: np.stack(x), *each), rows or len(each))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def in_ring(episodes, rows):
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), rows), episodes)
+
+
+def chosen(priority, seed, sample, batch, number, context):
+    """What `priorities.choose` takes, compiled."""
+    choose = jax.jit(lambda key, *data: priorities.choose(priority, key, *data, number, context))
+    return choose(jax.random.key(seed), sample, batch)[1]
 
 
 def test_max_entropy_ranks_rare_episodes_above_common_ones():
@@ -136,21 +149,22 @@ def test_a_mixture_of_one_cluster_is_its_gaussian():
 
 def candidates(desired, achieved_before, number, hindsight=True):
     """`number` * 4 transitions with goals `desired` on a line; the achieved goal before each is `achieved_before`."""
-    desired = jnp.stack([jnp.asarray(desired, jnp.float32), jnp.zeros(len(desired))], axis=-1)
-    before = jnp.stack([jnp.asarray(achieved_before, jnp.float32), jnp.zeros(len(desired))], axis=-1)
-    path = jnp.stack([before, before], axis=1)
-    own = desired + 7.0 if hindsight else desired
-    zeros = jnp.zeros(len(desired), jnp.int32)
-    ones = jnp.ones_like(zeros)
-    sample = Sample(before, before, before, path, own, zeros, zeros, ones, zeros > 0)
-    return sample, Batch(before, before, desired, before, REWARD(before, desired), jnp.full(len(desired), HP.gamma), zeros)
+    desired = np.stack([desired, np.zeros(len(desired))], axis=-1).astype(np.float32)
+    before = np.stack([achieved_before, np.zeros(len(desired))], axis=-1).astype(np.float32)
+    path = np.stack([before, before], axis=1)
+    own = desired + np.float32(7.0) if hindsight else desired
+    zeros = np.zeros(len(desired), np.int32)
+    sample = Sample(before, before, before, path, own, zeros, zeros, zeros + 1, zeros > 0)
+    discounts = np.full(len(desired), HP.gamma, np.float32)
+    batch = Batch(before, before, desired, before, np.asarray(reward_of(before, desired)), discounts, zeros)
+    return jax.tree.map(jnp.asarray, (sample, batch))
 
 
 @pytest.mark.slow
 def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
     sample, batch = candidates([0.0, 0.05, 0.5, 0.05] * 50, [0.0] * 200, 50)
     np.testing.assert_array_equal(transitions.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
-    _, kept = priorities.choose(transitions.not_misleading, jax.random.key(0), sample, batch, 50, CONTEXT)
+    kept = chosen(transitions.not_misleading, 0, sample, batch, 50, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
     own, as_it_is = candidates([0.0] * 4, [0.0] * 4, 1, hindsight=False)
     np.testing.assert_array_equal(transitions.not_misled(own, as_it_is, CONTEXT), 1)
@@ -158,7 +172,7 @@ def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
 
 def test_where_all_candidates_are_misleading_any_is_kept():
     sample, batch = candidates([0.0, 0.01, 0.02, 0.03] * 200, [0.0] * 800, 200)
-    _, kept = priorities.choose(transitions.not_misleading, jax.random.key(0), sample, batch, 200, CONTEXT)
+    kept = chosen(transitions.not_misleading, 0, sample, batch, 200, CONTEXT)
     assert len(np.unique(kept.desired_goal[:, 0])) == 4
 
 
@@ -172,17 +186,17 @@ def test_errors_of_one_step_by_hand():
 
 def test_td_error_ranks_episodes_and_transitions():
     ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]], rows=3)
-    renewed = priorities.renew(priorities.td_error, ring, CONTEXT)
+    renewed = jax.jit(lambda ring: priorities.renew(priorities.td_error, ring, CONTEXT))(ring)
     np.testing.assert_allclose(renewed.priority, [0.5 * 0.02, 1 - 5 * 0.02, 0.0], atol=1e-5)
     sample, batch = candidates([0.0, 0.0, 0.0, 0.5] * 100, [0.0] * 400, 100)  # an error of 0, three times, and 0.9
-    _, kept = priorities.choose(priorities.td_error, jax.random.key(1), sample, batch, 100, CONTEXT)
+    kept = chosen(priorities.td_error, 1, sample, batch, 100, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
 
 
 def test_weights_are_kept_in_proportion():
     choose = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
     sample, batch = candidates([1.0, 2.0, 0.0, 5.0] * 4000, [0.0] * 16000, 4000)
-    indices = choose(jax.random.key(0), sample, batch, 4000, CONTEXT)
+    indices = jax.jit(lambda key, *data: choose(key, *data, 4000, CONTEXT))(jax.random.key(0), sample, batch)
     found = np.bincount(np.asarray(indices) % 4, minlength=4)
     expected = 4000 * np.array([1, 2, 5]) / 8
     assert found[2] == 0
@@ -194,7 +208,7 @@ def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
     sample, batch = candidates([0.0, 0.0, 0.0, 1.0] * 2000, [0.5] * 8000, 2000)
     half = CONTEXT._replace(hparams=HP._replace(priority_fraction=0.5))
     by_last = priorities.Priority(choose=priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0]))
-    _, kept = priorities.choose(by_last, jax.random.key(0), sample, batch, 2000, half)
+    kept = chosen(by_last, 0, sample, batch, 2000, half)
     assert abs(float(kept.desired_goal[:, 0].mean()) - 0.5) < 0.05
 
 
@@ -282,10 +296,13 @@ def test_archer_multiplies_the_reward_of_replaced_goals_alone():
     own, as_it_is = candidates([0.5, 0.0], [0.0, 0.0], 1, hindsight=False)
     np.testing.assert_array_equal(relabel.hindsight_factor(own, as_it_is, HP._replace(hindsight_reward=0.5)), [1.0, 1.0])
     ring = ring_with([[[0.0, 0], [0.5, 0], [1.0, 0]]])
-    cumulative = replay.cumulative(ring)
-    arguments = ring, jax.random.key(0), (64,), samplers.make("future")
-    whole = relabel.draw_batches(*arguments, Context(REWARD, HP), cumulative)
-    half = relabel.draw_batches(*arguments, Context(REWARD, HP._replace(hindsight_reward=0.5)), cumulative)
+
+    @jax.jit
+    def draw(ring, factor):
+        context, key = Context(REWARD, HP._replace(hindsight_reward=factor)), jax.random.key(0)
+        return relabel.draw_batches(ring, key, (64,), samplers.make("future"), context, replay.cumulative(ring))
+
+    whole, half = draw(ring, 1.0), draw(ring, 0.5)
     replaced = np.any(np.asarray(whole.desired_goal) != 0, axis=-1)
     np.testing.assert_array_equal(half.reward, np.where(replaced, 0.5, 1.0) * whole.reward)
     assert set(np.unique(half.reward)) == {-1.0, -0.5, 0.0}

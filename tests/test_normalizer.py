@@ -4,13 +4,15 @@ import numpy as np
 
 from mjx_dher import normalizer
 
+update = jax.jit(normalizer.update)
+
 
 def test_moments_are_those_of_all_values():
     rng = np.random.default_rng(0)
     batches = [rng.normal([1.3, -50, 0], [0.05, 2, 0], (n, 5, 3)).astype(np.float32) for n in (1, 7, 100, 3)]
     state = normalizer.init(jnp.zeros(3))
     for batch in batches:
-        state = normalizer.update(state, jnp.asarray(batch), 200.0)
+        state = update(state, jnp.asarray(batch), 200.0)
     values = np.concatenate(batches).reshape(-1, 3).astype(np.float64)
     assert state.count == len(values)
     np.testing.assert_allclose(state.mean, values.mean(0), rtol=1e-5, atol=1e-6)
@@ -23,7 +25,7 @@ def test_no_cancellation_after_many_batches():
     batch = jnp.asarray(rng.normal(100.0, 0.01, (1000, 1)), jnp.float32)
     state = normalizer.init(jnp.zeros(1)).replace(count=jnp.array(1e7), mean=jnp.array([100.0]), var=jnp.array([1e-4]))
     for _ in range(50):
-        state = normalizer.update(state, batch, 200.0)
+        state = update(state, batch, 200.0)
     np.testing.assert_allclose(state.var, [1e-4], rtol=0.02)
 
 
@@ -37,7 +39,7 @@ def test_normalize_by_hand():
 
 
 def test_values_are_clipped_before_they_count():
-    state = normalizer.update(normalizer.init(jnp.zeros(1)), jnp.array([[1e9], [0.0]]), 200.0)
+    state = update(normalizer.init(jnp.zeros(1)), jnp.array([[1e9], [0.0]]), 200.0)
     np.testing.assert_allclose(state.mean, [100.0])
 
 
@@ -50,10 +52,10 @@ def test_nothing_seen_is_the_identity():
 def test_only_valid_values_are_seen():
     values = jnp.array([[1.0, 2.0], [jnp.nan, 5.0], [3.0, 8.0]])
     valid = jnp.array([True, False, True])
-    state = normalizer.update(normalizer.init(jnp.zeros(2)), values, 200.0, valid)
-    expected = normalizer.update(normalizer.init(jnp.zeros(2)), values[valid], 200.0)
+    state = update(normalizer.init(jnp.zeros(2)), values, 200.0, valid)
+    expected = update(normalizer.init(jnp.zeros(2)), values[valid], 200.0)
     jax.tree.map(np.testing.assert_array_equal, state, expected)
-    jax.tree.map(np.testing.assert_array_equal, normalizer.update(state, values, 200.0, jnp.zeros(3, bool)), state)
+    jax.tree.map(np.testing.assert_array_equal, update(state, values, 200.0, jnp.zeros(3, bool)), state)
 
 
 def test_a_tree_is_normalized_leaf_by_leaf():
@@ -66,13 +68,13 @@ def test_a_tree_is_normalized_leaf_by_leaf():
     }
     valid = jnp.arange(20).reshape(4, 5) % 3 > 0
     state = normalizer.init(jax.tree.map(lambda x: x[0, 0], values))
-    state = normalizer.update(state, values, 200.0, valid)
+    state = update(state, values, 200.0, valid)
     assert state["image"] is None
     for leaf, moments in ((values["vector"], state["vector"]), (values["field"][0], state["field"][0])):
         flat = np.asarray(leaf).reshape(20, -1)[valid.reshape(-1)]
         np.testing.assert_allclose(moments.mean.reshape(-1), flat.mean(0), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(moments.var.reshape(-1), flat.var(0), rtol=1e-5)
-    rows = normalizer.update(normalizer.init(jnp.zeros(3)), values["vector"], 200.0, jnp.array([True, False, True, True]))
+    rows = update(normalizer.init(jnp.zeros(3)), values["vector"], 200.0, jnp.array([True, False, True, True]))
     assert float(rows.count) == 15
     result = normalizer.normalize(state, values, 0.01, 5.0, 200.0)
     assert result["image"].dtype == jnp.uint8

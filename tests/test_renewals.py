@@ -1,6 +1,7 @@
 """What is renewed of a ring's priorities at a cycle."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -21,9 +22,17 @@ CONTEXT = Context(ENV.compute_reward, HParams())
 BY_CYCLE = Priority(renew=lambda ring, context: jnp.full(ring.priority.shape, 1.0 + context.progress), by_part=True)
 
 
+random_episodes = functools.cache(lambda: testing.trial.random_episodes(ENV))
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def first_of(played, number, rows):
+    some = jax.tree.map(lambda x: x[:number], played)
+    return replay.add(replay.init(jax.tree.map(lambda x: x[0], some), rows), some, jnp.arange(1.0, number + 1))
+
+
 def ring_of(number, rows):
-    played = jax.tree.map(lambda x: x[:number], testing.trial.random_episodes(ENV))
-    return replay.add(replay.init(jax.tree.map(lambda x: x[0], played), rows), played, jnp.arange(1.0, number + 1))
+    return first_of(random_episodes(), number, rows)
 
 
 def test_the_newest_rows_come_first_and_the_others_are_of_the_whole_ring():

@@ -10,18 +10,22 @@ from mjx_dher import replay
 from mjx_dher.types import Episode
 
 T = 4
+# Compiled as a whole. Tests of errors call them uncompiled, because only then do they see the values.
+add, cumulative_of = jax.jit(replay.add), jax.jit(replay.cumulative)
+sample_of, rows_of = jax.jit(replay.sample, static_argnums=2), jax.jit(replay.draw_rows, static_argnums=2)
 
 
 def make_episodes(ids, num_steps=T):
     """Episodes in which every number says whose it is: episode id x 1000 + step (the goal: id x 1000 + 500)."""
-    base = jnp.asarray(ids, jnp.float32)[:, None, None] * 1000
-    steps = base + jnp.arange(num_steps + 1, dtype=jnp.float32)[None, :, None]
-    return Episode(
-        observation={"vector": jnp.tile(steps, (1, 1, 3)), "scalar": steps[..., 0]},
-        achieved_goal=jnp.tile(steps, (1, 1, 2)),
-        desired_goal=jnp.tile(base[:, 0] + 500, (1, 2)),
+    base = np.asarray(ids, np.float32)[:, None, None] * 1000
+    steps = base + np.arange(num_steps + 1, dtype=np.float32)[None, :, None]
+    episodes = Episode(
+        observation={"vector": np.tile(steps, (1, 1, 3)), "scalar": steps[..., 0]},
+        achieved_goal=np.tile(steps, (1, 1, 2)),
+        desired_goal=np.tile(base[:, 0] + 500, (1, 2)),
         action=steps[:, :-1],
-    ).filled()
+    )
+    return jax.tree.map(jnp.asarray, episodes).filled()
 
 
 def make_ring(num_rows):
@@ -31,7 +35,6 @@ def make_ring(num_rows):
 @pytest.mark.parametrize(("num_rows", "num_new"), [(1, 1), (3, 2), (3, 3), (8, 5)])
 def test_wrap_around_never_mixes_episodes(num_rows, num_new):
     ring, added = make_ring(num_rows), 0
-    add = jax.jit(replay.add)
     for _ in range(7):
         ring = add(ring, make_episodes(np.arange(added, added + num_new)))
         added += num_new
@@ -47,8 +50,8 @@ def test_wrap_around_never_mixes_episodes(num_rows, num_new):
 
 
 def test_samples_are_transitions_of_one_episode_and_cover_all():
-    ring = replay.add(make_ring(6), make_episodes([1, 2, 3]))  # half full: the empty rows must not be drawn
-    sample = replay.sample(ring, jax.random.key(0), 4000)
+    ring = add(make_ring(6), make_episodes([1, 2, 3]))  # half full: the empty rows must not be drawn
+    sample = sample_of(ring, jax.random.key(0), 4000)
     ids = np.asarray(sample.desired_goal[:, 0] - 500)
     step = np.asarray(sample.step)
     np.testing.assert_array_equal(sample.observation["vector"][:, 2], ids + step)
@@ -99,12 +102,12 @@ def test_short_episodes_need_a_ring_for_them():
 
 
 def test_draw_rows_mixes_by_priority_and_uniform():
-    ring = replay.add(make_ring(6), make_episodes([0, 1, 2, 3]), jnp.array([0.0, 1.0, 0.0, 1.0]))
-    cumulative = replay.cumulative(ring)
+    ring = add(make_ring(6), make_episodes([0, 1, 2, 3]), jnp.array([0.0, 1.0, 0.0, 1.0]))
+    cumulative = cumulative_of(ring)
     np.testing.assert_array_equal(cumulative.priority, np.array([0, 1, 1, 2, 2, 2]) << 28)
 
     def shares(ring, share):
-        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, share, replay.cumulative(ring))
+        rows = rows_of(ring, jax.random.key(0), 40_000, share, cumulative_of(ring))
         return np.bincount(rows, minlength=6) / 40_000
 
     # Rows 1 and 3 have a priority; rows 4 and 5 are empty.
@@ -112,17 +115,17 @@ def test_draw_rows_mixes_by_priority_and_uniform():
     np.testing.assert_allclose(shares(ring, 1.0), [0, 0.5, 0, 0.5, 0, 0], atol=0.01)
     np.testing.assert_allclose(shares(ring, 0.6), [0.1, 0.4, 0.1, 0.4, 0, 0], atol=0.01)
     # What is written over has its new priority, and without any priority all are drawn alike.
-    ring = replay.add(ring, make_episodes([4, 5, 6, 7]), 0.0)
+    ring = add(ring, make_episodes([4, 5, 6, 7]), 0.0)
     np.testing.assert_allclose(shares(ring, 1.0), [0, 0, 0, 1, 0, 0], atol=0.01)
-    ring = replay.add(ring, make_episodes([8, 9]), 0.0)
+    ring = add(ring, make_episodes([8, 9]), 0.0)
     np.testing.assert_allclose(shares(ring, 1.0), np.full(6, 1 / 6), atol=0.01)
 
 
 def test_rows_are_drawn_in_proportion_to_any_weights():
     """Weights of very different sizes; 1e-30 and 0 are never drawn beside 1e30."""
     for weights in ([3.0, 1.0, 0.0, 6.0], [3e-30, 1e-30, 0.0, 6e-30], [0.0, 1e-30, 0.0, 1e30]):
-        ring = replay.add(make_ring(4), make_episodes([0, 1, 2, 3]), jnp.array(weights))
-        rows = replay.draw_rows(ring, jax.random.key(0), 40_000, 1.0, replay.cumulative(ring))
+        ring = add(make_ring(4), make_episodes([0, 1, 2, 3]), jnp.array(weights))
+        rows = rows_of(ring, jax.random.key(0), 40_000, 1.0, cumulative_of(ring))
         expected = np.array(weights) / sum(weights)
         np.testing.assert_allclose(np.bincount(rows, minlength=4) / 40_000, expected, atol=0.01)
         assert not np.any((np.array(weights) == 0)[rows])
@@ -133,22 +136,22 @@ def test_cumulative_priorities_are_exact_and_never_fall():
     rng = np.random.default_rng(0)
     for weights in (rng.integers(0, 2, 3000), rng.exponential(size=3000), rng.exponential(size=3000) ** 8):
         ring = make_ring(3000).replace(priority=jnp.asarray(weights, jnp.float32))
-        cumulative = np.asarray(replay.cumulative(ring).priority, np.int64)
+        cumulative = np.asarray(cumulative_of(ring).priority, np.int64)
         assert np.all(np.diff(cumulative) >= 0)
         assert 2**29 - 3000 <= cumulative[-1] <= 2**30 + 3000
         np.testing.assert_allclose(cumulative / cumulative[-1], np.cumsum(weights) / np.sum(weights), atol=1e-5)
 
 
 def test_sample_takes_the_rows_it_is_given():
-    ring = replay.add(make_ring(6), make_episodes([1, 2, 3]))
-    sample = replay.sample(ring, jax.random.key(0), 4, jnp.array([2, 0, 2, 1]))
+    ring = add(make_ring(6), make_episodes([1, 2, 3]))
+    sample = sample_of(ring, jax.random.key(0), 4, jnp.array([2, 0, 2, 1]))
     np.testing.assert_array_equal(sample.desired_goal[:, 0], [3500, 1500, 3500, 2500])
 
 
 def test_only_valid_episodes_are_written():
     """The others leave the ring as if they had never been: rows, cursor and size, over the wrap-around too."""
     four = make_episodes([10, 11, 12, 13])
-    ring = jax.jit(replay.add)(ring_of_two(), four, jnp.array([1.0, 0.0, 2.0, 3.0]), jnp.array([False, True, False, True]))
+    ring = add(ring_of_two(), four, jnp.array([1.0, 0.0, 2.0, 3.0]), jnp.array([False, True, False, True]))
     expected = replay.add(ring_of_two(), make_episodes([11, 13]), jnp.array([0.0, 3.0]))
     jax.tree.map(np.testing.assert_array_equal, ring, expected)
     ring = replay.add(ring, make_episodes([14, 15]), 1.0, jnp.array([False, True]))

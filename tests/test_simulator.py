@@ -81,7 +81,8 @@ def test_a_scan_of_a_batch_is_a_loop_over_mj_step(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     sim = Simulator(model, derived=["xpos", "sensordata"], substeps=3, num_threads=2)
     controls = jax.random.uniform(jax.random.key(0), (20, 4, model.nu), minval=-1, maxval=1)
-    first = jax.vmap(lambda x: sim.make_data().replace(qvel=x * jnp.ones(model.nv)))(jnp.linspace(-0.5, 0.5, 4))
+    data = sim.make_data()
+    first = jax.jit(jax.vmap(lambda x: data.replace(qvel=x * jnp.ones(model.nv))))(jnp.linspace(-0.5, 0.5, 4))
 
     def step(data, ctrl):
         data = jax.vmap(sim.step)(data, ctrl)
@@ -192,7 +193,7 @@ def test_step_and_advance_are_the_same_physics():
     """Alternately, so that neither leaves anything behind for the other."""
     env = make("push", engine="native")
     sim = Simulator(env.model, derived=["xpos"], substeps=20)
-    physics = env.reset(jax.random.key(0)).physics
+    physics = jax.jit(env.reset)(jax.random.key(0)).physics
     data = sim.make_data().replace(qpos=physics.qpos, qvel=physics.qvel, mocap_pos=jnp.array([[1.3, 0.7, 0.5]]))
     controls = Controls(ctrl=data.ctrl, mocap=jnp.concatenate([data.mocap_pos, data.mocap_quat], axis=1))
     pushed = data.replace(xfrc_applied=data.xfrc_applied + 1.0)
