@@ -43,7 +43,7 @@ def test_episodes_of_a_loop_of_one_s_own(capsys):
     ours = own_episodes.play(jax.random.key(0))
     key, env = jax.random.key(0), own_episodes.env
     actions = jax.random.uniform(key, (env.episode_length, 16, 2), minval=-1, maxval=1)
-    theirs, _ = rollout(env, lambda action, obs: action, key, 16, actions)
+    theirs, _ = jax.jit(lambda key, actions: rollout(env, lambda action, obs: action, key, 16, actions))(key, actions)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -84,7 +84,8 @@ def test_what_the_extensions_declare():
     for dense, highest in ((False, 1.0), (True, 5.0)):
         env = trap.Trap(dense=dense)
         actions = jax.random.uniform(jax.random.key(1), (env.episode_length, 64, 2), minval=-1, maxval=1)
-        episodes, outcome = rollout(env, lambda action, obs: action, jax.random.key(0), 64, actions)
+        play = jax.jit(lambda key, actions, env=env: rollout(env, lambda action, obs: action, key, 64, actions))
+        episodes, outcome = play(jax.random.key(0), actions)
         last = np.take_along_axis(np.array(episodes.observation), np.array(episodes.length)[:, None, None], axis=1)[:, 0]
         np.testing.assert_array_equal(episodes.terminal, np.linalg.norm(last, axis=-1) < trap.TRAP)
         assert 0 < episodes.terminal.sum() < 64

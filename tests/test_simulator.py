@@ -81,8 +81,7 @@ def test_a_scan_of_a_batch_is_a_loop_over_mj_step(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     sim = Simulator(model, derived=["xpos", "sensordata"], substeps=3, num_threads=2)
     controls = jax.random.uniform(jax.random.key(0), (20, 4, model.nu), minval=-1, maxval=1)
-    data = sim.make_data()
-    first = jax.jit(jax.vmap(lambda x: data.replace(qvel=x * jnp.ones(model.nv))))(jnp.linspace(-0.5, 0.5, 4))
+    first = jax.jit(jax.vmap(lambda x: sim.make_data().replace(qvel=x * jnp.ones(model.nv))))(jnp.linspace(-0.5, 0.5, 4))
 
     def step(data, ctrl):
         data = jax.vmap(sim.step)(data, ctrl)

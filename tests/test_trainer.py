@@ -2,6 +2,7 @@ import dataclasses
 import functools
 import itertools
 
+import configs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from configs import SMALL
 from conftest import refuses
 
-from mjx_dher import Config, HParams, learners, make_train, relabel, replay, samplers, trainer
+from mjx_dher import HParams, learners, make_train, relabel, replay, samplers, trainer
 from mjx_dher.contract import env_spec
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.program import loop
@@ -18,29 +19,26 @@ from probes import Explodes, PointMass, Walk
 
 ENV = PointMass()
 DTYPES = ("float32", "bfloat16")
-LEARNS = Config(
-    num_envs=16,
-    cycles_per_epoch=10,
-    updates_per_cycle=20,
-    target_period=1,
-    batch_size=128,
-    replay_size=20_000,
-    hidden_sizes=(64, 64),
-    eval_episodes=200,
-    total_steps=32_000,  # 20 epochs
-)
+LEARNS = dataclasses.replace(configs.LEARNS, total_steps=16_000)  # 20 epochs
+
+
+def made(env=ENV, config=SMALL):
+    """A training loop whose `init` is compiled."""
+    program = make_train(env, config)
+    return program._replace(init=jax.jit(program.init))
 
 
 @pytest.fixture(scope="module")
 def program():
     """The training loop of SMALL, and its epoch, compiled once."""
-    program = make_train(ENV, SMALL)
+    program = made()
     return program, jax.jit(program.epoch)
 
 
 def test_rollout_keeps_every_observation():
     actions = jax.random.uniform(jax.random.key(1), (10, 3, 2), minval=-1, maxval=1)
-    episodes, outcome = rollout(ENV, lambda action, obs: action, jax.random.key(0), 3, actions)
+    play = jax.jit(lambda key, actions: rollout(ENV, lambda action, obs: action, key, 3, actions))
+    episodes, outcome = play(jax.random.key(0), actions)
     np.testing.assert_array_equal(episodes.action, jnp.moveaxis(actions, 0, 1))
     assert episodes.observation.shape == (3, 11, 2)
     assert episodes.action.shape == (3, 10, 2)
@@ -111,7 +109,7 @@ def test_an_epoch_counts_what_it_does(program):
 def test_episodes_that_blow_up_leave_no_trace(value):
     """A quarter of all starts ends in NaN, Inf or a `failed` state: counted exactly, in no ring, in no normalizer."""
     env = Explodes(value)
-    program = make_train(env, dataclasses.replace(SMALL, num_envs=8, cycles_per_epoch=1, replay_size=1000))
+    program = made(env, dataclasses.replace(SMALL, num_envs=8, cycles_per_epoch=1, replay_size=1000))
     first = program.init(jax.random.key(0), HParams())
     state, metrics = jax.jit(program.epoch)(first)
     kept = int(state.replay.size)
@@ -129,14 +127,15 @@ def test_an_episode_with_a_failure_that_the_environment_forgets_is_discarded():
         def step(self, state, action):
             return super().step(dataclasses.replace(state, failed=jnp.zeros((), bool)), action)
 
-    episodes, outcome = rollout(Forgets(None), lambda _, obs: jnp.zeros((16, 2)), jax.random.key(0), 16)
+    play = jax.jit(lambda key: rollout(Forgets(None), lambda _, obs: jnp.zeros((16, 2)), key, 16))
+    episodes, outcome = play(jax.random.key(0))
     breaks = episodes.achieved_goal[:, 0, 0] > Explodes.EDGE
     assert 0 < breaks.sum() < 16
     np.testing.assert_array_equal(outcome.valid, ~breaks)
 
 
 def test_without_any_valid_episode_nothing_is_learned():
-    program = make_train(Explodes(jnp.nan, edge=-1.0), SMALL)
+    program = made(Explodes(jnp.nan, edge=-1.0))
     first = program.init(jax.random.key(0), HParams())
     state, metrics = jax.jit(program.epoch)(first)
     assert metrics["discarded_episodes"] == 4 * 3
@@ -195,7 +194,7 @@ def test_hparams_are_traced_one_compilation_serves_all(program):
 
 @pytest.fixture(scope="module")
 def learn():
-    """Trains the point mass for so many epochs, of 1,600 steps, and yields each Progress; compiled once for each dtype."""
+    """Trains the point mass for so many epochs, of 800 steps, and yields each Progress; compiled once for each dtype."""
 
     @functools.cache
     def compiled(dtype):
@@ -217,7 +216,7 @@ def test_training_solves_the_point_mass(dtype, learn):
     records = list(learn(HParams(polyak=0.98, gamma=0.9), 10, dtype))
     curve = [record.metrics["success_rate"] for record in records]
     assert [record.epoch for record in records] == list(range(1, 11))
-    assert records[-1].env_steps == 16_000
+    assert records[-1].env_steps == 8_000
     assert curve[-1] >= 0.95
     assert records[-1].metrics["reset_success_rate"] < 0.2  # it was not solved from the start
     # The shortest way takes up to distance / 0.1 steps of -1; a policy that has learned comes close to it.
@@ -331,7 +330,7 @@ def test_a_run_ends_with_the_step_sizes_at_their_end(learn):
 
 def test_normalizers_leave_out_what_follows_an_early_end():
     env = Walk()
-    train = make_train(env, dataclasses.replace(SMALL, num_envs=16, replay_size=100_000))
+    train = made(env, dataclasses.replace(SMALL, num_envs=16, replay_size=100_000))
     state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
     episodes, number = jax.device_get(state.replay.episodes), int(state.replay.size)
     assert set(episodes.length[:number].tolist()) > {env.episode_length}
