@@ -12,6 +12,7 @@ from mjx_dher import samplers
 from mjx_dher.learners import ddpg
 from mjx_dher.networks import mlp
 from point_mass import PointMass
+from probes import Least
 
 # Samplers: log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1].
 
@@ -197,53 +198,49 @@ PRIORITY = {
     "other_arguments": r"priority must be a function \(episode, context\)",
 }
 
-# Learners: make(config, spec, networks) -> Learner. Each is DDPG but for one method.
+# Learners: make(config, spec, networks) -> Learner. Each is `Least`, or the last one DDPG, but for one method.
 
 
 def _but(**methods):
-    def make(config, spec, networks):
-        learner = ddpg.make(config, spec, networks)
-        kind = type("Own", (ddpg.DDPG,), methods)
-        return kind(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
-
-    return make
+    return lambda config, spec, networks: type("Own", (Least,), methods)()
 
 
-_DDPG = ddpg.DDPG
-# It has its own `explore`: that of DDPG would not come to an end.
-keeps_axis = _but(
-    act=lambda self, state, obs, hparams: _DDPG.act(self, state, obs, hparams)[..., None],
-    explore=lambda self, state, obs, noise, hparams: _DDPG.act(self, state, obs, hparams)[..., None],
-)
-unbounded = _but(act=lambda self, state, obs, hparams: 10.0 + _DDPG.act(self, state, obs, hparams))
-forgets = _but(update=lambda self, state, batch, hparams: (state, _DDPG.update(self, state, batch, hparams)[1]))
-loses = _but(update=lambda self, state, batch, hparams: _DDPG.update(self, state, batch, hparams)[0])
-halves = _but(
-    update_target=lambda self, state, hparams: state.replace(target=jax.tree.map(lambda x: x.astype("float16"), state.params))
-)
+keeps_axis = _but(act=lambda self, state, obs, hparams: Least.act(self, state, obs, hparams)[..., None])
+unbounded = _but(act=lambda self, state, obs, hparams: 10.0 + Least.act(self, state, obs, hparams))
+forgets = _but(update=lambda self, state, batch, hparams: (state, Least.update(self, state, batch, hparams)[1]))
+loses = _but(update=lambda self, state, batch, hparams: Least.update(self, state, batch, hparams)[0])
+halves = _but(update_target=lambda self, state, hparams: jax.tree.map(lambda x: x.astype("float16"), state))
 losses_of_each = _but(
     update=lambda self, state, batch, hparams: (
-        _DDPG.update(self, state, batch, hparams)[0],
+        Least.update(self, state, batch, hparams)[0],
         {"critic_loss": jnp.zeros(batch.reward.shape)},
     )
 )
 breaks = _but(
     update=lambda self, state, batch, hparams: (
-        state.replace(params=jax.tree.map(lambda x: x / 0, state.params)),
-        _DDPG.update(self, state, batch, hparams)[1],
+        jax.tree.map(lambda x: x / 0, state),
+        Least.update(self, state, batch, hparams)[1],
     )
 )
 noise_by_env = _but(
     noise=lambda self, key, num_steps, num_envs, hparams: jax.tree.map(
-        lambda x: jnp.moveaxis(x, 0, 1), _DDPG.noise(self, key, num_steps, num_envs, hparams)
+        lambda x: jnp.moveaxis(x, 0, 1), Least.noise(self, key, num_steps, num_envs, hparams)
     )
 )
-exports_a_dict = _but(export=lambda self, state, hparams: {"params": state.params})
-exports_another = _but(
-    export=lambda self, state, hparams: _DDPG.export(
-        self, state.replace(params=jax.tree.map(lambda x: -x, state.params)), hparams
-    )
-)
+exports_a_dict = _but(export=lambda self, state, hparams: state)
+
+
+class _ExportsAnother(ddpg.DDPG):
+    def export(self, state, hparams):
+        return super().export(state.replace(params=jax.tree.map(lambda x: -x, state.params)), hparams)
+
+
+def exports_another(config, spec, networks):
+    learner = ddpg.make(config, spec, networks)
+    return _ExportsAnother(**{field.name: getattr(learner, field.name) for field in dataclasses.fields(learner)})
+
+
+least = _but()  # right
 
 
 def methodless(config, spec, networks):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from filelock import FileLock
 from flax import struct
 
+from mjx_dher.learners import Learner
 from mjx_dher.types import Array, Batch, EnvSpec
 from point_mass import PointMass, PointState
 
@@ -76,6 +77,22 @@ class Explodes(PointMass):
             failed = state.failed
             obs = obs | {"observation": jnp.where(step == 3, self.value, obs["observation"])}
         return ExplodingState(obs, following.reward, following.success, step, failed)
+
+
+class Least(Learner):
+    """A learner of one array, whose actions are the same everywhere. It is traced in a fraction of DDPG's time."""
+
+    def init(self, key):
+        return {"w": jnp.zeros(8)}
+
+    def act(self, state, obs, hparams):
+        return jnp.broadcast_to(jnp.tanh(state["w"][:2]), (*obs["observation"].shape[:-1], 2))
+
+    def explore(self, state, obs, noise, hparams):
+        return self.act(state, obs, hparams)
+
+    def update(self, state, batch, hparams):
+        return {"w": state["w"] + jnp.mean(batch.reward)}, {"q_mean": jnp.mean(batch.reward)}
 
 
 class LinearActor(nn.Module):

@@ -13,14 +13,13 @@ from conftest import refuses
 
 from mjx_dher import HParams, make_train, priorities, relabel, replay, samplers, testing, trainer
 from mjx_dher.context import Context
-from mjx_dher.contract import env_spec
 from mjx_dher.learners import RESERVED, ddpg
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import loggers
 from mjx_dher.runs.program.loop import Progress
 from mjx_dher.samplers import Sampler, future
 from point_mass import PointMass
-from probes import Walk
+from probes import Least, Walk
 
 ENV = PointMass()
 TRIAL = testing.trial.Trial(ENV)  # its episodes are played once
@@ -243,12 +242,11 @@ def test_a_policy_s_inputs_are_one_for_each_step():
         rollout(ENV, lambda inputs, obs: inputs["x"], jax.random.key(0), N, {"x": jnp.zeros((5, N, 2))})
 
 
-# Learners, in the loop: DDPG but for one method.
-DDPG = ddpg.DDPG
+# Learners, in the loop: `Least` but for one method.
 
 
 def updates(change):
-    return {"update": lambda self, state, batch, hparams: change(*DDPG.update(self, state, batch, hparams))}
+    return {"update": lambda self, state, batch, hparams: change(*Least.update(self, state, batch, hparams))}
 
 
 def half(tree):
@@ -275,13 +273,18 @@ LEARNERS = {  # methods, and what the error must name
 @pytest.mark.parametrize("name", LEARNERS)
 def test_what_a_learner_gives_is_checked(name):
     methods, parts = LEARNERS[name]
-    made = ddpg.make(SMALL, env_spec(ENV), trainer.learners.networks.mlp)
-    own = type("Own", (DDPG,), methods)(*(getattr(made, field.name) for field in dataclasses.fields(made)))
+    own = type("Own", (Least,), methods)()
     train = make_train(ENV, SMALL, learner=own)
     with refuses(*parts):
         trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
     with refuses(*parts, error=testing.ComponentError):
         testing.check_learner(lambda config, spec, networks: own, TRIAL, SMALL)
+
+
+def test_the_learner_without_a_mistake_passes():
+    train = make_train(ENV, SMALL, learner=Least())
+    trace(train.epoch, trace(train.init, jax.random.key(0), HParams()))
+    testing.check_learner(lambda config, spec, networks: Least(), TRIAL, SMALL)
 
 
 def test_a_sampler_is_checked_with_the_length_of_short_episodes():
@@ -308,9 +311,6 @@ def test_the_names_that_learners_may_not_use_are_those_of_the_log():
     assert set(logged) - losses | {"train_length_mean"} == RESERVED  # which only tasks that end early have
 
 
-# The checks themselves.
-
-
 @pytest.mark.slow
 def test_checks_take_episodes_of_one_step_and_observations_of_their_kind():
     one_step = PointMass(1)
@@ -327,11 +327,11 @@ def test_a_kernel_s_weights_and_a_priority_of_0_are_told():
 
 
 def test_what_is_to_be_left_out_is_left_out():
-    takes_all = lambda self, state, obs, goal, hparams, valid: DDPG.update_normalizers(self, state, obs, goal, hparams)  # noqa: E731
+    takes_all = lambda self, state, obs, goal, hparams, valid: ddpg.DDPG.update_normalizers(self, state, obs, goal, hparams)  # noqa: E731
 
     def make(config, spec, networks):
         made = ddpg.make(config, spec, networks)
-        kind = type("Own", (DDPG,), {"update_normalizers": takes_all})
+        kind = type("Own", (ddpg.DDPG,), {"update_normalizers": takes_all})
         return kind(*(getattr(made, field.name) for field in dataclasses.fields(made)))
 
     with refuses("learner.update_normalizers", "finite"):

@@ -228,7 +228,7 @@ def test_shapes_are_checked_where_a_function_is_handed_in(tmp_path, kind, name, 
     ],
 )
 def test_a_run_that_has_gone_bad_fails_and_says_why(tmp_path, env, parts, reason):
-    (result,), told = train(tmp_path, getattr(mistakes, env)() if env else ENV, **parts)
+    (result,), told = train(tmp_path, getattr(mistakes, env)() if env else ENV, **{"learner": "mistakes:least", **parts})
     assert (result.status, result.epoch) == ("failed", 1)
     assert reason in result.content["reason"]
     assert "success_rate" not in result.content
