@@ -14,9 +14,10 @@ from mjx_dher.learners import Learner, LearnerFn
 from mjx_dher.networks import NetworksFn
 from mjx_dher.policy import Policy
 from mjx_dher.relabel import relabel
+from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import future
 from mjx_dher.testing.trial import EPISODES, TOLERANCE, Trial, attempt, expect, expect_finite, run, trial_of
-from mjx_dher.types import Env, EnvSpec, Episode, PyTree
+from mjx_dher.types import Batch, Env, EnvSpec, Episode, PyTree
 
 BATCH = 8
 
@@ -53,8 +54,13 @@ def check_learner(
     numbers = trainer.as_arrays(hparams)
     state = attempt("learner.init", jax.jit(made.init), jax.random.key(0))
     expect_finite("the state that learner.init gives", state)
-    sample = replay.sample(trial.ring, jax.random.key(1), BATCH)
-    batch = relabel(sample, future, context.of_env(trial.env, numbers), jax.random.key(4)).batch
+
+    @jax.jit
+    def draw(ring: ReplayState) -> Batch:
+        sample = replay.sample(ring, jax.random.key(1), BATCH)
+        return relabel(sample, future, context.of_env(trial.env, numbers), jax.random.key(4)).batch
+
+    batch = draw(trial.ring)
     valid = jnp.arange(EPISODES) > 0
     hide = lambda x: x.at[0].set(jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x  # noqa: E731
     played = jax.tree.map(hide, episodes.observation), batch.desired_goal, numbers, valid
@@ -78,7 +84,10 @@ def _check_export(made: Learner, state: Any, obs: PyTree, hparams: HParams) -> N
     if policy is not None:
         what = f"learner.export must give a policy.Policy or None; it gives a {type(policy).__name__}"
         expect(isinstance(policy, Policy), what)
-        theirs, ours = attempt("the policy of learner.export", policy, obs), made.act(state, obs, trainer.as_arrays(hparams))
+        theirs, ours = (
+            attempt("the policy of learner.export", policy, obs),
+            jax.jit(made.act)(state, obs, trainer.as_arrays(hparams)),
+        )
         same = theirs.shape == ours.shape and bool(jnp.allclose(theirs, ours, atol=TOLERANCE))
         expect(same, "the policy of learner.export must act as learner.act does; it does not")
 
@@ -101,7 +110,7 @@ def _check_acting(made: Learner, state: Any, episodes: Episode, spec: EnvSpec, h
     _check_actions("explore", explored, (EPISODES, spec.action_size))
     action = run("learner.act", made.act, state, obs, hparams)
     _check_actions("act", action, (EPISODES, spec.action_size))
-    one = attempt("learner.act on one observation [D]", made.act, state, jax.tree.map(lambda x: x[0], obs), hparams)
+    one = attempt("learner.act on one observation [D]", jax.jit(made.act), state, jax.tree.map(lambda x: x[0], obs), hparams)
     _check_actions("act on one observation [D]", one, (spec.action_size,))
     alone = jnp.allclose(one, action[0], atol=TOLERANCE)
     expect(alone, "learner.act of a batch must be that of each of its observations; it depends on the others")

@@ -46,7 +46,7 @@ def expect_finite(what: str, value: Any) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
         if jnp.issubdtype(leaf.dtype, jnp.inexact):
             name = jax.tree_util.keystr(path) or "it"
-            expect(jnp.all(jnp.isfinite(leaf)), f"{what} must be finite; {name} is not")
+            expect(np.isfinite(np.asarray(leaf)).all(), f"{what} must be finite; {name} is not")
 
 
 def expect_range(what: str, values: NDArray) -> str:
@@ -104,7 +104,7 @@ class Trial:
         """Context of the run."""
         made = self.learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_spec(self.env))
         numbers = trainer.as_arrays(self.hparams)
-        values = learners.values_of(made, made.init(jax.random.key(0)), numbers) if hasattr(made, "value") else None
+        values = learners.values_of(made, jax.jit(made.init)(jax.random.key(0)), numbers) if hasattr(made, "value") else None
         return of_env(self.env, numbers, progress=jnp.float32(0.5), values=values)
 
     @functools.cached_property
@@ -115,7 +115,7 @@ class Trial:
     @functools.cached_property
     def ring(self) -> ReplayState:
         """Ring with the episodes, half of whose rows are empty."""
-        return replay.add(self.empty_ring, self.episodes)
+        return jax.jit(replay.add)(self.empty_ring, self.episodes)
 
 
 def trial_of(env: Env | Trial, hparams: HParams | None, learner: Learner | None) -> Trial:
