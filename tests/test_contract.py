@@ -27,7 +27,7 @@ def walk(request):
     env = Walk(T, request.param)
     steps = 0.4 * jax.random.normal(jax.random.key(0), (T, 300, 2))
     episodes, outcome = jax.jit(lambda: rollout(env, lambda step, obs: step, jax.random.key(1), 300, steps))()
-    ring = replay.add(replay.init(episode_template(env), 400, ends=True), episodes)
+    ring = jax.jit(replay.add)(replay.init(episode_template(env), 400, ends=True), episodes)
     return env, ring, jax.device_get(episodes), jax.device_get(outcome), np.asarray(steps)
 
 
@@ -117,7 +117,8 @@ def test_transitions_are_drawn_alike_or_in_proportion_to_priority(walk, fraction
     _, ring, episodes, _, _ = walk
     weight = np.arange(300) % 3
     ring = dataclasses.replace(ring, priority=jnp.zeros(400).at[:300].set(weight))
-    rows = np.asarray(replay.draw_rows(ring, jax.random.key(0), 200_000, fraction, replay.cumulative(ring)))
+    draw = jax.jit(lambda ring, key: replay.draw_rows(ring, key, 200_000, fraction, replay.cumulative(ring)))
+    rows = np.asarray(draw(ring, jax.random.key(0)))
     share = episodes.length * (weight if fraction else 1)
     counts, expected_counts = np.bincount(rows, minlength=400)[:300], 200_000 * share / share.sum()
     assert counts.sum() == 200_000
@@ -125,7 +126,8 @@ def test_transitions_are_drawn_alike_or_in_proportion_to_priority(walk, fraction
     assert counts[~used].sum() == 0
     chi2 = np.sum((counts[used] - expected_counts[used]) ** 2 / expected_counts[used])
     assert chi2 < used.sum() + 5 * math.sqrt(2 * used.sum())
-    steps = np.asarray(replay.sample(ring, jax.random.key(1), 200_000, jnp.asarray(rows)).step)
+    step_of = jax.jit(lambda ring, key, rows: replay.sample(ring, key, 200_000, rows).step)
+    steps = np.asarray(step_of(ring, jax.random.key(1), jnp.asarray(rows)))
     assert (steps < episodes.length[rows]).all()
 
 
@@ -135,7 +137,7 @@ def test_a_priority_does_not_see_the_padding(walk, name):
     env, _, episodes, _, _ = walk
     config = Config(hidden_sizes=(8,))
     learner = learners.make("ddpg", config, env_spec(env))
-    values = learners.values_of(learner, learner.init(jax.random.key(0)), HP)
+    values = learners.values_of(learner, jax.jit(learner.init)(jax.random.key(0)), HP)
     context = context_lib.of_env(env, HP, values=values)
     priority = priorities.whole(priorities.make(name))
     row = int(np.flatnonzero(episodes.length == 5)[0])
@@ -144,10 +146,11 @@ def test_a_priority_does_not_see_the_padding(walk, name):
         observation=whole.observation[:, :6], achieved_goal=whole.achieved_goal[:, :6], action=whole.action[:, :5]
     )
 
+    @jax.jit
     def weight(episode):
         one = replay.add(replay.init(jax.tree.map(lambda x: x[0], episode), 1, ends=True), episode)
         one = dataclasses.replace(one, priority=priorities.weights(priority, episode, context))
-        return float(priorities.renew(priority, one, context).priority[0])
+        return priorities.renew(priority, one, context).priority[0]
 
     np.testing.assert_allclose(weight(whole), weight(cut), rtol=1e-5)
 
@@ -157,7 +160,7 @@ def test_nothing_follows_a_terminal_transition(name):
     """With a discount of 0, an update does not depend on the next observation; with any other, it does."""
     config = Config(hidden_sizes=(8,), num_quantiles=3, dropped_quantiles=1)
     learner = learners.make(name, config, EnvSpec(jax.ShapeDtypeStruct((2,), jnp.float32), 2, 2, 5))
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     ones = jnp.ones((4, 2))
     numbers = jax.tree.map(jnp.float32, HP)
 
@@ -189,8 +192,9 @@ def test_values_are_known(kind, n_step):
     config = dataclasses.replace(configs.TINY, updates_per_cycle=400, n_step=n_step, **sizes)
     hparams = HParams(gamma=0.5, polyak=0.9, critic_lr=3e-3, her_k=1.0)
     train = make_train(env, config, sampler=samplers.make("future"))
-    state, metrics = jax.jit(train.epoch)(train.init(jax.random.key(0), hparams))
-    state, _ = jax.jit(train.epoch)(state)
+    epoch = jax.jit(train.epoch)
+    state, metrics = epoch(jax.jit(train.init)(jax.random.key(0), hparams))
+    state, _ = epoch(state)
     obs = {"observation": jnp.zeros((1, 1)), "achieved_goal": jnp.zeros((1, 1)), "desired_goal": jnp.full((1, 1), goal)}
     found = train.learner.value(state.learner, obs, jnp.zeros((1, 1)), hparams)
     np.testing.assert_allclose(found, [value], atol=0.08)

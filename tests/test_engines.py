@@ -48,11 +48,12 @@ def test_batching_is_vmap_in_any_nesting(name, engine):
 
 def test_native_is_a_plain_loop_over_mj_step(native, task):
     model, data = native.model, mujoco.MjData(native.model)
-    state, step = native.reset(jax.random.key(4)), task("push").step
+    state, step = task("push").reset(jax.random.key(4)), task("push").step
+    pose = jax.jit(native.arm.pose)
     for action in np.random.default_rng(0).uniform(-1, 1, (5, 4)).astype(np.float32):
         data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
         data.qacc_warmstart[:] = state.physics.warmstart
-        pos, quat = native.arm.pose(state.physics.qpos[native.arm.qpos])
+        pos, quat = pose(state.physics.qpos[native.arm.qpos])
         data.mocap_pos[0], data.mocap_quat[0] = pos + np.float32(0.05) * action[:3], quat + np.float32([1, 0, 1, 0])
         for _ in range(20):
             mujoco.mj_step(model, data)

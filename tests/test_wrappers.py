@@ -69,7 +69,7 @@ def test_a_wrapped_environment_is_one():
     """Pure, one structure, the same alone and in a batch, `with_goal`; and it starts and plays where the plain one does."""
     env = pickle.loads(pickle.dumps(envs.make("test_wrappers:Point", **ALL)))
     check_env(env)
-    first, plain = env.reset(KEY), Point().reset(KEY)
+    first, plain = jax.jit(env.reset)(KEY), jax.jit(Point().reset)(KEY)
     np.testing.assert_array_equal(first.obs["achieved_goal"], plain.obs["achieved_goal"])
     assert (env.dt, contract.step_seconds(env), hasattr(env, "with_object"), hasattr(first, "failed")) == (
         0.1,
@@ -78,7 +78,8 @@ def test_a_wrapped_environment_is_one():
         False,
     )
     keys = jax.random.split(KEY, 16)
-    episodes, outcome = rollout(env, lambda action, obs: action, keys, 16, jnp.broadcast_to(ACTIONS[:, None], (6, 16, 2)))
+    actions = jnp.broadcast_to(ACTIONS[:, None], (6, 16, 2))
+    episodes, outcome = jax.jit(lambda keys: rollout(env, lambda action, obs: action, keys, 16, actions))(keys)
     reward = env.compute_reward(episodes.achieved_goal[:, 1:], episodes.desired_goal[:, None])  # as hindsight computes it
     np.testing.assert_array_equal(reward.sum(-1), outcome.ret)
 
