@@ -165,15 +165,16 @@ def resets(task):
 # The modules that take longest, which start first, so that no worker is left with one of them at the end. Each runs in one
 # worker as a whole (--dist loadfile): its fixtures and what it compiles are made once.
 LONGEST = (
-    *("mistakes", "trainer", "own", "any_model", "identity", "wrong_calls", "sweep", "engines", "cli", "checkpoint"),
-    *("sweep_cli", "warp", "render", "driver", "ddpg", "claims", "relabel", "replay", "doctor", "demonstrations", "view_parts"),
+    *("contract", "identity", "trainer", "mistakes", "render", "cli", "wrong_calls", "actor_critic", "own", "packaging"),
+    *("sweep_cli", "pages", "curves", "driver", "docs", "promotion", "simulator", "commands", "splices", "renewals", "engines"),
 )
 
 
 def _share_contexts():
     """Lowers programs in a common MLIR context. JAX makes one for each program, which takes half of the time of a small one.
 
-    A context keeps all constants of its programs, so that another one follows after 1,000 programs.
+    A context keeps all constants of its programs, so that another one follows after 1,000 programs. A thread may compile while
+    another one lowers in the same context: it has all dialects from the start, and only loading one would disturb others.
     """
     mlir = sys.modules.get("jax._src.interpreters.mlir")
     if not hasattr(mlir, "make_ir_context"):
