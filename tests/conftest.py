@@ -185,7 +185,10 @@ def _share_contexts():
     def kept(thread, thousand):
         return make()
 
-    mlir.make_ir_context = lambda: kept(threading.get_ident(), next(numbers) // 1000)
+    def shared(*args, **kwargs):
+        return make(*args, **kwargs) if args or kwargs else kept(threading.get_ident(), next(numbers) // 1000)
+
+    mlir.make_ir_context = shared
 
 
 def pytest_configure():
