@@ -1,4 +1,4 @@
-"""Critics of 2024 and 2025 in the preset `gpu` of Slide and Block Z: normalization, residual blocks, categories, resets.
+"""Critics of 2024 and 2025 in the presets `gpu` of Slide (as of 2026-11-25) and Block Z.
 
     python bench/modern_critics.py --out critics --plan
     python bench/modern_critics.py --out critics --minutes 9   trains for 9 minutes and reports; run it again to resume

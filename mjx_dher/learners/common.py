@@ -62,7 +62,7 @@ class ActorCriticBase(Learner):
 
     spec: EnvSpec
     networks: Networks  # float32; used to act
-    learning: Networks  # in the learner's dtype, with the same parameters; used in updates
+    learning: Networks  # in the learner's dtype, with the same parameters; used in updates and for values
     actor: ActorKind = dataclasses.field(default_factory=Deterministic)
     axis_name: str | None = None  # mapped axis of the devices that share the run
     reset_every: int = 0  # updates after which networks are drawn again (`Config.reset_every`); the state then needs a `key`
