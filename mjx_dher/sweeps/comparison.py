@@ -161,8 +161,8 @@ class Row(NamedTuple):
 def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]:
     """Compares each setting of an environment with the baseline.
 
-    Success, area and epochs have bootstrap intervals over seeds. `better` is the probability of improvement. If both settings
-    have the same seeds, the p-value comes from a permutation test paired by seed.
+    Success, area and epochs have bootstrap intervals over seeds. `better` is the probability of improvement. Gain and
+    p-value, which comes from a permutation test, are paired by seed. They need two seeds or more that both settings have.
 
     Args:
       settings: settings of one environment.
@@ -202,8 +202,9 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
     if base is not None:
         others = areas_of(base)
         better = (stats.probability_of_improvement(areas, others), *stats.improvement_interval(areas, others))
-        if base.seeds == group.seeds and len(areas) > 1:
-            gain, p_value = float(np.mean(areas - others)), stats.paired_p_value(areas, others)
+        own, theirs = np.nonzero(np.equal.outer(group.seeds, base.seeds))  # places of the seeds that both have
+        if len(own) > 1:
+            gain, p_value = float(np.mean(areas[own] - others[theirs])), stats.paired_p_value(areas[own], others[theirs])
     return Row(
         group.env,
         group.label,
