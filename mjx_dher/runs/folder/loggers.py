@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import fingerprint
@@ -22,14 +22,6 @@ FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
 LOGS = ("jsonl", "tensorboard", "wandb")
 JSON_FILE = "metrics.jsonl"
 DIGEST = "digest"  # the last column of metrics.csv
-
-
-class Sink(Protocol):
-    """Logger that takes one row per epoch."""
-
-    def write(self, row: dict[str, Any]) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class CsvSink:
@@ -152,6 +144,7 @@ class WandbSink:
         self._run.finish()
 
 
+Sink = CsvSink | JsonlSink | TensorBoardSink | WandbSink
 EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # extras, and their packages
 
 

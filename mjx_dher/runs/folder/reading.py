@@ -6,19 +6,94 @@ import contextlib
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_dher import lookup, trust
+from mjx_dher import lookup
 from mjx_dher import spec as spec_lib
 from mjx_dher.config import Config, HParams
-from mjx_dher.runs.folder import contents, fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files, npz
 from mjx_dher.system.files import FolderError
+from mjx_dher.validation import check_number
 
 POLICY_RATIO = 20.0  # largest ratio of a policy's arrays to its uncompressed file
+
+# A form is a type, a pattern for a string, (kind, interval) of a number, [form] for a list, or a dict of forms by key. The key
+# "*" means all keys, and a key that ends in "?" may be missing.
+Form = Any
+_DIGEST = "[0-9a-f]{10}"
+_COUNT, _LANES = (int, "[0, 9000000000000000000]"), (int, "[1, 1000000]")
+_SHARE, _AMOUNT = (float, "[0, 1]"), (float, "[0, inf]")
+
+_IDENTITY: Form = {"sources": {"*": str}}  # `fingerprint.identity`
+_CONFIG: Form = {
+    "config": {"hidden_sizes": list},
+    "hparams": dict,
+    "physics": str,
+    "env_kwargs": list,
+    "sources": {"*": str},
+    "digest": _DIGEST,
+    "earlier?": [_DIGEST],
+    "jax_flags?": dict,
+    "lanes?": _LANES,
+    "devices?": _LANES,
+    "interface?": dict,
+    "versions?": {"*": str},
+}
+RESULT: Form = {
+    "status": f"{run_folder.FINISHED}|{run_folder.FAILED}",
+    "reason": str,
+    "digest": _DIGEST,
+    "lanes": _LANES,
+    "epochs": _COUNT,
+    "env_steps": _COUNT,
+    "wall_seconds": _AMOUNT,
+}
+_RATES: Form = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate"), _SHARE)
+RESULT_FINISHED: Form = {**RESULT, **_RATES, "episodes": _COUNT, "return_mean?": (float, "(-inf, inf)")}
+ROW: Form = {  # of metrics.csv; other metrics of learners can be any number
+    **dict.fromkeys(("epoch", "env_steps", "updates"), _COUNT),
+    "wall_seconds": _AMOUNT,
+    "success_rate": _SHARE,
+    **dict.fromkeys(("reset_success_rate?", "train_success_rate?", "relabelled_share?", "no_goal_share?"), _SHARE),
+    **dict.fromkeys(("bad_rewards?", "bad_success?"), _SHARE),
+    **dict.fromkeys(("discarded_episodes?", "steps_per_second?", "updates_per_second?", "memory_bytes?"), _AMOUNT),
+}
+_MANIFEST: Form = {
+    "epoch": _COUNT,
+    "wall_seconds": _AMOUNT,
+    "runs": [_IDENTITY],
+    "failed": {"*": list},
+    "leaves": [list],
+    "files": {"*": str},
+}
+
+
+def check_form(content: Any, form: Form, name: str = "content") -> None:
+    """Raises ValueError, TypeError or KeyError, naming the entry, unless `content` has the form `form`."""
+    if isinstance(form, type):
+        if not isinstance(content, form):
+            raise TypeError(f"{name} must be a {form.__name__}")
+    elif isinstance(form, str):
+        if not isinstance(content, str) or not re.fullmatch(form, content):
+            raise ValueError(f"{name} must be like {form}; got {content!r}")
+    elif isinstance(form, tuple):
+        check_number(name, content, form[1], form[0])
+    elif isinstance(form, list):
+        check_form(content, list, name)
+        for entry in content:
+            check_form(entry, form[0], name)
+    else:
+        check_form(content, dict, name)
+        prefix = "" if name == "content" else f"{name}."
+        for key, entry in form.items():
+            for field in content if key == "*" else (key.removesuffix("?"),):
+                if field in content or not key.endswith("?"):
+                    check_form(content[field], entry, f"{prefix}{field}")
 
 
 def changed_versions(content: Mapping[str, Any]) -> list[str]:
@@ -54,7 +129,7 @@ def read_config_file(file: Path) -> dict[str, Any]:
     """
     content = read_versioned(file, run_folder.SCHEMA)
     with checked(file, "does not describe a run"):
-        contents.check(content, contents.CONFIG)
+        check_form(content, _CONFIG)
         for flag in content.get("jax_flags", ()):
             lookup.check_name("jax_flags", flag, fingerprint.JAX_FLAGS)
     return content
@@ -156,7 +231,7 @@ def read_manifest(checkpoint: Path) -> dict[str, Any]:
         content = read_versioned(checkpoint / run_folder.MANIFEST, run_folder.SCHEMA)
         if content.pop("sha256", None) != fingerprint.sha256_of(content):
             raise ValueError(f"{run_folder.MANIFEST} has changed: SHA-256 differs")
-        contents.check(content, contents.MANIFEST)
+        check_form(content, _MANIFEST)
         return content
 
 
@@ -172,7 +247,7 @@ def policy_settings(arrays: Mapping[str, Any]) -> dict[str, Any]:
     if "settings" not in arrays:
         raise ValueError("it has no settings, unlike the policies of runs")
     settings = json.loads(arrays["settings"].tobytes())
-    contents.check(settings, contents.IDENTITY, "settings")
+    check_form(settings, _IDENTITY, "settings")
     return dict(settings)
 
 
@@ -206,10 +281,12 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
             env_kwargs=tuple(content["env_kwargs"]),
         )
         spec_lib.validate_values(spec)
-    if trusted:
+    names = {**spec_lib.custom_components(spec), **({"demonstrations": spec.demonstrations} if spec.demonstrations else {})}
+    if trusted or not names:
         return spec
-    names = {**spec_lib.custom_components(spec), "demonstrations": spec.demonstrations}
+    from mjx_dher.trust import FromFile
+
     marked: dict[str, Any] = {
-        field: trust.FromFile.of(name, file, spec.env_kwargs if field == "env" else ()) for field, name in names.items() if name
+        field: FromFile.of(name, file, spec.env_kwargs if field == "env" else ()) for field, name in names.items()
     }
     return dataclasses.replace(spec, **marked)

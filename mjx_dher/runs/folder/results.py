@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_dher.runs.folder import contents, loggers, reading, run_folder
+from mjx_dher.runs.folder import loggers, reading, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
@@ -27,7 +27,7 @@ def read_result(folder: Path) -> dict[str, Any]:
     with reading.checked(path):
         content = {"reason": "", **files.read_json(path)}
         numbers = {name: value for name, value in content.items() if value is not None}
-        contents.check(numbers, contents.RESULT_FINISHED if content["status"] == FINISHED else contents.RESULT)
+        reading.check_form(numbers, reading.RESULT_FINISHED if content["status"] == FINISHED else reading.RESULT)
     if content["digest"] != (digest := reading.read_config(folder)["digest"]):
         other = f"its digest is {content['digest']}, but {run_folder.CONFIG_FILE} has {digest}"
         raise FolderError(f"{path} is of a run with other settings: {other}")
@@ -62,7 +62,7 @@ def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str
     for number, line in enumerate(lines, 1):
         with reading.checked(path, f"has an invalid line of epoch {number}"):
             row: dict[str, Any] = {name: x if name == loggers.DIGEST else _to_number(name, x) for name, x in zip(head, line)}
-            contents.check({x: v for x, v in row.items() if v == v or x in loggers.FIRST_COLUMNS}, contents.ROW)  # noqa: PLR0124
+            reading.check_form({x: v for x, v in row.items() if v == v or x in loggers.FIRST_COLUMNS}, reading.ROW)  # noqa: PLR0124
             if row["epoch"] != number or (rows and row["env_steps"] <= rows[-1]["env_steps"]):
                 raise ValueError(f"epoch {row['epoch']} with env_steps {row['env_steps']} does not follow")
             while left and left[0] != row.get(loggers.DIGEST):
