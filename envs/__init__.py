@@ -41,7 +41,7 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
     _check_kind(name, constructor)
     own = inspect.signature(constructor).parameters  # the constructor's arguments take precedence
     wrapped = {key: overrides.pop(key) for key in _WRAPPERS if key in overrides and key not in own}
-    if _takes_engine(constructor):
+    if takes_engine(constructor):
         overrides["engine"] = engine
     elif engine != "auto":
         raise ValueError(f"engine must be auto for env {name!r}, which takes no engine; got {engine!r}")
@@ -98,13 +98,9 @@ _WRAPPERS = {
 }
 
 
-def takes_engine(name: str) -> bool:
-    """Whether the constructor of an environment has the argument `engine`."""
-    return _takes_engine(load("env", name))
-
-
-def _takes_engine(constructor: Callable[..., Any]) -> bool:
-    parameters = inspect.signature(constructor).parameters.values()
+def takes_engine(env: str | Callable[..., Any]) -> bool:
+    """Whether the constructor of an environment, or of the one of this name, has the argument `engine`."""
+    parameters = inspect.signature(load("env", env)).parameters.values()
     return any(parameter.name == "engine" or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
 
 

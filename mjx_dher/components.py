@@ -7,6 +7,8 @@ import importlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from typing_extensions import Doc
+
 from mjx_dher.lookup import check_function, check_name
 
 
@@ -212,11 +214,11 @@ def is_hand(env: Any) -> bool:
     return isinstance(env, str) and env in COMPONENTS["env"] and COMPONENTS["env"][env].path.startswith("mjx_dher.envs.hand:")
 
 
-def help_text(field: str, text: str) -> str:
+def doc(field: str, text: str) -> Doc:
     """Help text of a component's option, with the built-in names and the components that read it."""
     readers = [name for table in COMPONENTS.values() for name, component in table.items() if field in component.reads]
     read = f" Read by {', '.join(readers)}." if readers else ""
-    return f"{text}: {', '.join(COMPONENTS[field])}, or module:attribute.{read}"
+    return Doc(f"{text}: {', '.join(COMPONENTS[field])}, or module:attribute.{read}")
 
 
 @functools.cache

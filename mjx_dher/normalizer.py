@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from mjx_dher.parallel import split
 from mjx_dher.types import Array, PyTree
 
 
@@ -50,9 +51,6 @@ def update(
 def _update(
     state: NormalizerState | None, values: Array, clip: Array | float, valid: Array | None, axis_name: str | None
 ) -> NormalizerState | None:
-    def total(x: Array) -> Array:
-        return x if axis_name is None else jax.lax.psum(x, axis_name)
-
     if state is None:
         return None
     shape, ndim = state.mean.shape, values.ndim - state.mean.ndim
@@ -60,10 +58,10 @@ def _update(
     mask = jnp.broadcast_to(jnp.expand_dims(valid, range(valid.ndim, ndim)), values.shape[:ndim])
     mask = mask.reshape(-1, *(1,) * len(shape))
     values = jnp.clip(values, -clip, clip).reshape(-1, *shape)
-    number = total(jnp.sum(mask)).astype(jnp.float32)
-    batch_mean = total(jnp.sum(jnp.where(mask, values, 0.0), axis=0)) / jnp.maximum(number, 1.0)
+    number = split.total(jnp.sum(mask), axis_name).astype(jnp.float32)
+    batch_mean = split.total(jnp.sum(jnp.where(mask, values, 0.0), axis=0), axis_name) / jnp.maximum(number, 1.0)
     squares = jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0)
-    batch_var = total(jnp.sum(squares, axis=0)) / jnp.maximum(number, 1.0)
+    batch_var = split.total(jnp.sum(squares, axis=0), axis_name) / jnp.maximum(number, 1.0)
     count = state.count + number
     share = number / jnp.maximum(count, 1.0)
     delta = batch_mean - state.mean

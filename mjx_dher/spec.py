@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, get_args
 from typing_extensions import Doc
 
 from mjx_dher import validation
-from mjx_dher.components import COMPONENTS, help_text
+from mjx_dher.components import COMPONENTS, doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name, is_import_path
 
@@ -23,31 +23,27 @@ ENGINES = get_args(Engine)
 Argument = bool | int | float | str  # of an environment's constructor
 
 
-def _doc(field: str, text: str) -> Doc:
-    return Doc(help_text(field, text))
-
-
 @dataclasses.dataclass(frozen=True)
 class RunSpec:
     """Everything that decides the result of a run. Components are built-in names or module:attribute."""
 
-    env: Annotated[str, _doc("env", "Environment")] = "push"
+    env: Annotated[str, doc("env", "Environment")] = "push"
     engine: Annotated[
         Engine, Doc("Physics: native (MuJoCo C on all cores), warp (a kernel for NVIDIA GPUs), jax (MJX) or auto.")
     ] = "auto"
     env_kwargs: Annotated[
         tuple[str, ...], Doc("Arguments of the environment as NAME=VALUE, such as reward_type=dense distance_threshold=0.03.")
     ] = ()
-    sampler: Annotated[str, _doc("sampler", "Sampler of hindsight goals")] = "future"
-    weight_kernel: Annotated[str, _doc("weight_kernel", "Kernel that maps distances to weights")] = "linear"
-    weight_normalization: Annotated[str, _doc("weight_normalization", "Normalization of distances")] = "mean"
-    metric: Annotated[str, _doc("metric", "Distance between an achieved and a desired goal")] = "position"
-    priority: Annotated[str, _doc("priority", "Priority of episodes or transitions, for priority_fraction of each batch")] = (
+    sampler: Annotated[str, doc("sampler", "Sampler of hindsight goals")] = "future"
+    weight_kernel: Annotated[str, doc("weight_kernel", "Kernel that maps distances to weights")] = "linear"
+    weight_normalization: Annotated[str, doc("weight_normalization", "Normalization of distances")] = "mean"
+    metric: Annotated[str, doc("metric", "Distance between an achieved and a desired goal")] = "position"
+    priority: Annotated[str, doc("priority", "Priority of episodes or transitions, for priority_fraction of each batch")] = (
         "eventful"
     )
-    generator: Annotated[str, _doc("generator", "Generator of the goals of training episodes")] = "reset"
-    learner: Annotated[str, _doc("learner", "Learner")] = "ddpg"
-    networks: Annotated[str, _doc("networks", "Networks of the learner")] = "mlp"
+    generator: Annotated[str, doc("generator", "Generator of the goals of training episodes")] = "reset"
+    learner: Annotated[str, doc("learner", "Learner")] = "ddpg"
+    networks: Annotated[str, doc("networks", "Networks of the learner")] = "mlp"
     demonstrations: Annotated[
         str | None, Doc("Episodes to fill the replay ring with at the start: an .npz, or a Minari data set by folder or name.")
     ] = None

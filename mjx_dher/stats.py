@@ -8,15 +8,31 @@ Functions import scipy.stats when called, because that takes a second.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mjx_dher.rates import difference_interval, wilson_interval  # noqa: F401 - public here
+from mjx_dher.rates import wilson_interval
 
 Statistic = Callable[..., Any]  # (values, axis=...) -> values without that axis, as np.mean
+
+
+def difference_interval(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> tuple[float, float]:
+    """Newcombe's 95 % interval of the difference a - b of two success rates (Newcombe 1998, method 10).
+
+    Returns:
+      Low and high end.
+
+    Raises:
+      ValueError: as in `wilson_interval`.
+    """
+    low_a, high_a = wilson_interval(successes_a, trials_a)
+    low_b, high_b = wilson_interval(successes_b, trials_b)
+    a, b = successes_a / trials_a, successes_b / trials_b
+    return a - b - math.hypot(a - low_a, high_b - b), a - b + math.hypot(high_a - a, b - low_b)
 
 
 def interquartile_mean(scores: ArrayLike, axis: int | None = None) -> Any:

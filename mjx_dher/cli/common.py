@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-import math
 import os
 import time
 from collections.abc import Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from rich.console import Console
@@ -24,11 +21,7 @@ from mjx_dher import __version__, envs
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.spec import ENGINES, RunSpec, custom_components, to_arguments, to_texts
-from mjx_dher.validation import check_count, check_number
-
-if TYPE_CHECKING:
-    from mjx_dher.sweeps import comparison
+from mjx_dher.spec import ENGINES, RunSpec, custom_components
 
 CURVE_WIDTH = 24  # characters of the live curve
 # Types of options.
@@ -58,14 +51,6 @@ def check_engine(engine: str | None) -> None:
         check_name("engine", engine, ENGINES)
 
 
-def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Sequence[str] = ()) -> None:
-    """Raises ValueError for an invalid option of a command that plays episodes."""
-    check_count("episodes", episodes)
-    check_number("seed", seed, "[0, 4294967295]")
-    check_engine(engine)
-    to_arguments(env_kwargs)
-
-
 def make_env(run: RunSpec, engine: str | None = None) -> Any:
     """Makes the environment of a run, with `engine` instead of the run's if given."""
     return envs.make(run.env, engine=engine or run.engine, **run.env_arguments)
@@ -76,11 +61,6 @@ def played_env(run: RunSpec, engine: str | None) -> Any:
     import jax
 
     return make_env(run, "auto" if engine is None and run.engine == "warp" and jax.default_backend() == "cpu" else engine)
-
-
-def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
-    """Run whose environment's arguments are updated with `env_kwargs`."""
-    return dataclasses.replace(run, env_kwargs=to_texts({**run.env_arguments, **to_arguments(env_kwargs)}))
 
 
 def settle_compiler(engine: str) -> None:
@@ -107,32 +87,6 @@ def try_components(specs: Sequence[RunSpec], console: Console, env: Any = None, 
         made = make_env(runs[0], "native" if on_cpu and runs[0].engine == "warp" else None) if env is None else env
         for line in verdicts.check(made, runs):
             console.print(line)
-
-
-def find_run(run: Path, console: Console) -> Path:
-    """Finds a run folder or bundled policy, and prints which it is if the name could be either. Raises FolderError if there is
-    none.
-    """
-    from mjx_dher.policy import bundled
-
-    path = bundled.find(run)
-    if bundled.is_shipped(path):
-        console.print(f"{run}: the bundled policy; its card is {path / bundled.CARD}")
-    elif str(run) in bundled.names():
-        console.print(f"{run}: the run in the current folder, not the bundled policy of this name")
-    return path
-
-
-def read_run(path: Path, console: Console) -> RunSpec:
-    """Reads the description of the run in `path`, and prints which custom source files have changed since. Raises FolderError
-    if it is not a run folder, or it is damaged.
-    """
-    from mjx_dher.runs.folder import reading
-
-    content, spec = reading.read_run(path)
-    for text in reading.changed_code(content, spec):
-        console.print(f"since {path} was trained: {text}")
-    return spec
 
 
 def join(distributed: bool, described: Mapping[str, Any], console: Console) -> Console:
@@ -172,22 +126,6 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], console: Con
     else:
         for row in rows:
             console.print("\n".join(f"{name}: {cell}" for name, cell in zip(head, row) if cell), "", sep="\n", soft_wrap=True)
-
-
-def compare(
-    folder: Path, by_env: dict[str, list[comparison.Group]], baseline: str, threshold: float, console: Console
-) -> Sequence[comparison.Row]:
-    """Prints the comparison of all settings of a sweep, and writes it to `folder`. Returns its rows."""
-    from mjx_dher.sweeps import comparison
-
-    rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
-    comparison.write(folder, rows)
-    print_table(*comparison.table(rows), console)
-    for env, groups in by_env.items():
-        if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
-            labels = "; ".join(group.label for group in groups)
-            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}")
-    return rows
 
 
 class Screen:

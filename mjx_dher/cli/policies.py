@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import operator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,44 @@ from mjx_dher.cli.common import EnvKwargs, Physics, Trust
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, run_folder
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import RunSpec, to_arguments, to_texts
 from mjx_dher.system.caches import check_platform, keep_compiled_programs
+from mjx_dher.validation import check_count, check_number
+
+
+def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Sequence[str] = ()) -> None:
+    """Raises ValueError for an invalid option of a command that plays episodes."""
+    check_count("episodes", episodes)
+    check_number("seed", seed, "[0, 4294967295]")
+    common.check_engine(engine)
+    to_arguments(env_kwargs)
+
+
+def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
+    """Run whose environment's arguments are updated with `env_kwargs`."""
+    return dataclasses.replace(run, env_kwargs=to_texts({**run.env_arguments, **to_arguments(env_kwargs)}))
+
+
+def find_run(run: Path, console: Console) -> Path:
+    """Finds a run folder or bundled policy, and prints which it is if the name could be either. Raises FolderError if there is
+    none.
+    """
+    path = bundled.find(run)
+    if bundled.is_shipped(path):
+        console.print(f"{run}: the bundled policy; its card is {path / bundled.CARD}")
+    elif str(run) in bundled.names():
+        console.print(f"{run}: the run in the current folder, not the bundled policy of this name")
+    return path
+
+
+def read_run(path: Path, console: Console) -> RunSpec:
+    """Reads the description of the run in `path`, and prints which custom source files have changed since. Raises FolderError
+    if it is not a run folder, or it is damaged.
+    """
+    content, spec = reading.read_run(path)
+    for text in reading.changed_code(content, spec):
+        console.print(f"since {path} was trained: {text}")
+    return spec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,10 +82,10 @@ def eval_command(argv: list[str], console: Console) -> int:
     args = parse(EvalArgs, argv)
     if not args.runs:
         raise ValueError("eval needs one or more run folders or bundled policies; got none")
-    common.check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
+    check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
     remarks = PlainConsole(stderr=True, soft_wrap=True) if args.json else console
-    folders = [common.find_run(run, remarks) for run in args.runs]
-    runs = [common.changed_arguments(common.read_run(folder, remarks), args.env_kwargs) for folder in folders]
+    folders = [find_run(run, remarks) for run in args.runs]
+    runs = [changed_arguments(read_run(folder, remarks), args.env_kwargs) for folder in folders]
     for run in runs:
         common.settle_compiler(args.engine or run.engine)
     from mjx_dher.policy.load import check_fits, load_policy
@@ -115,16 +152,16 @@ def render_command(argv: list[str], console: Console) -> int:
 
     args = parse(RenderArgs, argv)
     render.check_output(args.out, args.width, args.height, args.overwrite)
-    common.check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
+    check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
     if args.run is not None and args.env is None:
-        folder = common.find_run(args.run, console)
-        played, policy = common.read_run(folder, console), load_policy(folder)
+        folder = find_run(args.run, console)
+        played, policy = read_run(folder, console), load_policy(folder)
     elif args.env is not None and args.run is None:
         lookup.check_name("env", args.env, envs.list_envs(), custom=True)
         played, policy = RunSpec(env=args.env), None
     else:
         raise ValueError(f"render needs either a run folder or --env (one of {', '.join(envs.list_envs())})")
-    _draw(common.changed_arguments(played, args.env_kwargs), policy, args, console)
+    _draw(changed_arguments(played, args.env_kwargs), policy, args, console)
     return 0
 
 
@@ -184,9 +221,9 @@ class TransferArgs:
 def transfer_command(argv: list[str], console: Console) -> int:
     """Plays the policy of a run folder in the original task."""
     args = parse(TransferArgs, argv)
-    common.check_play(args.seed, args.engine, args.episodes)
-    folder = common.find_run(args.run, console)
-    run = common.read_run(folder, console)
+    check_play(args.seed, args.engine, args.episodes)
+    folder = find_run(args.run, console)
+    run = read_run(folder, console)
     common.settle_compiler(args.engine or run.engine)
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, load_plain
@@ -247,7 +284,7 @@ def export_command(argv: list[str], console: Console) -> int:
 
     args = parse(ExportArgs, argv)
     lookup.check_name("format", args.format, export.FORMATS)
-    folder = common.find_run(args.run, console)
+    folder = find_run(args.run, console)
     content, run = reading.read_run(folder)
     beside = Path(f"{folder.name}.{args.format}") if bundled.is_shipped(folder) else folder / f"policy.{args.format}"
     out = args.out or beside

@@ -3,21 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 from rich.console import Console
 
 from mjx_dher.cli import commands
-from mjx_dher.cli.common import Trust, compare, print_table
+from mjx_dher.cli.common import Trust, print_table
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
 from mjx_dher.validation import check_number
 
+if TYPE_CHECKING:
+    from mjx_dher.sweeps.comparison import Group, Row
+
 EPISODES = 3  # per video
+
+
+def compare(folder: Path, by_env: dict[str, list[Group]], baseline: str, threshold: float, console: Console) -> Sequence[Row]:
+    """Prints the comparison of all settings of a sweep, and writes it to `folder`. Returns its rows."""
+    from mjx_dher.sweeps import comparison
+
+    rows = [row for groups in by_env.values() for row in comparison.compare(groups, baseline, threshold)]
+    comparison.write(folder, rows)
+    print_table(*comparison.table(rows), console)
+    for env, groups in by_env.items():
+        if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
+            labels = "; ".join(group.label for group in groups)
+            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}")
+    return rows
 
 
 @dataclasses.dataclass(frozen=True)

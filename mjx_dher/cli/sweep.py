@@ -17,7 +17,8 @@ from typing_extensions import Doc
 from mjx_dher import components, presets, spec
 from mjx_dher.cli import settings
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import Devices, Screen, compare, join, make_env, settle_compiler, try_components
+from mjx_dher.cli.common import Devices, Screen, join, make_env, settle_compiler, try_components
+from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet.chunks import FleetOptions
 from mjx_dher.runs.folder import fingerprint
@@ -33,10 +34,6 @@ GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "pr
 
 
 SAMPLERS = ("future", "closest", "epsilon_closest", "weighted")  # by default
-
-
-def _doc(field: str, text: str) -> Doc:
-    return Doc(components.help_text(field, text))
 
 
 if TYPE_CHECKING:
@@ -72,19 +69,19 @@ class SweepArgs:
     sweep: _Axes
     """Numbers to try: --sweep.her-k 2 4 8."""
     options: Annotated[Options, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Options)
-    env: Annotated[tuple[str, ...], _doc("env", "Environments")] = ("push",)
+    env: Annotated[tuple[str, ...], doc("env", "Environments")] = ("push",)
     engine: Engine = "auto"
     """Physics: native, warp, jax or auto."""
     env_kwargs: tuple[str, ...] = ()
     """Arguments of the environments as NAME=VALUE."""
-    sampler: Annotated[tuple[str, ...], _doc("sampler", "Samplers of hindsight goals")] = SAMPLERS
-    weight_kernel: Annotated[tuple[str, ...], _doc("weight_kernel", "Kernels")] = ("linear",)
-    weight_normalization: Annotated[tuple[str, ...], _doc("weight_normalization", "Normalizations of distances")] = ("mean",)
-    metric: Annotated[tuple[str, ...], _doc("metric", "Distances between goals")] = ("position",)
-    priority: Annotated[tuple[str, ...] | None, _doc("priority", "Priorities, by default the preset's")] = None
-    generator: Annotated[tuple[str, ...], _doc("generator", "Generators of the goals of training episodes")] = ("reset",)
-    learner: Annotated[tuple[str, ...] | None, _doc("learner", "Learners, by default the preset's")] = None
-    networks: Annotated[tuple[str, ...] | None, _doc("networks", "Networks, by default the preset's")] = None
+    sampler: Annotated[tuple[str, ...], doc("sampler", "Samplers of hindsight goals")] = SAMPLERS
+    weight_kernel: Annotated[tuple[str, ...], doc("weight_kernel", "Kernels")] = ("linear",)
+    weight_normalization: Annotated[tuple[str, ...], doc("weight_normalization", "Normalizations of distances")] = ("mean",)
+    metric: Annotated[tuple[str, ...], doc("metric", "Distances between goals")] = ("position",)
+    priority: Annotated[tuple[str, ...] | None, doc("priority", "Priorities, by default the preset's")] = None
+    generator: Annotated[tuple[str, ...], doc("generator", "Generators of the goals of training episodes")] = ("reset",)
+    learner: Annotated[tuple[str, ...] | None, doc("learner", "Learners, by default the preset's")] = None
+    networks: Annotated[tuple[str, ...] | None, doc("networks", "Networks, by default the preset's")] = None
     seeds: int = 10
     """Runs per setting. All settings use the same seeds, and so the same initial networks and resets."""
     first_seed: int = 0
@@ -307,6 +304,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
 
 
 def _write_tables(args: SweepArgs, console: Console) -> None:
+    from mjx_dher.cli.report import compare
     from mjx_dher.sweeps import comparison, tables
 
     with files.lock(args.out / grid.CELLS, wait=True):  # another process may be writing them

@@ -16,7 +16,8 @@ from rich.console import Console
 
 from mjx_dher import envs
 from mjx_dher.cli.commands import parse
-from mjx_dher.cli.common import VIEW_PORT, EnvKwargs, Trust, check_play, find_run, read_run
+from mjx_dher.cli.common import VIEW_PORT, EnvKwargs, Trust
+from mjx_dher.cli.policies import check_play, find_run, read_run
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments

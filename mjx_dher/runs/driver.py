@@ -179,7 +179,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         logs = [_open(stack, session, program.lanes, *run) for run in own]
         success = processes.broadcast(lambda: _success_rates(folders[0], start.epoch))  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
-        for progress in loop.run(session.env, specs[0].config, program.compiled, start, processes.fetch):
+        for progress in loop.run(session.env, specs[0].config, program.compiled, start):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
             for lane, (row, opened) in enumerate(zip(rows, logs)):
@@ -288,7 +288,7 @@ def _finish(
     if len(failed) < len(specs):
         keys, _ = program_lib.stack(specs, program.choices, program.lanes)
         episodes = session.options.final_episodes
-        outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes, processes.fetch)
+        outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes)
     results = []
     for lane, (spec, folder) in enumerate(zip(specs, folders)):
         epoch, reason = failed.get(lane, (progress.epoch, ""))

@@ -15,7 +15,7 @@ from mjx_dher import config as config_lib
 from mjx_dher import validation
 from mjx_dher.config import Config, HParams
 from mjx_dher.contract import check_steps
-from mjx_dher.parallel import mesh
+from mjx_dher.parallel import mesh, processes
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.system import memory
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
@@ -93,13 +93,11 @@ def train(
         yield progress._replace(metrics={name: float(f"{x:.6g}") for name, x in progress.metrics.items()})
 
 
-def run(
-    env: Env, config: Config, compiled: Compiled, start: Start, fetch: Callable[[Any], Any] = jax.device_get
-) -> Iterator[Progress]:
+def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:
     """Runs a compiled program, yielding after every epoch. Metrics stay arrays.
 
-    The device works in its own thread, so signal handlers can run during an epoch. `fetch` converts a tree of arrays to NumPy.
-    Raises ValueError for an error of `env.check` after an epoch.
+    The device works in its own thread, so signal handlers can run during an epoch. Raises ValueError for an error of
+    `env.check` after an epoch.
     """
     num_epochs = config_lib.num_epochs(config, env.episode_length)
     state = jax.block_until_ready(start.state)
@@ -112,7 +110,7 @@ def run(
                 concurrent.futures.wait([running], timeout=0.1)
             state, *told = running.result()
             check_steps(env)
-            metrics, finite = fetch(told)
+            metrics, finite = processes.fetch(told)
             now = time.perf_counter()
             yield Progress(
                 epoch=number,

@@ -21,7 +21,7 @@ from mjx_dher import spec as spec_lib
 from mjx_dher.config import HParams
 from mjx_dher.contract import check_steps, env_spec
 from mjx_dher.learners import Learner
-from mjx_dher.parallel import mesh, split
+from mjx_dher.parallel import mesh, processes, split
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.rollout import Outcome
 from mjx_dher.runs.folder import run_folder
@@ -211,12 +211,10 @@ def lane_of(tree: Any, lane: int, lanes: int) -> Any:
     return tree if lanes == 1 else jax.tree.map(lambda x: x[lane], tree)
 
 
-def evaluate(
-    env: Env, program: Program, state: TrainState, keys: PRNGKey, episodes: int, fetch: Callable[[Any], Any] = jax.device_get
-) -> Outcome:
+def evaluate(env: Env, program: Program, state: TrainState, keys: PRNGKey, episodes: int) -> Outcome:
     """Outcomes [lanes, episodes] of the final evaluation of each lane, as NumPy arrays.
 
-    Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`. `fetch` converts arrays of all devices to NumPy.
+    Chunk i of a run's episodes, from 1, has the key `fold_in(key, i)`.
     """
 
     def key_of(number: int) -> Any:
@@ -225,6 +223,6 @@ def evaluate(
         return mesh.to_host(own)[0] if program.layout.devices else own
 
     chunks = map(key_of, range(1, 1 + math.ceil(episodes / evaluate_lib.CHUNK)))
-    outcome = evaluate_lib.in_chunks(functools.partial(program.evaluate.result(), state), chunks, episodes, fetch)
+    outcome = evaluate_lib.in_chunks(functools.partial(program.evaluate.result(), state), chunks, episodes, processes.fetch)
     check_steps(env)
     return jax.tree.map(np.atleast_2d, outcome)
