@@ -13,9 +13,8 @@ from sweep_helpers import compile_once  # noqa: F401
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, presets, spec
-from mjx_dher.cli import show
+from mjx_dher.cli import COMMANDS, show
 from mjx_dher.cli import train as cli_train
-from mjx_dher.cli.commands import COMMANDS
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import fingerprint, reading

@@ -11,7 +11,7 @@ from conftest import ROOT, names
 from rich.console import Console
 
 from mjx_dher import RunSpec, cli, lookup
-from mjx_dher.cli import commands, common
+from mjx_dher.cli import FOREIGN_FLAGS, common
 from mjx_dher.runs.program.loop import Progress
 
 
@@ -25,7 +25,7 @@ def test_a_polyak_that_is_likely_a_tau_is_explained():
 def test_every_foreign_flag_names_one_that_is_there(capsys):
     assert cli.main(["train", "--help"]) == 0
     text = capsys.readouterr().out
-    for flag in commands.FOREIGN_FLAGS:
+    for flag in FOREIGN_FLAGS:
         assert cli.main([flag, "3"]) == 2
         named = re.findall(r"--[\w-]+", capsys.readouterr().err.replace(flag, "", 1))
         assert all(word in text for word in named), flag

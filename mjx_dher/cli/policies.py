@@ -14,8 +14,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup
-from mjx_dher.cli import common
-from mjx_dher.cli.commands import parse
+from mjx_dher.cli import common, parse
 from mjx_dher.cli.common import EnvKwargs, Physics, Trust
 from mjx_dher.cli.output import PlainConsole
 from mjx_dher.policy import bundled

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 from rich.console import Console
 
-from mjx_dher.cli import commands
+from mjx_dher import cli
 from mjx_dher.cli.common import Trust, print_table
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid
@@ -61,7 +61,7 @@ class PlotArgs:
 
 def plot_command(argv: list[str], console: Console) -> int:
     """Draws runs, or a sweep."""
-    args = commands.parse(PlotArgs, argv)
+    args = cli.parse(PlotArgs, argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(args.formats)
     if grid.is_sweep(args.folders):
@@ -119,7 +119,7 @@ class ReportArgs:
 
 def report_command(argv: list[str], console: Console) -> int:
     """Writes a report of a run or a sweep."""
-    args = commands.parse(ReportArgs, argv)
+    args = cli.parse(ReportArgs, argv)
     check_number("threshold", args.threshold, "(0, 1]", float)
     figures.check(("svg",), "report")
     sweep = grid.is_sweep((args.folder,))
@@ -130,7 +130,7 @@ def report_command(argv: list[str], console: Console) -> int:
     if args.video:
         for run, out in _to_film(args.folder, sweep):
             own = ("--out", str(out), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
-            commands.run("render", [str(run), *own], console)
+            cli.run("render", [str(run), *own], console)
     tell = console.print
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
     out = args.out or args.folder / report.REPORT

@@ -11,8 +11,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup, spec
-from mjx_dher.cli import common, settings
-from mjx_dher.cli.commands import parse
+from mjx_dher.cli import common, parse, settings
 from mjx_dher.cli.common import Devices, Physics, Trust, make_env, settle_compiler
 from mjx_dher.cli.train import train_into
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder

@@ -9,13 +9,13 @@ import io
 import json
 import operator
 from functools import reduce
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup, presets, spec
-from mjx_dher.cli.commands import COMMANDS, parse
+from mjx_dher.cli import COMMANDS, parse
 from mjx_dher.cli.common import make_env, print_table
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
@@ -46,6 +46,17 @@ FIELDS = {  # kinds of components, and their field of RunSpec
     "generators": "generator",
     "learners": "learner",
     "networks": "networks",
+}
+_NATIVE = "use engine native"
+# Changes to an MJCF that let an engine take it, by words of the reason against it.
+_CURES = {
+    "integrator": 'integrator="Euler"',
+    "disable springs": "set stiffness and damping to 0 in place of the flags",
+    "noslip": 'noslip_iterations="0"',
+    "solver": 'solver="Newton"',
+    "without nativeccd": '<flag nativeccd="disable"/>',
+    "with nativeccd": '<flag nativeccd="enable"/>',
+    "stand_in": "add the geom that it names",
 }
 KINDS = ("tasks", "engines", "presets", *list(FIELDS)[1:], "policies")
 
@@ -147,8 +158,6 @@ def engines_command(argv: list[str], console: Console) -> int:
     model = getattr(envs.make(args.env, engine=engine, **spec.to_arguments(args.env_kwargs)), "model", None)
     if not isinstance(model, mujoco.MjModel):
         raise ValueError(f"env {args.env!r} must have an attribute `model`, a mujoco.MjModel")
-    from mjx_dher.envs.engines.explain import explain
-
     verdicts = explain(model)
     if args.json:
         print(json.dumps([{**verdict._asdict(), "supported": not verdict.reason} for verdict in verdicts], indent=2))
@@ -156,6 +165,39 @@ def engines_command(argv: list[str], console: Console) -> int:
         rows = [(each.engine, "no" if each.reason else "yes", each.reason, each.cure) for each in verdicts]
         print_table(("engine", "supported", "reason", "cure"), rows, console)
     return 0
+
+
+class Verdict(NamedTuple):
+    """Whether an engine supports a model."""
+
+    engine: str  # native, jax, warp fused or warp graph
+    reason: str  # "" if it does
+    cure: str
+
+
+def explain(model: Any) -> list[Verdict]:
+    """Tries every engine, and both paths of warp, on a model. Without a GPU, warp is tried on the CPU."""
+    return [
+        _verdict(model, "native", "mjx_dher.envs.Simulator, or MuJoCo itself"),
+        _verdict(model, "jax", _NATIVE),
+        _verdict(model, "warp", "engine warp takes the path graph", path="fused", allow_cpu=True),
+        _verdict(model, "warp", _NATIVE, path="graph", allow_cpu=True),
+    ]
+
+
+def _verdict(model: Any, engine: str, otherwise: str, **options: Any) -> Verdict:
+    from mjx_dher.envs.engines import make_engine
+
+    name = f"{engine} {options['path']}" if options else engine
+    try:
+        make_engine(engine, model, 1, **options)
+    except ValueError as error:
+        reason, _, cure = str(error).partition("; ")
+        if cure and cure != _NATIVE:
+            return Verdict(name, reason, cure)
+        cures = [cure for words, cure in _CURES.items() if words in reason]
+        return Verdict(name, reason, "; or ".join([*cures, otherwise]))
+    return Verdict(name, "", "")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,8 +15,7 @@ from rich.console import Console
 from typing_extensions import Doc
 
 from mjx_dher import components, presets, spec
-from mjx_dher.cli import settings
-from mjx_dher.cli.commands import parse
+from mjx_dher.cli import parse, settings
 from mjx_dher.cli.common import Devices, Screen, join, make_env, settle_compiler, try_components
 from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams

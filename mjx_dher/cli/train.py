@@ -14,8 +14,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import lookup, presets, spec
-from mjx_dher.cli import common
-from mjx_dher.cli.commands import parse
+from mjx_dher.cli import common, parse
 from mjx_dher.cli.common import VIEW_PORT, Devices, Screen, make_env, settle_compiler
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs
-from mjx_dher.cli.commands import parse
+from mjx_dher.cli import parse
 from mjx_dher.cli.common import VIEW_PORT, EnvKwargs, Trust
 from mjx_dher.cli.policies import check_play, find_run, read_run
 from mjx_dher.lookup import check_name
