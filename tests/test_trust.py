@@ -20,7 +20,7 @@ from mjx_dher import RunSpec, cli, envs, import_paths, trust
 from mjx_dher.cli import train
 from mjx_dher.cli.output import PlainConsole, printable
 from mjx_dher.components import COMPONENTS
-from mjx_dher.policy.numpy_policy import Policy
+from mjx_dher.policy import Policy
 from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import to_arguments, to_texts, validate
 from mjx_dher.system import files

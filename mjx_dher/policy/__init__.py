@@ -1,8 +1,134 @@
 """Trained policies: as NumPy functions, as a learner's state, as files, and bundled with the package.
 
-`Policy` needs only NumPy. Import `policy.load`, `policy.learner_policy` and `policy.bundled` explicitly.
+`Policy` needs only NumPy. `arrays` checks its files. Import `policy.load`, `policy.learner_policy` and `policy.bundled`
+explicitly.
 """
 
-from mjx_dher.policy.numpy_policy import Policy, TrainedPolicy, from_mlp
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from mjx_dher.system import files
 
 __all__ = ["Policy", "TrainedPolicy", "from_mlp"]
+
+VECTORS = ("observation_mean", "observation_std", "goal_mean", "goal_std")
+SCALARS = ("norm_clip", "obs_clip")
+
+
+class TrainedPolicy(Protocol):
+    """A deterministic policy from `load_policy`: a `Policy` or a `learner_policy.LearnerPolicy`."""
+
+    @property
+    def sizes(self) -> tuple[Any, int, int]: ...  # D, G and A (`EnvSpec.sizes`)
+
+    @property
+    def interface(self) -> Mapping[str, Any]: ...  # `contract.robot_interface` of the run's environment; {} if unknown
+
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray: ...  # actions [..., A] for one state or a batch
+
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any: ...  # the same without checks, in NumPy or JAX
+
+    def save(self, path: Path, **extra: Any) -> None: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A deterministic policy: normalization, linear layers with ReLU between them, tanh.
+
+    Call it with a mapping that has "observation" [..., D] and "desired_goal" [..., G], such as the observation of a Gymnasium
+    goal environment. It returns actions [..., A] float32 in [-1, 1].
+    """
+
+    layers: tuple[tuple[Any, Any], ...]  # (kernel [in, out], bias [out]) of each linear layer
+    observation_mean: Any  # [D]
+    observation_std: Any  # [D], at least norm_eps
+    goal_mean: Any  # [G]
+    goal_std: Any  # [G]
+    norm_clip: float
+    obs_clip: float
+    # Seconds of a step `dt`; of a task from an MJCF also `controls`, observation `layout` and names of its `joints`.
+    interface: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Sizes D, G and A of observation, goal and action."""
+        return self.observation_mean.shape[0], self.goal_mean.shape[0], self.layers[-1][1].shape[0]
+
+    def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
+        """Actions [..., A] for observations of one state or a batch. Raises ValueError if a key is missing, a last axis has the
+        wrong size, or a value is not finite.
+        """
+        values = []
+        for key, mean in (("observation", self.observation_mean), ("desired_goal", self.goal_mean)):
+            if key not in obs:
+                raise ValueError(f"the policy needs {key!r}; got {sorted(obs)}")
+            value = np.asarray(obs[key], np.float32)
+            if value.ndim == 0 or value.shape[-1] != mean.shape[0]:
+                raise ValueError(f"the last axis of {key} must have size {mean.shape[0]}; got shape {value.shape}")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{key} must be finite")
+            values.append(value)
+        if values[0].shape[:-1] != values[1].shape[:-1]:
+            raise ValueError(f"batch shapes differ: observation {values[0].shape}, desired_goal {values[1].shape}")
+        return self.forward(values[0], values[1], np)
+
+    def forward(self, observation: Any, goal: Any, xp: Any = np) -> Any:
+        """Actions for observations [..., D] and goals [..., G], in NumPy or, with xp=jax.numpy, in JAX. Checks nothing."""
+
+        def normalize(value, mean, std):
+            value = xp.clip(value, -self.obs_clip, self.obs_clip)
+            rank = (1,) * (value.ndim - 1)  # explicit batch axes, because JAX may forbid implicit ones
+            return xp.clip((value - mean.reshape(*rank, -1)) / std.reshape(*rank, -1), -self.norm_clip, self.norm_clip)
+
+        x = xp.concatenate(
+            [
+                normalize(observation, self.observation_mean, self.observation_std),
+                normalize(goal, self.goal_mean, self.goal_std),
+            ],
+            axis=-1,
+        )
+        for index, (kernel, bias) in enumerate(self.layers):
+            x = x @ kernel + bias.reshape(*(1,) * (x.ndim - 1), -1)
+            if index < len(self.layers) - 1:
+                x = xp.maximum(x, 0)
+        return xp.tanh(x)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Named arrays of the policy, float32: layerI_kernel [in, out], layerI_bias [out], and the other fields."""
+        arrays = {f"layer{i}_{part}": a for i, layer in enumerate(self.layers) for part, a in zip(("kernel", "bias"), layer)}
+        arrays |= {field: getattr(self, field) for field in (*VECTORS, *SCALARS)}
+        return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
+
+    def save(self, path: Path, **extra: Any) -> None:
+        """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
+        arrays: dict[str, Any] = {**self.arrays(), **extra}
+        with files.atomic_write(path) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)
+
+
+def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
+    """Makes a policy from the actor's linear layers, by flax's names, and the `NormalizerState`s of observations [D] and goals
+    [G].
+    """
+    layers = tuple(
+        (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
+    )
+
+    def std(norm: Any) -> np.ndarray:
+        return np.maximum(np.sqrt(np.asarray(norm.var)), np.float32(hparams.norm_eps))
+
+    return Policy(
+        layers=layers,
+        observation_mean=np.asarray(observation_norm.mean),
+        observation_std=std(observation_norm),
+        goal_mean=np.asarray(goal_norm.mean),
+        goal_std=std(goal_norm),
+        norm_clip=float(hparams.norm_clip),
+        obs_clip=float(hparams.obs_clip),
+    )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher.policy.numpy_policy import SCALARS, VECTORS, Policy
+from mjx_dher.policy import SCALARS, VECTORS, Policy
 
 
 def from_arrays(arrays: Mapping[str, Any]) -> Policy:
