@@ -40,7 +40,6 @@ class Engine(Protocol):
 
     def advance(self, physics: Physics, controls: Controls) -> Physics:
         """Physics one environment step later."""
-        ...
 
     def check(self) -> None:
         """Raises ValueError if earlier steps were wrong in a way that their results do not show."""

@@ -194,7 +194,6 @@ class Screen:
         )
 
     def close(self) -> None:
-        """Ends the live bar."""
         if self._bar is not None:
             self._bar.stop()
 

@@ -34,7 +34,6 @@ class PlainConsole(Console):
         super().__init__(highlight=False, markup=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Makes a text for the terminal."""
         return super().render_str(printable(text), **options)
 
 
@@ -47,12 +46,10 @@ class Guarded:
         self._stream = open(os.devnull, "w", encoding="utf-8") if self._closed else stream  # noqa: SIM115
 
     def write(self, text: str) -> int:
-        """Writes `text`, or drops it."""
         self._attempt("write", text)
         return len(text)
 
     def flush(self) -> None:
-        """Flushes the stream, or drops its content."""
         self._attempt("flush")
 
     def _attempt(self, method: str, *args: Any) -> None:

@@ -143,7 +143,6 @@ class Cluster:
         self._board: Any = ray.remote(Board).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here).remote()
 
     def resources(self) -> list[dict[str, float]]:
-        """Resources of each living node."""
         return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
 
     def submit(self, chunk: Chunk, task: Task, work: Work) -> Running:
@@ -157,7 +156,6 @@ class Cluster:
         return Running(chunk, remote.remote(chunk, work, self._board))
 
     def wait(self, running: Sequence[Running], seconds: float) -> list[Running]:
-        """Chunks that end within `seconds`."""
         by_ref = {one.ref: one for one in running}
         ended, _ = self._ray.wait(list(by_ref), num_returns=1, timeout=seconds)
         return [by_ref[ref] for ref in ended]
@@ -182,7 +180,6 @@ class Cluster:
             raise LostError(f"{running.chunk.id}: {_first_line(error)}") from error
 
     def cancel(self, running: Running) -> None:
-        """Cancels a chunk that has not begun."""
         self._ray.cancel(running.ref, force=False)
 
     def look(self, stop: bool) -> list[News]:
@@ -194,7 +191,6 @@ class Cluster:
 
 
 def _run(chunk: Chunk, work: Work, board: Any) -> list[bytes]:
-    """Trains a chunk in a Ray worker."""
     import ray
 
     def tell(news: News) -> bool:

@@ -48,7 +48,6 @@ class Layout:
 
     @functools.cached_property
     def mesh(self) -> jax.sharding.Mesh:
-        """JAX mesh of the devices."""
         kinds = (jax.sharding.AxisType.Auto,) * 2
         return jax.make_mesh((self.lanes, self.shards), (LANES, DATA), kinds, devices=self.devices)
 

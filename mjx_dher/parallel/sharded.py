@@ -81,11 +81,9 @@ class _PerDevice:
         self._pool = concurrent.futures.ThreadPoolExecutor(len(stages))  # a call waits while it calls back to the host
 
     def eval_shape(self, *arguments: Any) -> Any:
-        """Shapes of the results."""
         return self._stages[0].eval_shape(*arguments)
 
     def lower(self, *arguments: Any) -> _PerDevice:
-        """Lowers the function for each device."""
 
         def shape_on(device: Any, x: Any) -> jax.ShapeDtypeStruct:
             shape = (x.shape[0] // self._layout.lanes, *x.shape[1:])
@@ -99,7 +97,6 @@ class _PerDevice:
         return _PerDevice(self._layout, [stage.compile(compiler_options=compiler_options) for stage in self._stages])
 
     def memory_analysis(self) -> Any:
-        """The compiler's figures for one device."""
         return self._stages[0].memory_analysis()
 
     def __call__(self, *arguments: Any) -> Any:

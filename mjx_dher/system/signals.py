@@ -121,7 +121,6 @@ class _Signals:
         self.mask = signal.pthread_sigmask(signal.SIG_BLOCK, NUMBERS)
 
     def in_parent(self) -> None:
-        """Unblocks signals."""
         signal.pthread_sigmask(signal.SIG_SETMASK, self.mask)
 
     def in_child(self) -> None:

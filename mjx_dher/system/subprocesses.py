@@ -25,7 +25,6 @@ class Answer(NamedTuple):
     failure: str | None  # one line; None if the program succeeded
 
     def last_json(self) -> Any:
-        """JSON value in the last line of `out`."""
         return json.loads(self.out.splitlines()[-1])
 
 

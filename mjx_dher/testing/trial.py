@@ -101,7 +101,6 @@ class Trial:
 
     @functools.cached_property
     def context(self) -> Context:
-        """Context of the run."""
         made = self.learner or learners.make("ddpg", Config(hidden_sizes=(16,)), env_spec(self.env))
         numbers = trainer.as_arrays(self.hparams)
         values = learners.values_of(made, jax.jit(made.init)(jax.random.key(0)), numbers) if hasattr(made, "value") else None

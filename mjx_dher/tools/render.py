@@ -252,7 +252,6 @@ class Painter:
         scene.ngeom += 1
 
     def close(self) -> None:
-        """Frees the renderer."""
         self._renderer.close()
 
 

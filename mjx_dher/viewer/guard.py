@@ -160,7 +160,6 @@ class Connection(ServerConnection):
         self._guard, self._credit, self._received = guard, float(BURST_BYTES), self.loop.time()
 
     def drop(self) -> None:
-        """Ends the connection at once."""
         self._guard.waiting.pop(self, None)
         self._guard.clients.pop(self, None)
         self.transport.abort()

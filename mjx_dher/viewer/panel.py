@@ -25,7 +25,6 @@ class Commands:
         self._lock, self._waiting = threading.Lock(), dict[str, Callable[[], None]]()
 
     def put(self, kind: str, command: Callable[[], None]) -> None:
-        """Adds a command and returns at once."""
         with self._lock:
             self._waiting.pop(kind, None)
             self._waiting[kind] = command
@@ -116,7 +115,6 @@ class Panel:
         self._about.content = text
 
     def update(self, with_curves: bool) -> None:
-        """Shows the player's progress."""
         player = self._player()
         _assign(self._play, "label", "Pause" if player.playing else "Play")
         _assign(self._renew, "value", player.renew)

@@ -106,7 +106,6 @@ class Viewer:
         self._panel.name(self._cast.source.label, self._cast.about(), self._cast.critic, self._cast.value is not None)
 
     def show(self, curves: bool) -> None:
-        """Shows the player's state."""
         positions, orientations = self._poses.at(self.player.qpos)
         for body, node in self._nodes.items():
             if body:  # the world does not move
@@ -139,7 +138,6 @@ class Viewer:
         self._draw_scene()
 
     def _draw_scene(self) -> None:
-        """Redraws the environment."""
         scene, env = self._server.scene, self.player.game.env
         for name in ("/bodies", "/ghosts", "/handle", "/balls"):
             with contextlib.suppress(KeyError, ValueError):

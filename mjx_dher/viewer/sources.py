@@ -35,7 +35,6 @@ class Source:
 
     @property
     def place(self) -> tuple[str, tuple[str, ...]]:
-        """The environment and its arguments."""
         return self.env, self.env_kwargs
 
 

@@ -23,7 +23,6 @@ _TINY = wp.constant(1e-15)  # MuJoCo's smallest number
 """)
 def _to_the(x: float, exponent: float) -> float:
     """x to the power of `exponent`. Its code is not inlined, because a GPU waits for instructions beyond its cache."""
-    ...
 
 
 @wp.func

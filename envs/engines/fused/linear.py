@@ -175,4 +175,3 @@ def direction(
     Returns:
       x' (M + J' D J) x.
     """
-    ...

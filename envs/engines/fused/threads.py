@@ -19,7 +19,6 @@ _GROUP = "const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) <<
 """)
 def sync(threads: int):  # type: ignore[no-untyped-def]
     """Waits for the environment's other threads; their writes are visible afterwards."""
-    ...
 
 
 @wp.func_native("""
@@ -33,7 +32,6 @@ def gather(warps: int):  # type: ignore[no-untyped-def]
     It is not needed for correctness. But the kernel's instructions do not fit into the instruction cache, and the warps of a
     multiprocessor get them two to four times as fast if all need the same ones at the same time.
     """
-    ...
 
 
 @wp.func_native(f"""
@@ -45,7 +43,6 @@ def gather(warps: int):  # type: ignore[no-untyped-def]
 """)
 def total(x: float, threads: int) -> float:
     """Sum of the threads' numbers, with the same bits in each thread."""
-    ...
 
 
 @wp.func_native(f"""
@@ -63,7 +60,6 @@ def total(x: float, threads: int) -> float:
 """)
 def earlier(x: int, thread: int, threads: int) -> int:
     """Sum of the numbers of the threads before this one."""
-    ...
 
 
 @wp.func_native(f"""
@@ -75,7 +71,6 @@ def earlier(x: int, thread: int, threads: int) -> int:
 """)
 def all_of(x: int, threads: int) -> int:
     """Sum of the threads' numbers."""
-    ...
 
 
 def _carve(of: str) -> str:
@@ -94,31 +89,26 @@ def _carve(of: str) -> str:
 @wp.func_native(_carve("wp::int32"))
 def ints(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=int):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func_native(_carve("wp::float32"))
 def floats(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=float):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func_native(_carve("wp::vec_t<3, wp::float32>"))
 def vec3s(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.vec3):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func_native(_carve("wp::vec_t<4, wp::float32>"))
 def quats(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.vec4):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func_native(_carve("wp::mat_t<3, 3, wp::float32>"))
 def matrices(spare: wp.array(dtype=float), size: int, begin: int, length: int, threads: int) -> wp.array(dtype=wp.mat33):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func_native(_carve("wp::vec_t<6, wp::float32>"))
@@ -126,7 +116,6 @@ def spatials(spare: wp.array(dtype=float), size: int, begin: int, length: int, t
     dtype=wp.spatial_vector
 ):
     """Returns `length` values that begin at a place in the environment's memory."""
-    ...
 
 
 @wp.func

@@ -45,7 +45,6 @@ class LaneCheckpoints:
 
     @property
     def names(self) -> list[str]:
-        """Names of the run folders."""
         return [folder.name for folder in self.folders]
 
     @property
@@ -180,7 +179,6 @@ class Schedule:
         self._epochs, self._due = epochs, time.monotonic() + SECONDS_TO_FIRST
 
     def is_due(self, epoch: int) -> bool:
-        """Whether to save after an epoch."""
         return time.monotonic() >= self._due or (self._epochs > 0 and epoch % self._epochs == 0)
 
     @contextlib.contextmanager
