@@ -83,7 +83,6 @@ class Actuators(Control):
         bound.moved = [own[i] for i in bound.indices]
         bound.size = 1 if self.together else len(bound.indices)
         bound.low, bound.high = np.array([_range(model, i) for i in bound.indices], np.float32).T
-        bound._bind_joints(model, [_joint(model, i) for i in bound.indices])
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
@@ -97,9 +96,6 @@ class Actuators(Control):
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
         return True
-
-    def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
-        pass
 
     scale = 1.0
     indices: list[int]
@@ -129,6 +125,15 @@ class JointDelta(JointPosition):
         super().__init__(names, together)
         self.scale = scale
 
+    def bind(self, model: mujoco.MjModel) -> Self:
+        bound = super().bind(model)
+        bound.qpos = model.jnt_qposadr[[_joint(model, i) for i in bound.indices]]
+        slope, offset = np.array([_holding(model, i) for i in bound.indices], np.float32).T
+        bound.gear = slope * np.array(model.actuator_gear[bound.indices, 0], np.float32)
+        if offset.any():
+            bound.offset = offset
+        return bound
+
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
         target = self.gear * (physics.qpos[self.qpos] + self.scale * action) + self.offset
         return dataclasses.replace(
@@ -140,13 +145,6 @@ class JointDelta(JointPosition):
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
         return is_servo(model, index) and _joint(model, index) >= 0
-
-    def _bind_joints(self, model: mujoco.MjModel, joints: list[int]) -> None:
-        self.qpos = model.jnt_qposadr[joints]
-        slope, offset = np.array([_holding(model, i) for i in self.indices], np.float32).T
-        self.gear = slope * np.array(model.actuator_gear[self.indices, 0], np.float32)
-        if offset.any():
-            self.offset = offset
 
     qpos: np.ndarray
     gear: np.ndarray  # input per rad or m of the joint

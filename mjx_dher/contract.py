@@ -19,10 +19,11 @@ def env_spec(env: Env) -> EnvSpec:
     """Spec of an environment: its `spec`, or one derived from its attributes and arrays. The environment is traced, not run.
     Raises ValueError if `env` is not an environment, or its spec disagrees with its arrays. The message names the field.
     """
-    return _spec_and_shapes(env)[0]
+    return spec_and_template(env)[0]
 
 
-def _spec_and_shapes(env: Env) -> tuple[EnvSpec, Any]:
+def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
+    """`env_spec` and `episode_template`, from one trace of `env`."""
     check_env_parts(env)
     first = jax.eval_shape(env.reset, jax.random.key(0))
     check_first(first, ())
@@ -41,21 +42,6 @@ def _spec_and_shapes(env: Env) -> tuple[EnvSpec, Any]:
         raise ValueError(f"spec: ends must be True, because the environment's state has {flags[0]}; got False")
     if spec.ends and not flags and not spec.ends_at_goal:
         raise ValueError("spec: ends must be False for a state without done and terminal, unless ends_at_goal; got True")
-    return spec, first
-
-
-def _say(leaf: Any) -> Any:
-    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
-
-
-def episode_template(env: Env) -> Episode:
-    """Shapes and dtypes of one episode, without running `env`. Raises ValueError if `env` is not an environment."""
-    return spec_and_template(env)[1]
-
-
-def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
-    """`env_spec` and `episode_template`, from one trace of `env`."""
-    spec, first = _spec_and_shapes(env)
 
     def repeat(x: Any, times: int) -> Any:
         return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
@@ -68,6 +54,15 @@ def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
         action=repeat(jax.ShapeDtypeStruct((env.action_size,), jnp.float32), num_steps),
     )
     return spec, template.filled()
+
+
+def _say(leaf: Any) -> Any:
+    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
+
+
+def episode_template(env: Env) -> Episode:
+    """Shapes and dtypes of one episode, without running `env`. Raises ValueError if `env` is not an environment."""
+    return spec_and_template(env)[1]
 
 
 def check_env_parts(env: Any) -> None:

@@ -212,11 +212,6 @@ def displacements(achieved: Array) -> Array:
     return jnp.concatenate([jnp.zeros_like(achieved[:1]), achieved[1:] - achieved[:-1]])
 
 
-def _error_size(sample: Sample, batch: Batch, context: Context) -> Array:
-    del sample
-    return jnp.abs(context.td_error(batch))
-
-
 def _mean_error(ring: ReplayState, context: Context) -> Array:
     """Mean absolute one-step error of each episode, for its desired goal, shape [E]."""
 
@@ -245,4 +240,9 @@ def _mean_error(ring: ReplayState, context: Context) -> Array:
 
 
 # Luu & Yoo 2021 ("HGR"): episodes by their mean error, then hindsight goals by theirs.
-td_error = Priority(renew=_mean_error, choose=by_weight(_error_size), uses_values=True, by_part=True)
+td_error = Priority(
+    renew=_mean_error,
+    choose=by_weight(lambda sample, batch, context: jnp.abs(context.td_error(batch))),
+    uses_values=True,
+    by_part=True,
+)

@@ -251,7 +251,7 @@ def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
         return samplers[0]
     score = one_of([functools.partial(_score, sampler) for sampler in samplers], "choice")
     weighs = one_of([functools.partial(weigh, sampler) for sampler in samplers], "choice")
-    crosses = one_of([functools.partial(_crosses, sampler) for sampler in samplers], "choice")
+    crosses = one_of([lambda hparams, own=sampler.cross_episode: own for sampler in samplers], "choice")
 
     def log_weights(
         achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array | None = None, length: Array | None = None
@@ -264,10 +264,6 @@ def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
         score=score if any(sampler.score for sampler in samplers) else None,
         measure_by=lambda distance: join([of_distance(sampler, distance) for sampler in samplers]),
     )
-
-
-def _crosses(sampler: Sampler, hparams: HParams) -> Any:
-    return sampler.cross_episode
 
 
 def probabilities(log_weights: Array) -> Array:

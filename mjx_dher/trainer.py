@@ -92,19 +92,9 @@ class Loop:
         return self.sampler.score is not None or self.priority.uses_values or generator
 
     @property
-    def steps_per_cycle(self) -> int:
-        """Environment steps per cycle, if no episode ends early."""
-        return self.config.num_envs * self.spec.episode_length
-
-    @property
-    def policy_delay(self) -> int:
-        """Critic updates per actor update."""
-        return learners.policy_delay(self.learner)
-
-    @property
     def updates_per_round(self) -> int:
         """Updates until both targets and actor have moved."""
-        return max(self.config.target_period, self.policy_delay)
+        return max(self.config.target_period, learners.policy_delay(self.learner))
 
     @property
     def rounds_per_draw(self) -> int:
@@ -159,7 +149,7 @@ def make_train(
         template=template,
         axis_name=axis_name,
     )
-    if problem := validation.delay_problem(config, loop.policy_delay):
+    if problem := validation.delay_problem(config, learners.policy_delay(loop.learner)):
         raise ValueError(problem)
     if generator is not None:
         check_with_goal(env)
@@ -218,7 +208,8 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
     noise = loop.learner.noise(noise_key, env.episode_length, config.num_envs, hparams)
     learners.check_noise(noise, env.episode_length, config.num_envs)
-    updates = state.env_steps // loop.steps_per_cycle * config.updates_per_cycle
+    steps = config.num_envs * env.episode_length  # if no episode ends early
+    updates = state.env_steps // steps * config.updates_per_cycle
     before = _context(loop, state.learner, hparams, updates)
     goals = _goals(loop, state, before)
     episodes, outcome = rollout(env, policy, rollout_key, config.num_envs, noise, goals, loop.spec)
@@ -242,8 +233,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         **relabelled,
         **losses,
     }
-    env_steps = state.env_steps + loop.steps_per_cycle
-    return TrainState(learner=learner, replay=ring, hparams=hparams, key=key, env_steps=env_steps), metrics
+    return TrainState(learner=learner, replay=ring, hparams=hparams, key=key, env_steps=state.env_steps + steps), metrics
 
 
 def _context(loop: Loop, learner: PyTree, hparams: HParams, updates: Array) -> Context:

@@ -49,14 +49,11 @@ def _defaults() -> dict[str, Any]:
     """Defaults of fields. For fields of elements, the default of one element."""
     per_element = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "pair_", "tendon_")
     values = dict(fields(mujoco.MjModel.from_xml_string(_NEUTRAL)))
+    counts = {name for name in values if name.startswith("n") and name.islower() and "." not in name}
     # The world body comes first, and the default actuator drives its joint.
     return {
-        name: value[0] if name.startswith(per_element) else 0 if _is_count(name) else value for name, value in values.items()
+        name: value[0] if name.startswith(per_element) else 0 if name in counts else value for name, value in values.items()
     }
-
-
-def _is_count(name: str) -> bool:
-    return name.startswith("n") and name.islower() and "." not in name
 
 
 def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> list[str]:

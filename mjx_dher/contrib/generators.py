@@ -33,13 +33,7 @@ class Generator:
         return self.generate(key, obs, ring, context)
 
 
-def _own_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Context) -> Array:
-    """Goals [N, G] of the reset."""
-    del key, ring, context
-    return obs["desired_goal"]
-
-
-reset = Generator(_own_goals)
+reset = Generator(lambda key, obs, ring, context: obs["desired_goal"])
 
 
 def make(name: str | Generator | GenerateFn) -> Generator:
