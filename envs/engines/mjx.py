@@ -99,7 +99,7 @@ def _grow_for_margins(model: mujoco.MjModel) -> None:
 def _geoms_in(model: mujoco.MjModel, message: str) -> list[int]:
     """Geoms of the first pair whose two types an MJX error names."""
     for ends in [*pairs.meeting(model), *zip(model.pair_geom1, model.pair_geom2)]:
-        if all(re.search(rf"\bmjGEOM_{pairs.type_of(model, geom)}\b", message) for geom in ends):
+        if all(re.search(rf"\bmjGEOM_{name}\b", message) for name in pairs.types_of(model, *ends)):
             return [int(geom) for geom in ends]
     return []
 

@@ -15,9 +15,16 @@ LEAST_FRICTION = 1e-5  # MuJoCo's
 _MANY = 50  # contacts of height fields and signed distance fields
 
 
-def type_of(model: mujoco.MjModel, geom: int) -> str:
-    """A geom's type, such as "BOX"."""
-    return _TYPES[int(model.geom_type[geom])]
+def types_of(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]:
+    """The types of two geoms, such as "BOX", in MuJoCo's order."""
+    first, second = sorted(int(model.geom_type[geom]) for geom in (geom1, geom2))
+    return _TYPES[first], _TYPES[second]
+
+
+def edges_of(model: mujoco.MjModel, dims: np.ndarray) -> np.ndarray:
+    """Rows of contacts, by their condim: the edges of a pyramid, or the directions of an elliptic cone."""
+    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    return np.where((dims == 1) | elliptic, dims, 2 * dims - 2)
 
 
 def meeting(model: mujoco.MjModel) -> np.ndarray:
@@ -106,7 +113,7 @@ def frictions(model: mujoco.MjModel, pairs: Pairs, friction: Any, xp: Any) -> di
 
 def most_contacts(model: mujoco.MjModel, geom1: int, geom2: int) -> int:
     """Largest number of contacts of two geoms."""
-    kind = tuple(sorted((type_of(model, geom1), type_of(model, geom2)), key=_TYPES.index))
+    kind = types_of(model, geom1, geom2)
     if "HFIELD" in kind or "SDF" in kind:
         return _MANY
     if kind in _MOST:
@@ -120,8 +127,7 @@ def most(model: mujoco.MjModel) -> tuple[float, float]:
         return np.inf, np.inf
     pairs = all_pairs(model)
     contacts = [most_contacts(model, geom1, geom2) for geom1, geom2 in zip(pairs.geom1, pairs.geom2)]
-    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    rows = [dim if elliptic or dim == 1 else 2 * dim - 2 for dim in pairs.dim.tolist()]
+    rows = edges_of(model, pairs.dim).tolist()
     others = 6 * model.neq + model.nv + model.ntendon  # of equality constraints and friction
     limits = int(np.count_nonzero(model.jnt_limited)) + int(np.count_nonzero(model.tendon_limited))
     return sum(contacts), others + 2 * limits + sum(n * row for n, row in zip(contacts, rows))

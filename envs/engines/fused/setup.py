@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Softness, Tendons, World
-from mjx_dher.envs.engines.pairs import all_pairs, frictions
+from mjx_dher.envs.engines.pairs import all_pairs, edges_of, frictions, types_of
 from mjx_dher.system.warp_setup import wp
 
 _MOST = {"PLANE_BOX": 4, "PLANE_CYLINDER": 4, "BOX_BOX": 8, "CYLINDER_BOX": 5, "PLANE_CAPSULE": 2}
@@ -236,7 +236,7 @@ def contacts_of(model: mujoco.MjModel, rows: int = 10**6) -> Any:
     geom1, geom2 = pairs.geom1.copy(), pairs.geom2.copy()
     swap = model.geom_type[geom1] > model.geom_type[geom2]
     geom1[swap], geom2[swap] = geom2[swap], geom1[swap]
-    kinds_most = [CONTACT_KINDS[pair_types(model, *pair)] for pair in zip(geom1, geom2)]
+    kinds_most = [CONTACT_KINDS[types_of(model, *pair)] for pair in zip(geom1, geom2)]
     kind, most = np.array(kinds_most, np.int32).reshape(-1, 2).T
     slots = int(most.sum())
     elliptic, edges = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, edges_of(model, pairs.dim)
@@ -280,18 +280,6 @@ def _halves(model: mujoco.MjModel) -> np.ndarray:
         which = model.geom_type == int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
         halves[which] = np.stack([radius, radius, length], axis=1)[which]
     return halves
-
-
-def edges_of(model: mujoco.MjModel, dims: np.ndarray) -> np.ndarray:
-    """Rows of contacts, by their condim: the edges of a pyramid, or the directions of an elliptic cone."""
-    elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    return np.where((dims == 1) | elliptic, dims, 2 * dims - 2)
-
-
-def pair_types(model: mujoco.MjModel, geom1: int, geom2: int) -> tuple[str, str]:
-    """Returns the types of two geoms, in MuJoCo's order."""
-    first, second = sorted(int(model.geom_type[geom]) for geom in (geom1, geom2))
-    return mujoco.mjtGeom(first).name[len("mjGEOM_") :], mujoco.mjtGeom(second).name[len("mjGEOM_") :]
 
 
 def other_rows(model: mujoco.MjModel) -> int:

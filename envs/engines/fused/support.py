@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
 from mjx_dher.envs.engines.fused import setup
-from mjx_dher.envs.engines.pairs import all_pairs
+from mjx_dher.envs.engines.pairs import all_pairs, types_of
 
 # Fields of MjModel that `setup` reads, with restrictions below.
 _READ = re.compile(
@@ -139,7 +139,7 @@ def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
     pairs = all_pairs(model)
     geoms: dict[str, dict[int, None]] = {}
     for ends in zip(pairs.geom1, pairs.geom2):
-        kind, what = setup.pair_types(model, *ends), None
+        kind, what = types_of(model, *ends), None
         if kind not in setup.CONTACT_KINDS:
             what = f"contacts of {kind[0].lower()} and {kind[1].lower()}"
         elif kind == ("CYLINDER", "BOX") and not model.opt.disableflags & _OLDER_CCD:
