@@ -57,9 +57,7 @@ class GoalEnv(abc.ABC):
         """
 
     def check_action(self, action: Array) -> Array:
-        """Converts `action` to float32. Raises ValueError for a wrong shape or, outside `jit`, for values that are not
-        finite.
-        """
+        """Converts `action` to float32. Raises ValueError for a wrong shape or, outside `jit`, for infinite or NaN values."""
         shape = jnp.shape(action)
         if shape != (self.action_size,):
             raise ValueError(

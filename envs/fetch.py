@@ -193,9 +193,7 @@ class FetchEnv(SimulatedTask):
         return jnp.concatenate([xy, jnp.array([task.object_height, 1.0, 0.0, 0.0, 0.0])])
 
     def sample_goal(self, key: PRNGKey) -> Array:
-        """Draws a goal [3] around the gripper plus the task's offset. With an object, half of the goals lie above its
-        height.
-        """
+        """Draws a goal [3] around the gripper plus the task's offset. With an object, half of the goals lie above it."""
         task = self.task
         # Scaled by `uniform`, which XLA rounds equally everywhere, so reset and first step have the same goal.
         largest = jnp.array([task.target_range] * 3 + [task.max_goal_lift], jnp.float32)

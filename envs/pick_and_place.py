@@ -6,9 +6,7 @@ from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 
 class PickAndPlace(FetchEnv):
-    """FetchPickAndPlace: like Push, but `action[3]` opens and closes the fingers, and half of the goals lie up to 45 cm
-    higher.
-    """
+    """FetchPickAndPlace: like Push, but `action[3]` moves the fingers, and half of the goals lie up to 45 cm higher."""
 
     name = "pick_and_place"
     task = FetchTask(

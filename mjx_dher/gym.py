@@ -316,9 +316,7 @@ def _copied(tree: Any) -> Any:
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
-    """Converts `actions` to float32. Raises an error unless they fit `space`, except its bounds, and `reset` has been
-    called.
-    """
+    """Converts `actions` to float32. Raises an error before the first `reset` or if they do not fit `space`, bounds aside."""
     if state is None:
         raise gymnasium.error.ResetNeeded("reset must be called before step")
     actions = np.asarray(actions, np.float32)

@@ -53,9 +53,7 @@ def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:
 
 
 class Actor(nn.Module):
-    """Deterministic policy: maps normalized observation and goal to an action in [-1, 1]. Parameters and actions are
-    float32.
-    """
+    """Deterministic policy: normalized observation and goal to an action in [-1, 1]. Parameters and actions are float32."""
 
     action_size: int
     hidden_sizes: Sequence[int] = (256, 256, 256)

@@ -159,9 +159,7 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
 
 
 def find_demonstrations(source: str) -> Path:
-    """Path of an .npz file, or folder of a Minari data set. Raises ValueError if it does not exist or is not trusted
-    (`trust`).
-    """
+    """Path of an .npz file or Minari data set. Raises ValueError if it does not exist or is not trusted (`trust`)."""
     root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
     for path in (Path(source), root / source):
         if (source.endswith(".npz") and path.is_file()) or (source and (path / "data").is_dir()):

@@ -31,9 +31,7 @@ def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[st
 
 
 def check_parts(config: Config, episode_length: int, parts: int) -> None:
-    """Raises ValueError for sizes that cannot be divided among `parts` devices. It names each field and the nearest valid
-    values.
-    """
+    """Raises ValueError for sizes that `parts` devices cannot share. It names each field and the nearest valid values."""
     episodes = episodes_capacity(config, episode_length)
     problems = []
     for field, count, unit in (

@@ -17,9 +17,7 @@ __all__ = ["Controls", "Engine", "Physics", "make_engine", "resolve_engine"]
 
 
 def resolve_engine(name: str) -> str:
-    """Resolves `auto`: native on a CPU, warp on a GPU if warp-lang is installed, else jax. Raises ValueError if there is no
-    engine `name`.
-    """
+    """Resolves `auto`: native on a CPU, warp on a GPU if warp-lang is there, else jax. Raises ValueError for another `name`."""
     check_name("engine", name, ENGINES)
     if name != "auto":
         return name

@@ -38,9 +38,7 @@ def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
 
 
 def find_run(run: Path, console: Console) -> Path:
-    """Finds a run folder or bundled policy, and prints which it is if the name could be either. Raises FolderError if there is
-    none.
-    """
+    """Finds a run folder or bundled policy, and says which it is if it could be either. Raises FolderError if it is neither."""
     path = bundled.find(run)
     if bundled.is_shipped(path):
         console.print(f"{run}: the bundled policy; its card is {path / bundled.CARD}")

@@ -113,9 +113,7 @@ class Policy:
 
 
 def from_mlp(dense: Any, observation_norm: Any, goal_norm: Any, hparams: Any) -> Policy:
-    """Makes a policy from the actor's linear layers, by flax's names, and the `NormalizerState`s of observations [D] and goals
-    [G].
-    """
+    """Makes a policy from the actor's linear layers, by flax's names, and `NormalizerState`s of observations [D], goals [G]."""
     layers = tuple(
         (np.asarray(dense[f"Dense_{i}"]["kernel"]), np.asarray(dense[f"Dense_{i}"]["bias"])) for i in range(len(dense))
     )

@@ -14,9 +14,7 @@ from mjx_dher.spec import RunSpec
 
 
 def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
-    """Reason why a run fails after an epoch with these metrics, or None. `finite` tells whether all of the learner's floats
-    are.
-    """
+    """Why a run fails after an epoch with these metrics, or None. `finite` tells whether all of the learner's floats are."""
     if not finite:
         return "the networks or normalizers have numbers that are not finite (smaller actor_lr and critic_lr may help)"
     episodes = config.num_envs * config.cycles_per_epoch

@@ -111,9 +111,7 @@ def _check_log_weights(values: NDArray, alone: NDArray, played: NDArray) -> str:
 
 
 def _weights(log_weights: NDArray) -> NDArray:
-    """Weights [..., T+1] from log weights [..., T+1], scaled so that the largest is 1. All are 0 if all log weights are
-    -inf.
-    """
+    """Weights [..., T+1] from log weights [..., T+1], scaled so that the largest is 1. All are 0 if all are -inf."""
     largest = log_weights.max(axis=-1, keepdims=True)
     return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 

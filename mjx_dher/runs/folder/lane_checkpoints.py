@@ -85,9 +85,7 @@ class LaneCheckpoints:
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
 
     def _find(self, state: TrainState, will_save: bool) -> bool:
-        """Whether there is a checkpoint. Reports a disk too full for another one, or raises FolderError if there is none
-        yet.
-        """
+        """Whether there is a checkpoint. Reports a disk too full for another, or raises FolderError if there is none yet."""
         has_some = bool(run_folder.checkpoints(self.folder))
         if will_save and (lack := checkpoint.lack_of_space(self.folder, state)):
             if not has_some:
