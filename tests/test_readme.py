@@ -11,8 +11,8 @@ README = (ROOT / "README.md").read_text()
 INNER = (
     "__main__ cli system envs.engines.fused envs.engines.warp envs.engines.graph envs.engines.features"
     " envs.engines.fields envs.engines.pairs envs.engines.sensors envs.engines.batches envs.engines.corrections"
-    " envs.engines.explain runs sweeps testing tools lookup import_paths rates trust viewer fleet check parallel"
-    " policy.learner_policy policy.numpy_policy policy.arrays"
+    " runs sweeps testing tools lookup import_paths rates trust viewer fleet check parallel"
+    " policy.learner_policy policy.arrays"
 )
 
 
