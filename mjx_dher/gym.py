@@ -176,12 +176,12 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
             self._painter = None
 
 
-def make_custom(name: str, render_mode: str | None = None, **options: Any) -> gymnasium.Env[Obs, np.ndarray]:
-    """Makes a `GymEnv` that is truncated after its `episode_length`: the entry point of `ENV_ID`. For longer episodes pass
-    `episode_length`, because `max_episode_steps` of `gymnasium.make` can only shorten them.
+def make_custom(name: str, render_mode: str | None = None, episode_length: int | None = None, **options: Any) -> Any:
+    """Makes a `GymEnv` that is truncated after `episode_length` steps, by default its own: the entry point of `ENV_ID`. In
+    `gymnasium.make`, `max_episode_steps` can only make episodes shorter than that.
     """
     env = GymEnv(name, render_mode, **options)
-    return TimeLimit(env, env._compiled.spec.episode_length)
+    return TimeLimit(env, env._compiled.spec.episode_length if episode_length is None else episode_length)
 
 
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):

@@ -166,3 +166,11 @@ def test_stable_baselines3_learns_to_reach(capsys):
     (example,) = [block for block in blocks if "stable_baselines3" in block]
     exec(compile(example, "gymnasium.md", "exec"), {})
     assert float(capsys.readouterr().out.split()[-1]) >= 0.9
+
+
+@pytest.mark.parametrize("steps", [4, 12])
+def test_a_custom_environment_plays_episodes_of_another_length(steps):
+    env = gymnasium.make(ENV, name="point_mass:PointMass", episode_length=steps)
+    env.reset(seed=0)
+    truncated = [env.step(np.zeros(2, np.float32))[3] for _ in range(steps)]
+    assert truncated == [False] * (steps - 1) + [True]
