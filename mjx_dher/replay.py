@@ -108,7 +108,8 @@ def _check_one(episode: Episode) -> None:
 
 def nbytes(episode: Episode, num_episodes: int) -> int:
     """Bytes that `init` allocates for the episodes."""
-    return num_episodes * sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(episode))
+    rows = jax.eval_shape(lambda: init(episode, num_episodes).episodes)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(rows))
 
 
 def capacity(state: ReplayState) -> int:

@@ -73,6 +73,8 @@ def test_nbytes_is_what_the_arrays_take():
     ring = replay.init(template, 11)
     assert replay.nbytes(template, 11) == sum(leaf.nbytes for leaf in jax.tree.leaves(ring.episodes))
     assert replay.capacity(ring) == 11
+    without = dataclasses.replace(template, length=None, terminal=None)
+    assert replay.nbytes(without, 11) == replay.nbytes(template, 11)
 
 
 def test_refuses_more_than_it_holds():
