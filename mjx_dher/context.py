@@ -61,12 +61,21 @@ class Context(NamedTuple):
         """Lowest and highest return [] (`return_bounds`)."""
         return return_bounds(self.reward_range, self.hparams.gamma)
 
+    def learner_values(self) -> Values:
+        """`values`. Raises ValueError if there are none."""
+        if self.values is None:
+            raise ValueError(
+                "values is missing: this method asks for a learner's values, so it needs uses_values=True in a run, and a"
+                " Context with values outside one (learners.values_of)"
+            )
+        return self.values
+
     def td_error(self, batch: Batch) -> Array:
         """One-step errors r + discount V(s', g) - Q(s, a, g) of a batch, shape [B]."""
-        assert self.values is not None
-        following = self.values.of_state(batch.next_observation, batch.desired_goal)
+        values = self.learner_values()
+        following = values.of_state(batch.next_observation, batch.desired_goal)
         target = jnp.clip(batch.reward + batch.discount * following, *self.bounds())
-        return target - self.values.value(batch.observation, batch.desired_goal, batch.action)
+        return target - values.value(batch.observation, batch.desired_goal, batch.action)
 
 
 def of_env(env: Any, hparams: HParams, **fields: Any) -> Context:

@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import refuses
 
 from mjx_dher import priorities, relabel, replay, samplers
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
+from mjx_dher.contrib import generators
 from mjx_dher.types import Episode
 from probes import Clock
 
@@ -152,3 +154,16 @@ def test_distances_whose_sum_overflows_offer_no_goal(normalization):
     sampler = samplers.make("weighted", metric=lambda achieved, desired: distances, normalization=normalization)
     log_weights = samplers.weigh(sampler, jnp.zeros((4, 2)), jnp.zeros(2), jnp.int32(0), HP)
     assert samplers.draw(jax.random.key(0), log_weights[None]) == 4  # no index: the transition keeps its goal, and is counted
+
+
+def test_methods_that_ask_a_learner_name_the_values_that_they_lack():
+    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], EPISODES), 3), EPISODES)
+    obs = {"observation": PATHS[:, 0], "achieved_goal": PATHS[:, 0], "desired_goal": EPISODES.desired_goal}
+    sampler = samplers.make("weighted", metric="time_to_goal")
+    for act in (
+        lambda: priorities.renew(priorities.td_error, ring, CONTEXT),
+        lambda: generators.make("hgg")(jax.random.key(0), obs, ring, CONTEXT),
+        lambda: samplers.score_episodes(sampler, EPISODES, CONTEXT),
+    ):
+        with refuses("values", "uses_values"):
+            act()

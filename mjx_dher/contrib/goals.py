@@ -78,7 +78,7 @@ def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Cont
     is the a_pt of the minimum. The authors solve a minimum-cost flow on the host. Here the matching is soft (`match`), and
     each reset draws an episode from its row. If nothing moved in any of the episodes, resets keep their goals.
     """
-    assert context.values is not None
+    values = context.learner_values()
     row_key, match_key = jax.random.split(key)
     start, desired = obs["achieved_goal"], obs["desired_goal"]
     number = desired.shape[0]
@@ -87,7 +87,7 @@ def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Cont
     shape = achieved.shape[:2]
     first = jax.tree.map(lambda x: jnp.broadcast_to(x[rows, :1], (*shape, *x.shape[2:])), ring.episodes.observation)
     diameter = jnp.max(jnp.linalg.norm(desired - start, axis=-1))
-    value = jnp.clip(context.values.of_state(first, achieved), *context.bounds())
+    value = jnp.clip(values.of_state(first, achieved), *context.bounds())
     least, step = _nearest(achieved, value * (1.0 - context.hparams.gamma) * diameter / _LIPSCHITZ, desired)
     cost = least + _START_WEIGHT * jnp.linalg.norm(start[:, None] - achieved[None, :, 0], axis=-1)
     moved = jnp.linalg.norm(achieved[:, -1] - achieved[:, 0], axis=-1) > STILL

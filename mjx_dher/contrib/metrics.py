@@ -49,9 +49,8 @@ resting_point_rough = functools.partial(_resting, friction=1.0)  # the cube of P
 
 def _steps_left(episode: Episode, context: Context) -> Array:
     """-V(s_i, g) [T+1], at least 0. With rewards of -1 per step it is the discounted number of steps to the goal."""
-    assert context.values is not None
     goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal.shape)
-    return jnp.maximum(-context.values.of_state(episode.observation, goals), 0.0)
+    return jnp.maximum(-context.learner_values().of_state(episode.observation, goals), 0.0)
 
 
 time_to_goal = LearnedMetric(_steps_left)
