@@ -272,6 +272,32 @@ def test_its_numbers_come_back_to_the_bit(folder, trained):
     assert isinstance(policy.state.params, common.Params)
 
 
+class Keyed(learners.Learner):
+    """Its state has a random key, and numbers of a type that NumPy lacks."""
+
+    def __init__(self, config, spec, networks):
+        pass
+
+    def init(self, key):
+        return {"gain": jnp.full((), 0.3, jnp.bfloat16), "key": key}
+
+    def act(self, state, obs, hparams):
+        return jnp.tanh(state["gain"] * (obs["desired_goal"] - obs["observation"]))
+
+
+def test_keys_and_bfloat16_come_back_to_the_bit(tmp_path):
+    run = RunSpec(env="point_mass:PointMass", learner="test_learners:Keyed", config=SMALL)
+    run_folder.write_config(tmp_path, run, "none", {})
+    learner = Keyed(SMALL, TASK, None)
+    state = jax.device_get(learner.init(jax.random.key(7)))
+    save_policy(tmp_path, learner_policy.LearnerPolicy(learner, state, HP, TASK))
+    policy = mjx_dher.load_policy(tmp_path, trust=True)
+    assert policy.state["gain"].dtype == jnp.bfloat16
+    assert policy.state["gain"] == state["gain"]
+    assert policy.state["key"] == state["key"]
+    np.testing.assert_array_equal(policy(OBS), learner.act(state, OBS, HP))
+
+
 @pytest.mark.parametrize("changes", [{"networks": "mlp"}, {"config": dataclasses.replace(SMALL, hidden_sizes=(16,))}])
 def test_a_stored_policy_of_other_networks_is_refused(folder, changes, mine):
     policy = mjx_dher.load_policy(folder)

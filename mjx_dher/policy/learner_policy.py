@@ -56,9 +56,29 @@ class LearnerPolicy:
 
     def save(self, path: Path, **extra: Any) -> None:
         """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
-        arrays: dict[str, Any] = {f"state{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
+        arrays: dict[str, Any] = {f"state{i:04d}": _to_plain(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
         with atomic_write(path) as partial, partial.open("wb") as file:
             np.savez(file, env_spec=np.array(to_json(self.spec)), **arrays, **extra)
+
+
+def _to_plain(leaf: Any) -> np.ndarray:
+    """Array of NumPy's own numbers: the data of random keys, and the bits of types that NumPy lacks, such as bfloat16."""
+    array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+    return array.view(f"u{array.itemsize}") if array.dtype.kind == "V" else array
+
+
+def _from_plain(array: np.ndarray, like: Any) -> Array:
+    """Inverse of `_to_plain` for a leaf with the shape and dtype of `like`. Raises ValueError if they do not fit."""
+    numbers = jax.eval_shape(jax.random.key_data, like) if _is_key(like) else like
+    dtype = np.dtype(numbers.dtype)
+    if array.shape != numbers.shape or array.dtype != (f"u{dtype.itemsize}" if dtype.kind == "V" else dtype):
+        raise ValueError(f"got {array.dtype}{list(array.shape)} for {like.dtype}{list(like.shape)}")
+    value = jnp.asarray(array.view(dtype))
+    return jax.random.wrap_key_data(value) if _is_key(like) else value
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _leading(key: str, obs: Mapping[str, Any], like: PyTree) -> set[tuple[int, ...]]:
@@ -92,9 +112,10 @@ def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolic
     template = jax.eval_shape(learner.init, jax.random.key(0))
     leaves, treedef = jax.tree.flatten(template)
     stored = [arrays[f"state{i:04d}"] for i in range(sum(name.startswith("state") for name in arrays))]
-    if [(x.shape, x.dtype) for x in stored] != [(x.shape, x.dtype) for x in leaves]:
-        raise ValueError(f"its arrays do not fit learner {spec.learner!r} with networks {spec.networks!r}")
-    state = jax.tree.unflatten(treedef, [jnp.asarray(x) for x in stored])
+    try:
+        state = jax.tree.unflatten(treedef, [_from_plain(x, like) for x, like in zip(stored, leaves, strict=True)])
+    except ValueError as error:
+        raise ValueError(f"its arrays do not fit learner {spec.learner!r} with networks {spec.networks!r} ({error})") from error
     policy = LearnerPolicy(learner, state, spec.hparams, env_spec, read_interface(arrays))
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), env_spec.observation)
     if not np.all(np.isfinite(policy({"observation": zeros, "desired_goal": np.zeros(env_spec.goal_size, np.float32)}))):
