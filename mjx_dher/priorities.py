@@ -43,6 +43,7 @@ class Priority:
     choose: ChooseFn | None = None  # choice among relabelled transitions
     uses_values: bool = False  # whether it reads `context.values`
     by_part: bool = False  # whether `renew` weighs each episode alone and may get part of the ring (`Config.renewals`)
+    renews: Callable[[Context], Array] | None = None  # whether a lane's priority has `renew`, if lanes differ in it (`join`)
 
 
 def eventful(episode: Episode, context: Context) -> Array:
@@ -109,6 +110,15 @@ def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array |
     return dataclasses.replace(ring, priority=weight if rows is None else ring.priority.at[rows].set(weight))
 
 
+def mean(priority: Priority, ring: ReplayState, weight: Array, context: Context) -> Array:
+    """Mean priority [] of the whole ring if it is renewed, else of new episodes, from their weights [N]."""
+    of_new = replay.mean(weight, len(weight))
+    if priority.renew is None:
+        return of_new
+    of_ring = replay.mean(ring.priority, ring.size)
+    return of_ring if priority.renews is None else jnp.where(priority.renews(context), of_ring, of_new)
+
+
 def choose(
     priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context
 ) -> tuple[Sample, Batch]:
@@ -162,12 +172,14 @@ def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
     if len(made) == 1:
         return made[0]
     index = "priority_choice"
+    renewed = [own.renew is not None for own in made]
     return Priority(
         weigh=one_of([functools.partial(_weigh, own) for own in made], index) if any(own.weigh for own in made) else None,
         renew=one_of([functools.partial(_renew, own) for own in made], index) if any(own.renew for own in made) else None,
         choose=one_of([functools.partial(_choose, own) for own in made], index) if any(own.choose for own in made) else None,
         uses_values=any(own.uses_values for own in made),
         by_part=all(own.by_part for own in made if own.renew),
+        renews=one_of([lambda context, own=own: jnp.asarray(own) for own in renewed], index) if any(renewed) else None,
     )
 
 

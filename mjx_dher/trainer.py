@@ -222,12 +222,11 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     # While the ring is empty, nothing is learned.
     can_learn = split.all_true(replay.can_sample(ring), loop.axis_name)
     learner = jax.tree.map(lambda new, old: jnp.where(can_learn, new, old), learned, learner)
-    drawn = (ring.priority, ring.size) if loop.priority.renew else (weights, config.num_envs)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": replay.mean(*drawn),
+        "priority_mean": priorities.mean(loop.priority, ring, weights, context),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,

@@ -14,6 +14,7 @@ from mjx_dher import HParams, make_train, priorities, replay, testing
 from mjx_dher.context import Context
 from mjx_dher.contrib import episodes
 from mjx_dher.priorities import Priority
+from mjx_dher.runs.program.program import Lane
 from point_mass import PointMass
 
 ENV = PointMass()
@@ -75,6 +76,16 @@ def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
     for number, alone in enumerate((priorities.whole(priorities.eventful), BY_CYCLE)):
         found = priorities.renew(joined, ring, CONTEXT._replace(hparams=SimpleNamespace(priority_choice=number)), rows)
         np.testing.assert_array_equal(found.priority, priorities.renew(alone, ring, CONTEXT, rows).priority)
+
+
+def test_a_lane_logs_the_mean_priority_of_new_episodes_beside_one_that_renews():
+    def logged(priority, hparams):
+        train = make_train(ENV, SMALL, priority=priority)
+        return jax.jit(train.epoch)(train.init(jax.random.key(0), hparams))[1]["priority_mean"]
+
+    lane = Lane(*HParams(), choice=0, priority_choice=0, generator_choice=0)
+    together = logged(priorities.join([priorities.eventful, BY_CYCLE]), lane)
+    np.testing.assert_array_equal(together, logged(priorities.eventful, HParams()))
 
 
 def renewed_at(renewals, priority):
