@@ -179,6 +179,9 @@ def _add_episodes(loop: Loop, state: TrainState, episodes: Episode) -> TrainStat
     ring = replay.add(state.replay, episodes, priorities.weights(loop.priority, episodes, context))
     key = split.own_key(jax.random.fold_in(state.key, ADD), loop.axis_name)
     learner, _ = _update_normalizers(loop, state.learner, episodes, jnp.ones(len(rows), bool), context, key)
+    if loop.config.renewals:  # a cycle may then renew its own episodes alone
+        context = _context(loop, learner, state.hparams, jnp.zeros(()))
+        ring = priorities.renew(loop.priority, ring, context, _rows_to_renew(loop, state, ring, len(rows)))
     return dataclasses.replace(state, learner=learner, replay=ring)
 
 
@@ -217,7 +220,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     ring = replay.add(state.replay, episodes, weights, outcome.valid)
     learner, relabelled = _update_normalizers(loop, state.learner, episodes, outcome.valid, before, normalizer_key)
     context = _context(loop, learner, anneal(hparams, before.progress), updates)
-    ring = priorities.renew(loop.priority, ring, context, _rows_to_renew(loop, state, ring))
+    ring = priorities.renew(loop.priority, ring, context, _rows_to_renew(loop, state, ring, config.num_envs))
     learned, losses = _learn(loop, learner, ring, context, learn_key)
     # While the ring is empty, nothing is learned.
     can_learn = split.all_true(replay.can_sample(ring), loop.axis_name)
@@ -241,9 +244,8 @@ def _context(loop: Loop, learner: PyTree, hparams: HParams, updates: Array) -> C
     return context_lib.of_env(loop.env, hparams, progress=progress, updates=updates, values=values)
 
 
-def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState) -> Array | None:
-    """Rows whose priorities to renew after a cycle's episodes were added, or None for all."""
-    new = loop.config.num_envs
+def _rows_to_renew(loop: Loop, state: TrainState, ring: ReplayState, new: int) -> Array | None:
+    """Rows whose priorities to renew after `new` episodes were added, or None for all."""
     number = loop.config.renewals * new
     if loop.priority.renew is None or not loop.priority.by_part or not 0 < number < replay.capacity(ring):
         return None

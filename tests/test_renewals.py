@@ -120,3 +120,11 @@ def test_a_run_renews_its_own_episodes_and_as_many_others_as_it_is_told(renewals
         np.testing.assert_array_equal(cycle[3], 3)
         others = int((cycle > np.arange(4)[:, None]).sum())
         assert others == 0 if renewals == 1 else 0 < others < 3 * number
+
+
+def test_added_demonstrations_are_renewed_too():
+    """Cycles that renew their own episodes alone would leave them at 0, and never draw them."""
+    train = make_train(ENV, dataclasses.replace(SMALL, renewals=1), priority=BY_CYCLE)
+    state = train.init(jax.random.key(0), HParams())
+    state = jax.jit(train.add)(state, jax.tree.map(lambda x: x[:3], random_episodes()))
+    np.testing.assert_array_equal(state.replay.priority, [1.0] * 3 + [0.0] * (len(state.replay.priority) - 3))
