@@ -50,12 +50,14 @@ def check(field: str, name: str, place: Path | None) -> None:
 
 
 def record(field: str, name: str, place: Path | None, arguments: Sequence[str] = ()) -> None:
-    """Records a name that the user typed or passed, with the file of its module or data. A `FromFile` is not recorded. Does
-    nothing if there is no state folder.
+    """Records a name that the user typed or passed, with the file of its module or data. Does nothing if there is no state
+    folder.
+
+    A `FromFile` is recorded with other `arguments`, which the user typed, if the user has trained with those of its file.
     """
-    if isinstance(name, FromFile):
-        return
     with contextlib.suppress(OSError, RuntimeError):
+        if isinstance(name, FromFile) and not _record(field, name, place, name.arguments).exists():
+            return
         _folder(make=True)
         _record(field, name, place, arguments).touch()
 

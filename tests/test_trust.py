@@ -143,6 +143,25 @@ def test_what_the_user_has_trained_with_needs_no_flag_wherever_the_folder_is(her
     assert cli.main(COMMANDS["eval"]) == 0
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_arguments_that_the_user_types_to_a_trusted_environment_are_recorded(here, known):
+    """As `train --config RUN --env-kwargs episode_length=7` does. The new run is the user's own."""
+    folder = here / "first"
+    run_folder.write_config(folder, OWN, "none", {"lanes": 1})
+    if not known:
+        for record in (here / "state").rglob("trusted/*"):
+            record.unlink()
+    other = dataclasses.replace(reading.read_run(folder)[1], env_kwargs=("episode_length=7",))
+    run_folder.write_config(here / "second", other, "none", {"lanes": 1})
+    assert other.env.arguments == ()
+    found = reading.read_run(here / "second")[1]
+    if known:
+        assert import_paths.load("env", found.env)
+    else:
+        with refuses("env", "point_mass:PointMass"):
+            import_paths.load("env", found.env)
+
+
 def test_the_same_name_with_other_arguments_or_of_another_file_is_not_trusted(here, received, monkeypatch):
     write(here / "own", OWN)
     received(dataclasses.replace(OWN, env_kwargs=("episode_length=5",)))
