@@ -247,6 +247,16 @@ def test_without_a_checkpoint_that_fits_runs_begin_anew(tmp_path, harm):
     assert not (tmp_path / "unfinished").exists()
 
 
+def test_stopped_runs_that_a_larger_sweep_begins_again_are_told(tmp_path):
+    seen, said = [], []
+    cut_short(tmp_path, make_grid(("future",), static=LONGER), 2, lanes=2)
+    on_epoch = lambda specs, progress: seen.append(progress.epoch)  # noqa: E731
+    more = make_grid(("future",), (0, 1, 2, 3), static=LONGER)
+    run(tmp_path, more, lanes=4, on_epoch=on_epoch, should_stop=lambda: seen[-1] == 1, report=said.append)
+    assert seen == [1]
+    assert any(line.startswith("2 of these runs begin again") for line in said)
+
+
 def test_a_checkpoint_that_cannot_be_written_does_not_end_the_sweep(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(

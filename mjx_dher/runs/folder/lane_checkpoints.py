@@ -85,8 +85,13 @@ class LaneCheckpoints:
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
 
     def _find(self, state: TrainState, will_save: bool) -> bool:
-        """Whether there is a checkpoint. Reports a disk too full for another, or raises FolderError if there is none yet."""
+        """Whether there is a checkpoint. Reports runs that begin again, and a disk too full for another checkpoint. Raises
+        FolderError if it is too full for the first.
+        """
         has_some = bool(run_folder.checkpoints(self.folder))
+        held = {name for path in self.shared.glob(f"*/{NAMES_FILE}") for name in _names(path)} & {*self.names}
+        if held and not has_some:
+            self.report(f"{len(held)} of these runs begin again, because they share a checkpoint with other runs than before")
         if will_save and (lack := checkpoint.lack_of_space(self.folder, state)):
             if not has_some:
                 raise FolderError(f"{self.folder}: {lack}")
