@@ -228,6 +228,7 @@ def _ranges_of(varied: Any) -> dict[str, tuple[float, float]]:
 def substeps_of(hz: float, timestep: float) -> int:
     """Timesteps of the model per action. Raises ValueError if `hz` does not give a whole number."""
     check_number("hz", hz, "(0, inf)", float)
+    check_number("timestep of the model", timestep, "(0, inf)", float)
     substeps = round(1 / (hz * timestep))
     if substeps < 1 or abs(substeps * timestep * hz - 1) > 1e-6:
         nearest = sorted({float(f"{1 / (n * timestep):.9g}") for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})

@@ -173,8 +173,16 @@ class MujocoTask(SimulatedTask):
 
 def load_model(task: type, model: Any) -> mujoco.MjModel:
     """Compiles the MJCF of a task class. A path is relative to the file of the class. Raises ValueError if there is no such
-    file, or MuJoCo rejects it.
+    file, MuJoCo rejects it, or a number is NaN.
     """
+    compiled = _compile(task, model)
+    fields = [(name, getattr(part, name)) for part in (compiled, compiled.opt) for name in dir(part) if name[0] != "_"]
+    if bad := [name for name, value in fields if isinstance(value, float | np.ndarray) and np.isnan(value).any()]:
+        raise ValueError(f"model of {task.__name__} has NaN in {', '.join(bad)}")
+    return compiled
+
+
+def _compile(task: type, model: Any) -> mujoco.MjModel:
     try:
         if isinstance(model, mujoco.MjModel):
             return copy.copy(model)

@@ -186,6 +186,11 @@ def test_a_robots_loop_rejects_a_quaternion_without_length():
         (arm(POSITION), {"observations": None}, ["observations", None]),
         (arm(POSITION), {"goal": task.Position(3, (0, 0, 0), (1, 1, 1))}, ["site", 3]),
         (arm(POSITION), {"goal": task.Joints("j", high=(1, 2, 3))}, ["goal", 1]),
+        (arm(POSITION).replace('gravity="0 0 0"', 'timestep="0"'), {}, ["timestep", 0.0]),
+        (arm(POSITION).replace('gravity="0 0 0"', 'timestep="-0.004"'), {}, ["timestep", -0.004]),
+        (arm(POSITION).replace('gravity="0 0 0"', 'wind="0 0 nan"'), {}, ["NaN", "wind"]),
+        (arm(POSITION).replace('kp="20"', 'kp="nan"'), {}, ["NaN", "actuator_gainprm"]),
+        (arm(POSITION).replace('mass="1"', 'friction="nan"'), {}, ["NaN", "geom_friction"]),
     ],
 )
 def test_an_unusual_declaration_is_rejected(model, declared, parts):
