@@ -104,6 +104,29 @@ def test_every_kind_of_geom_is_drawn():
     assert by_name["box"][1]["dimensions"] == (0.2, 0.4, 0.6)
 
 
+def test_a_geom_s_name_may_have_slashes():
+    """Names are paths in viser: `arm/hand` would lie in the frame of the geom `arm`."""
+    geoms = '<geom name="arm" size=".1" pos="0 0 1"/><geom name="arm/hand" size=".1"/>'
+    added = Recorder()
+    scene.add(added, mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>"))
+    assert [call.count("/") for call, _, _ in added.calls] == [2, 3, 3]
+
+
+@pytest.mark.parametrize("mode", ["", 'mode="trackcom"', 'mode="targetbodycom" target="ball"'])
+def test_the_camera_front_may_be_in_a_body(mode):
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><body name="arm" pos="0 0 2"><joint/><geom size=".1"/>
+        <camera name="front" pos="1 0 0" fovy="30" {mode}/></body>
+        <body name="ball"><geom size=".1"/></body></worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.5
+    mujoco.mj_forward(model, data)
+    position, direction, angle = scene.front(model, data.qpos)
+    np.testing.assert_allclose(position, data.cam_xpos[0])
+    np.testing.assert_allclose(direction, -data.cam_xmat[0].reshape(3, 3)[:, 2])
+    assert angle == pytest.approx(np.radians(30))
+    assert scene.front(mujoco.MjModel.from_xml_string("<mujoco/>"), np.zeros(0)) is None
+
+
 class Recorder:
     """A scene of viser's that notes what is added."""
 

@@ -219,6 +219,7 @@ class Painter:
 
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)  # cameras can follow a centre of mass
         mujoco.mj_camlight(self._model, self._data)
         front = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, "front")  # -1, a free camera, if there is none
         self._renderer.update_scene(self._data, camera=front)

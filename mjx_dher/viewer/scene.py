@@ -60,6 +60,17 @@ class Poses:
         return self._data.xpos, self._data.xquat
 
 
+def front(model: Any, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Position [3] in m, direction [3] and vertical angle in rad of the camera "front" in a configuration [nq], or None."""
+    index, data = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "front"), mujoco.MjData(model)
+    if index < 0:
+        return None
+    data.qpos[:] = qpos
+    for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):  # it may be in a body, or follow one
+        compute(model, data)
+    return data.cam_xpos[index], -data.cam_xmat[index].reshape(3, 3)[:, 2], float(np.radians(model.cam_fovy[index]))
+
+
 def add(scene: Any, model: Any, ghosts: Any = None) -> dict[int, Any]:
     """Adds a model's geoms to a viser scene. Returns the nodes of bodies with geoms, by body number.
 
@@ -73,7 +84,8 @@ def add(scene: Any, model: Any, ghosts: Any = None) -> dict[int, Any]:
     for shape in chosen:
         if shape.body not in nodes:
             nodes[shape.body] = scene.add_frame(f"{folder}/{shape.body}", show_axes=False)
-        _add_shape(scene, model, shape, f"{folder}/{shape.body}/{shape.name}")
+        name = shape.name.replace("/", "|")  # a slash would put it into another geom's frame
+        _add_shape(scene, model, shape, f"{folder}/{shape.body}/{name}")
     return nodes
 
 

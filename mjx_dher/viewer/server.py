@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from mjx_dher.system import private_api
@@ -16,7 +15,7 @@ from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
 from mjx_dher.viewer import address
 from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
 from mjx_dher.viewer.player import Game, Player, bounds, make_game
-from mjx_dher.viewer.scene import Poses, add
+from mjx_dher.viewer.scene import Poses, add, front
 from mjx_dher.viewer.sources import Cast, Source
 
 _REACHED = (60, 180, 75)  # colour of a reached goal
@@ -197,18 +196,14 @@ class Viewer:
 
     def _aim(self, model: Any) -> None:
         """Moves the cameras to the model's camera "front", if it exists."""
-        cameras = [model.camera(index) for index in range(model.ncam) if model.camera(index).name == "front"]
-        if not cameras:
+        if (camera := front(model, self.player.qpos)) is None:
             return
-        position, center = np.array(cameras[0].pos), np.array(model.stat.center)
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, cameras[0].quat)
-        forward = -matrix.reshape(3, 3)[:, 2]
+        (position, forward, angle), center = camera, np.array(model.stat.center)
         look_at = position + forward * float(np.dot(center - position, forward))
         position = look_at + _BACK * (position - look_at)  # the panel takes a third of the page
         for camera in (self._server.initial_camera, *(client.camera for client in self._server.get_clients().values())):
             camera.position, camera.look_at = position, look_at
-            camera.fov = float(np.radians(cameras[0].fovy[0]))
+            camera.fov = angle
 
 
 def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:
