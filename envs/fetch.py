@@ -19,6 +19,7 @@ from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import State
 from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.engines.base import check_shape
 from mjx_dher.envs.simulated import Range, SimulatedTask
 from mjx_dher.types import Array, EnvSpec, PRNGKey
 
@@ -134,9 +135,13 @@ class FetchEnv(SimulatedTask):
         Args:
           object_qpos: position [3] in m and orientation [4] (w, x, y, z) of the object, or None for a task without object.
           desired_goal: goal [3] in m.
+
+        Raises:
+          ValueError: an array has another shape.
         """
         physics: Physics = jax.tree.map(jnp.asarray, self._rest)
         if object_qpos is not None:
+            check_shape("object_qpos", object_qpos, (7,))
             qpos = physics.qpos.at[self._object_qpos].set(jnp.asarray(object_qpos, jnp.float32))
             physics = dataclasses.replace(physics, qpos=qpos)
         return self.first_state(physics, desired_goal)

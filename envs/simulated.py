@@ -15,6 +15,7 @@ import numpy as np
 
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines.base import check_shape
 from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
 from mjx_dher.validation import check_count, check_number
 
@@ -126,6 +127,7 @@ class SimulatedTask(GoalEnv):
         """First state of an episode that starts from `physics`, with a goal [G]. If `physics` has diverged, it is like a state
         from `step`.
         """
+        check_shape("desired_goal", desired_goal, (self.goal_size,))
         physics = self._sensed(physics)
         sound = self.is_sound(physics)
         physics = self._or_rest(physics, sound)
@@ -141,6 +143,7 @@ class SimulatedTask(GoalEnv):
 
     def with_goal(self, state: State, goal: Array) -> State:
         """State with another desired goal [G]."""
+        check_shape("desired_goal", goal, (self.goal_size,))
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
         return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
 
@@ -168,6 +171,7 @@ class SimulatedTask(GoalEnv):
     def with_object(self, state: State, position: Array) -> State:
         """State with the start's first free body at rest at `position`, [3] in m."""
         assert self._object is not None
+        check_shape("position", position, (3,))
         at, dof, *_ = self._object
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
         qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)

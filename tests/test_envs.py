@@ -151,3 +151,16 @@ def test_physics_has_the_shapes_it_says(task):
     physics = task("push").reset(jax.random.key(7)).physics
     assert isinstance(physics, Physics)
     assert [x.shape for x in jax.tree.leaves(physics)] == [(14,), (13,), (13,), (0,)]
+
+
+def test_starts_and_goals_of_another_shape_are_rejected(task):
+    env = task("push", resolve_engine("auto")).env
+    state, start, goal = env.reset(jax.random.key(0)), jnp.array([1.3, 0.7, 0.425, 1, 0, 0, 0]), jnp.zeros(3)
+    with refuses("object_qpos", "[1]", "[7]"):
+        env.init_state(jnp.ones(1), goal)
+    with refuses("desired_goal", "[]", "[3]"):
+        env.init_state(start, 0.5)
+    with refuses("desired_goal", "[4, 3]", "[3]", "jax.vmap"):
+        env.with_goal(state, jnp.zeros((4, 3)))
+    with refuses("position", "[]", "[3]"):
+        env.with_object(state, 1.0)
