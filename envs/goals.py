@@ -57,12 +57,12 @@ class Goal:
         return about | {name: np.round(np.asarray(end, float), 6).tolist() for name, end in ends.items() if end is not None}
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
-        """Marks that show a goal: balls, and bodies as ghosts.
+        """Marks that show a goal: balls, and bodies as ghosts. By default none.
 
         Args:
           qpos: coordinates [nq].
         """
-        raise NotImplementedError
+        return []
 
 
 class Position(Goal):

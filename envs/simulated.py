@@ -69,6 +69,7 @@ class SimulatedTask(GoalEnv):
         substeps = substeps_of(self.hz, self.model.opt.timestep)
         self.dt = substeps * float(self.model.opt.timestep)  # s
         self._ranges = _ranges_of(self.varied if varied is None else varied)
+        self._engine_options = engine_options
         self.engine = make_engine(engine, self.model, substeps, varied=tuple(self._ranges), **engine_options)
         self.bind()
         self.distance_threshold = _plain(self.threshold if distance_threshold is None else distance_threshold)
@@ -145,7 +146,8 @@ class SimulatedTask(GoalEnv):
         """State with another desired goal [G]."""
         check_shape("desired_goal", goal, (self.goal_size,))
         obs: GoalObs = {**state.obs, "desired_goal": jnp.asarray(goal, jnp.float32)}
-        return dataclasses.replace(state, obs=obs, success=self._success(obs["achieved_goal"], obs["desired_goal"]))
+        success = jnp.where(state.failed, 0.0, self._success(obs["achieved_goal"], obs["desired_goal"]))
+        return dataclasses.replace(state, obs=obs, success=success)
 
     def step(self, state: State, action: Array) -> State:
         """Applies an action [A] for one step.

@@ -88,7 +88,7 @@ class MujocoTask(SimulatedTask):
         self.layout = {text: slice(*ends) for text, *ends in zip(texts, ends, ends[1:])}  # of the observation
         self.observation_size = ends[-1]
         if any(entry.sensors for entry in self._entries):
-            self._sensors = Sensors(self.engine.name, self.model, getattr(self.engine, "allow_cpu", False), tuple(self._ranges))
+            self._sensors = Sensors(self.engine.name, self.model, tuple(self._ranges), **self._engine_options)
             none: Any = np.zeros(self.model.nsensordata, np.float32)
             self._rest = dataclasses.replace(self._rest, sensors=none)  # `_sensed` reads them
         check_number("max_speed", self.max_speed, "(0, inf)", float)

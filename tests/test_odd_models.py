@@ -12,6 +12,7 @@ from conftest import refuses
 from mjx_dher.envs import task
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.envs.robot import RobotLoop
+from mjx_dher.viewer.player import Player, make_game
 
 
 def arm(actuators, joint="", more="", sensors=""):
@@ -68,6 +69,36 @@ def test_settling_works_with_sensors():
     )
     state = env.step(env.reset(jax.random.key(0)), jnp.zeros(1))
     np.testing.assert_allclose(state.obs["observation"][0], state.physics.qpos[0], atol=1e-6)
+
+
+def test_sensors_are_read_on_the_engine_s_threads():
+    model = arm(POSITION, sensors='<jointpos name="p" joint="j"/>')
+    declared = {"model": model, "goal": task.Joints("j"), "observations": ("sensor:p",)}
+    env = type("Odd", (task.MujocoTask,), declared)(engine="native", num_threads=3)
+    assert env.engine._num_threads == env._sensors._reader._num_threads == 3
+
+
+class Height(task.Goal):
+    """A goal of one's own, with what training needs."""
+
+    size, threshold = 1, 0.1
+
+    def achieved(self, physics):
+        return physics.qpos
+
+    def sample(self, key):
+        return jax.random.uniform(key, (1,))
+
+    @staticmethod
+    def distance(achieved, desired):
+        return jnp.abs(achieved - desired)[..., 0]
+
+
+def test_a_goal_of_one_s_own_without_marks_is_played_and_not_drawn():
+    env = make(arm(POSITION), goal=Height())
+    player = Player(make_game(env), lambda obs: np.zeros(1, np.float32), seed=1)
+    player.step()
+    assert (player.marks, env.goal_bounds, env.robot_interface["goal"]["kind"]) == ([], None, "Height")
 
 
 WELDED = """

@@ -216,6 +216,7 @@ def test_a_simulation_that_blows_up_fails_and_goes_back_to_the_start():
         state = step(dataclasses.replace(first, physics=first.physics.replace(qvel=qvel)), jnp.array([action]))
         assert (bool(state.failed), float(state.success)) == (True, 0.0)
         np.testing.assert_array_equal(state.physics.qpos, first.physics.qpos)
+        assert env.with_goal(state, state.obs["achieved_goal"]).success == 0
         state = step(state, jnp.zeros(1))
         assert np.isfinite(np.append(state.obs["observation"], 0 if state.failed else np.nan)).all()
 

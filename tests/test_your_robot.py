@@ -130,6 +130,19 @@ def test_an_edited_mjcf_changes_the_identity_of_a_run(tmp_path, monkeypatch):
     assert digests[0] != digests[1] == digests[2]
 
 
+def test_an_mjcf_in_another_folder_and_an_included_one_belong_to_the_identity(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "robot_elsewhere_of_test.py").write_text('model = "parts/arm.xml"')
+    (tmp_path / "parts" / "more").mkdir(parents=True)
+    files = {"arm.xml": '<include file="more/a.xml"/>', "more/a.xml": "<include file='b.xml'/>", "more/b.xml": "", "c.xml": ""}
+    digests = []
+    for name, content in [*files.items(), ("arm.xml", files["arm.xml"] + " "), ("more/b.xml", "new"), ("c.xml", "new")]:
+        (tmp_path / "parts" / name).write_text(content)
+        fingerprint._source.cache_clear()
+        digests.append(fingerprint.sources(RunSpec(env="robot_elsewhere_of_test:Reach"))["env"])
+    assert digests[3] != digests[4] != digests[5] == digests[6]  # the last one is not named
+
+
 SERVO = """
 <mujoco><option gravity="0 0 0"/>
   <worldbody><body><joint name="j" axis="0 0 1" damping="1" range="-90 90"/>

@@ -18,19 +18,19 @@ class Sensors:
 
     Args:
       engine: "native", "jax", "warp" or "warp graph". MuJoCo Warp reads them for both paths of warp.
-      allow_cpu: as in `WarpEngine`.
       varied: as in `make_engine`.
+      **options: the engine's options. Used are `num_threads` of native and `allow_cpu` of warp.
 
     Raises:
       ValueError: the implementation does not support the model.
     """
 
-    def __init__(self, engine: str, model: mujoco.MjModel, allow_cpu: bool = False, varied: Sequence[str] = ()):
+    def __init__(self, engine: str, model: mujoco.MjModel, varied: Sequence[str] = (), **options: Any):
         self._reader: Any
         if engine == "native":
             from mjx_dher.envs.engines.native import Simulator
 
-            self._reader = Simulator(model, derived=("sensordata",), varied=varied)
+            self._reader = Simulator(model, derived=("sensordata",), num_threads=options.get("num_threads"), varied=varied)
             self._rest = jax.device_get(self._reader.make_data())
         elif engine == "jax":
             from mjx_dher.envs.engines.mjx import MjxEngine
@@ -39,7 +39,9 @@ class Sensors:
         else:
             from mjx_dher.envs.engines.warp import WarpEngine
 
-            self._reader = WarpEngine(model, 0, path="graph", allow_cpu=allow_cpu, sensors=True, varied=varied)
+            self._reader = WarpEngine(
+                model, 0, path="graph", allow_cpu=options.get("allow_cpu", False), sensors=True, varied=varied
+            )
 
     def read(self, physics: Physics, controls: Controls) -> Array:
         """Values [nsensordata] of all sensors, in the model's order."""

@@ -79,8 +79,8 @@ def text(value: Any) -> str:
 def sources(spec: RunSpec) -> dict[str, str]:
     """Names and digests of the files of custom components and demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
-    A component's digest includes MJCF files in its folder that it names, but not the files that it imports. Each file is read
-    once per process, like its module.
+    A component's digest includes MJCF files that it names and the ones that these include, but no meshes, and not the files
+    that it imports. Each file is read once per process, like its module.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
     if spec.demonstrations is not None:
@@ -95,10 +95,23 @@ def _source(import_path: str) -> str | None:
     file = module_file(import_path)
     if file is None:
         return None
-    code = file.read_bytes()
-    return _name_and_digest(
-        file, [file, *(model for model in sorted(file.parent.glob("*.xml")) if model.name.encode() in code)]
-    )
+    return _name_and_digest(file, [file, *_models(file)])
+
+
+def _models(file: Path) -> list[Path]:
+    """MJCF files that a Python file names, and the files that these include."""
+    code, models = file.read_bytes(), set[Path]()
+    named = [model for model in file.parent.glob("*.xml") if model.name.encode() in code]
+    named += [file.parent / os.fsdecode(name) for name in re.findall(rb"[\"']([^\"'\n]{1,250}\.xml)[\"']", code)]
+    waiting = [(model, model.parent) for model in named]
+    while waiting:  # a nested file's path is relative to the first one's folder, or to its own
+        model, first = waiting.pop()
+        model = Path(os.path.normpath(model))
+        if model not in models and os.path.isfile(model):
+            models.add(model)
+            for name in re.findall(rb"<include\s+file\s*=\s*[\"']([^\"'\n]{1,250})[\"']", model.read_bytes()):
+                waiting += [(folder / os.fsdecode(name), first) for folder in (first, model.parent)]
+    return sorted(models)
 
 
 @functools.cache
