@@ -6,6 +6,7 @@ import json
 import math
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,6 +144,18 @@ def test_plot_draws_a_run_into_its_folder_and_several_together(tmp_path, monkeyp
     assert "seed 1 (not ended)" in capsys.readouterr().out
     assert cli.main(["plot", str(one), str(other), "--formats", "pdf", "--out", "new/folder"]) == 0
     assert (tmp_path / "new/folder/curves.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_every_name_of_a_run_is_drawn_as_it_is(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = ["_old", "$_$", "q\udcff", "new"]
+    drawn = [curves.read_curve(write_run(Path(name), epochs=5 + number)) for number, name in enumerate(names)]
+    (legend,) = curves.draw_together(drawn).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["_old", r"\$_\$", r"q\xff", "new"]
+    assert [line.get_color() for line in legend.get_lines()] == [color for color, *_ in figures.styles(4)]
+    assert cli.main(["plot", *names]) == 0
+    assert cli.main(["report", names[2]]) == 0
+    assert r"mjx-dher --config q\xff/config.json" in Path(names[2], "report.html").read_text()
 
 
 def test_what_is_no_run_is_named(tmp_path, capsys):

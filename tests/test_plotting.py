@@ -10,6 +10,7 @@ from test_comparison import cell, failed
 
 from mjx_dher.cli.common import print_table
 from mjx_dher.sweeps import comparison, plotting
+from mjx_dher.tools import figures
 
 LONG = "a_package_of_mine.samplers_of_mine:prefer_goals_that_are_near"
 ENV = "a_package_of_mine.environments:TaskOfMine"
@@ -68,6 +69,16 @@ def test_everything_written_is_inside_and_apart(name, env, count):
         boxes = sorted((box.x0, box.x1) for text, box in placed if text in axis.get_xticklabels())
         assert all(left[1] <= right[0] + 1 for left, right in itertools.pairwise(boxes)), boxes
     assert any("1 of 4 failed" in text.get_text().replace("\n", " ") for text, _ in placed)
+
+
+def test_each_setting_has_its_own_line_in_the_legend():
+    cells = [cell(sampler, seed, [0.2, 0.5]) for sampler in ("future", "_mine:a$_$", "mine:b") for seed in range(2)]
+    groups = comparison.groups(cells)["push"]
+    (legend,) = plotting.curves(groups, 0.9).legends
+    own = {text.get_text().replace(r"\$", "$"): line.get_color() for text, line in zip(legend.get_texts(), legend.get_lines())}
+    assert own == {group.label: color for group, (color, *_) in zip(groups, figures.styles(3))}
+    for figure in plotting.draw(groups, comparison.compare(groups, "future", 0.9), 0.9).values():
+        texts(figure)  # `$_$` is no formula
 
 
 @pytest.mark.parametrize(("lanes", "label"), [(1, "seconds (one run)"), (5, "seconds (parallel runs)")])

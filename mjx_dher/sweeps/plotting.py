@@ -58,7 +58,7 @@ def thresholds(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -
         axis.errorbar(place + 0.32, middle, [[middle - low], [high - middle]], color=color, marker=marker, capsize=4)
     axis.axhline(1.05 * last, color="0.6", linewidth=0.8, linestyle="--")
     axis.text(-0.45, never, "never", fontsize=8, va="center", color="0.3")
-    axis.set_xticks(range(len(groups)), names, fontsize=8)
+    axis.set_xticks(range(len(groups)), map(figures.plain, names), fontsize=8)
     axis.set_xlim(-0.5, len(groups) - 0.3)
     axis.set_ylim(0, 1.16 * last)
     axis.set_ylabel(f"epochs to {threshold:g}")
@@ -88,7 +88,7 @@ def comparison(rows: Sequence[Row]) -> Any:
         axis.grid(axis="x", alpha=0.2)
     axes[2].axvline(0.5, color="0.6", linewidth=0.8)
     axes[2].set_xlim(-0.03, 1.03)
-    axes[0].set_yticks(range(len(rows)), names, fontsize=9)
+    axes[0].set_yticks(range(len(rows)), map(figures.plain, names), fontsize=9)
     axes[0].invert_yaxis()
     figure.suptitle(figures.folded(f"{rows[0].env}: {_seeds(row.seeds for row in rows)}, 95 % intervals", 11), fontsize=11)
     return figure

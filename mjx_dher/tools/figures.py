@@ -76,8 +76,8 @@ def label_success(
         axis.grid(alpha=0.2)
     axes[0].set_ylabel("success rate")
     figure.suptitle(folded(title, figure.get_figwidth()), fontsize=11)
-    handles, _ = axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
+    lines = axes[0].get_lines()[: len(names)]  # Matplotlib's own list lacks names that begin with _
+    figure.legend(lines, list(map(plain, names)), loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
 def write(figure: Any, path: Path) -> None:
@@ -106,4 +106,9 @@ def to_svg(figure: Any, number: int) -> str:
 
 def folded(title: str, width: float) -> str:
     """Title folded to the width of a figure, in inches."""
-    return textwrap.fill(title, int(11.5 * width))
+    return plain(textwrap.fill(title, int(11.5 * width)))
+
+
+def plain(text: str) -> str:
+    """Text that Matplotlib draws as it is: without formulas, and with escaped bytes of file names that are not valid UTF-8."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace").replace("$", r"\$")

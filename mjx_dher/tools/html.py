@@ -33,8 +33,8 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def text(value: object) -> str:
-    """Escaped text of a value."""
-    return html.escape(str(value))
+    """Escaped text of a value, also bytes of file names that are not valid UTF-8."""
+    return html.escape(str(value).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"))
 
 
 def element(name: str, words: object, kind: str = "") -> str:
