@@ -110,9 +110,9 @@ def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array |
     return dataclasses.replace(ring, priority=weight if rows is None else ring.priority.at[rows].set(weight))
 
 
-def mean(priority: Priority, ring: ReplayState, weight: Array, context: Context) -> Array:
-    """Mean priority [] of the whole ring if it is renewed, else of new episodes, from their weights [N]."""
-    of_new = replay.mean(weight, len(weight))
+def mean(priority: Priority, ring: ReplayState, weight: Array, valid: Array, context: Context) -> Array:
+    """Mean priority [] of the whole ring if it is renewed, else of the `valid` [N] new episodes, from their weights [N]."""
+    of_new = replay.mean(jnp.where(valid, weight, 0.0), jnp.sum(valid))
     if priority.renew is None:
         return of_new
     of_ring = replay.mean(ring.priority, ring.size)

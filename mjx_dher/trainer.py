@@ -229,7 +229,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
         "discarded_episodes": jnp.sum(~outcome.valid),
-        "priority_mean": priorities.mean(loop.priority, ring, weights, context),
+        "priority_mean": priorities.mean(loop.priority, ring, weights, outcome.valid, context),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
         **relabelled,

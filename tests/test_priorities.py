@@ -167,3 +167,11 @@ def test_methods_that_ask_a_learner_name_the_values_that_they_lack():
     ):
         with refuses("values", "uses_values"):
             act()
+
+
+def test_discarded_episodes_are_not_in_the_mean_priority():
+    ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], EPISODES), 3), EPISODES)
+    eventful = priorities.whole(priorities.eventful)
+    for valid, expected in (([True, False, True], 3.0), ([True, True, True], 4.0), ([False] * 3, 0.0)):
+        found = priorities.mean(eventful, ring, jnp.array([1.0, 6.0, 5.0]), jnp.array(valid), CONTEXT)
+        assert found == expected
