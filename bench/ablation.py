@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import bakeoff
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes, tuned
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best, tuned
 
 from mjx_dher.spec import RunSpec
 
@@ -80,7 +80,7 @@ ABLATION = Experiment(
     learners=("gpu",),
     tasks=("pick_and_place", "slide"),
     spec_of=spec_of,
-    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    minutes=minutes_of_best,
     table="ablation.csv",
 )
 

@@ -14,7 +14,7 @@ import sys
 
 import bakeoff
 from ablation import numbered, sized
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best
 
 from mjx_dher import presets
 from mjx_dher.spec import RunSpec
@@ -44,7 +44,7 @@ HANDS = Experiment(
     learners=("gpu",),
     tasks=("hand_reach", "block_rotate_z"),
     spec_of=spec_of,
-    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    minutes=minutes_of_best,
     table="hands.csv",
 )
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import bakeoff
 from ablation import sized
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, estimated_minutes, tuned
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best, tuned
 
 from mjx_dher.spec import RunSpec
 
@@ -44,7 +44,7 @@ CRITICS = Experiment(
     learners=("gpu",),
     tasks=("slide", "block_rotate_z"),
     spec_of=spec_of,
-    minutes=lambda _, tasks, arms, seeds: estimated_minutes(("best",), tasks, arms, seeds),
+    minutes=minutes_of_best,
     table="modern_critics.csv",
 )
 

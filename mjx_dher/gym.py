@@ -176,12 +176,14 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
             self._painter = None
 
 
-def make_custom(name: str, render_mode: str | None = None, episode_length: int | None = None, **options: Any) -> Any:
+def make_custom(name: str, render_mode: str | None = None, episode_length: int | None = None, **options: Any) -> TimeLimit:
     """Makes a `GymEnv` that is truncated after `episode_length` steps, by default its own: the entry point of `ENV_ID`. In
     `gymnasium.make`, `max_episode_steps` can only make episodes shorter than that.
     """
     env = GymEnv(name, render_mode, **options)
-    return TimeLimit(env, env._compiled.spec.episode_length if episode_length is None else episode_length)
+    length = env._compiled.spec.episode_length if episode_length is None else episode_length
+    check_count("episode_length", length)
+    return TimeLimit(env, length)
 
 
 class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndarray]):

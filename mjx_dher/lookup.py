@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import importlib.util
 import inspect
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -16,6 +17,12 @@ from typing import Any
 # Of the command that runs.
 current_folder = False  # whether to search the current folder for components
 trusts_files = False  # --trust (`trust`)
+_BYTES = re.compile("[\udc80-\udcff]+")  # as Python decodes them
+
+
+def escaped(text: str) -> str:
+    """Text with escaped bytes of file names that are not valid UTF-8, which cannot be written."""
+    return _BYTES.sub(lambda match: match[0].encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"), text)
 
 
 def command_name() -> str:

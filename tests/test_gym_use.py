@@ -174,3 +174,9 @@ def test_a_custom_environment_plays_episodes_of_another_length(steps):
     env.reset(seed=0)
     truncated = [env.step(np.zeros(2, np.float32))[3] for _ in range(steps)]
     assert truncated == [False] * (steps - 1) + [True]
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, float("nan"), ""])
+def test_a_length_that_no_episode_can_have_is_refused_by_name(steps):
+    with refuses("episode_length", str(steps)):
+        gymnasium.make(ENV, name="point_mass:PointMass", episode_length=steps)

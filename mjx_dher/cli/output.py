@@ -16,15 +16,15 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from mjx_dher import lookup
+
 # Characters that control a terminal or reverse its text, except tab and line feed.
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
-_BYTES = re.compile("[\udc80-\udcff]+")  # undecodable bytes of a file name
 
 
 def printable(text: str) -> str:
     """Text with escaped control characters, and escaped bytes of file names that are not valid UTF-8."""
-    text = _BYTES.sub(lambda match: match[0].encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"), text)
-    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], text)
+    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], lookup.escaped(text))
 
 
 class PlainConsole(Console):

@@ -1,4 +1,4 @@
-"""The commands `list`, `check`, `engines`, `doctor` and `completion`, which show what there is and what works."""
+"""The commands `list`, `check`, `engines`, `doctor` and `completion`. They show components and this machine's state."""
 
 from __future__ import annotations
 

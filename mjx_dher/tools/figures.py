@@ -111,4 +111,4 @@ def folded(title: str, width: float) -> str:
 
 def plain(text: str) -> str:
     """Text that Matplotlib draws as it is: without formulas, and with escaped bytes of file names that are not valid UTF-8."""
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace").replace("$", r"\$")
+    return lookup.escaped(text).replace("$", r"\$")

@@ -7,6 +7,8 @@ import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from mjx_dher import lookup
+
 VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
 LARGEST = 50_000_000  # bytes of an embedded video
 
@@ -34,7 +36,7 @@ def page(title: str, body: Iterable[str]) -> str:
 
 def text(value: object) -> str:
     """Escaped text of a value, also bytes of file names that are not valid UTF-8."""
-    return html.escape(str(value).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"))
+    return html.escape(lookup.escaped(str(value)))
 
 
 def element(name: str, words: object, kind: str = "") -> str:

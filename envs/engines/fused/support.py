@@ -106,7 +106,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _narrow(model: mujoco.MjModel, kind: str) -> np.ndarray:
-    """Joints or tendons that can be at both limits at once: MuJoCo C has a row for each of them, and the kernel for one."""
+    """Joints or tendons that can be at both limits at once: MuJoCo C has a row for each limit, and the kernel one row."""
     limited, span, margin = (getattr(model, f"{kind}_{name}") for name in ("limited", "range", "margin"))
     return (limited != 0) & (span[:, 1] - span[:, 0] < 2 * margin)
 
