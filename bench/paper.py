@@ -143,7 +143,8 @@ _UPDATE = 23.8e-6  # seconds of gradients and drawing per run and update of 2,04
 _FLOAT32 = 82.2e-6  # the same in float32 with 20 parallel runs
 _STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
 _MORE = 1.25  # whole epochs over the sum of their parts, in the sweeps of 2026-11-22
-_CYCLES = 2.5  # seconds of an epoch with own cycles, whatever the number of runs: from three sweeps on an H100
+# Seconds of an epoch with own cycles, whatever the number of runs: from three sweeps on an H100, and from a part of Slide's.
+_CYCLES = {"push": 2.5, "pick_and_place": 5.0, "slide": 7.5}
 _LANES = 40
 _AROUND = 38.0  # seconds per command: compiling (24 to 47), imports, last evaluations, tables (12)
 
@@ -155,7 +156,7 @@ def estimate(sweep: Sweep) -> float:
     update = _FLOAT32 if sweep.own_cycles else _UPDATE
     epoch = 2000 * workers * update + steps / _STEPS_A_SECOND[sweep.task]
     runs = sweep.settings * sweep.seeds
-    waiting = _CYCLES * workers * sweep.epochs * math.ceil(runs / _LANES) if sweep.own_cycles else 0.0
+    waiting = _CYCLES[sweep.task] * sweep.epochs * math.ceil(runs / _LANES) if sweep.own_cycles else 0.0
     return _AROUND + _MORE * epoch * sweep.epochs * runs + waiting
 
 
