@@ -78,6 +78,8 @@ class BraxEnv:
 
     def with_goal(self, state: BraxState, goal: Array) -> BraxState:
         """State with another desired goal [G]."""
+        if jnp.shape(goal) != (shape := state.obs["desired_goal"].shape):
+            raise ValueError(f"goal has shape {jnp.shape(goal)}; {self.name} has goals {shape}")
         return dataclasses.replace(self._state(state.inner, goal, state.failed), reward=state.reward)
 
     def reached(self, achieved_goal: Array, desired_goal: Array) -> Array:

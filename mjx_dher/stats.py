@@ -58,10 +58,10 @@ def bootstrap_interval(
       statistic: function (values, axis=...) that reduces one axis, such as np.mean. Tasks are pooled.
 
     Raises:
-      ValueError: there are no scores, or `level` does not lie between 0 and 1.
+      ValueError: there are no scores, `level` does not lie between 0 and 1, or `repeats` is less than 1.
     """
     scores = _scores(scores)
-    rng = np.random.default_rng(seed)
+    rng = _generator(seed, repeats)
     chosen = rng.integers(len(scores), size=(repeats, *scores.shape))
     resampled = np.take_along_axis(scores[None], chosen, axis=1).reshape(repeats, -1)
     low, high = _quantiles(statistic(resampled, axis=1), level)
@@ -80,14 +80,14 @@ def curve_interval(
       Three arrays [P]: the mean, and the lower and upper ends of the interval.
 
     Raises:
-      ValueError: `curves` is not [S, P], or `level` does not lie between 0 and 1.
+      ValueError: `curves` is not [S, P], `level` does not lie between 0 and 1, or `repeats` is less than 1.
     """
     from scipy.stats import trim_mean
 
     curves = np.asarray(curves, float)
     _curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)
     num_seeds = len(curves)
-    chosen = np.random.default_rng(seed).integers(num_seeds, size=(repeats, num_seeds))
+    chosen = _generator(seed, repeats).integers(num_seeds, size=(repeats, num_seeds))
     low, high = _quantiles(trim_mean(curves[chosen], 0.25, axis=1), level)
     return trim_mean(curves, 0.25, axis=0), low, high
 
@@ -140,10 +140,10 @@ def improvement_interval(
       a, b: scores [S] or [S, K]. Their numbers of seeds may differ.
 
     Raises:
-      ValueError: as in `probability_of_improvement`, or `level` does not lie between 0 and 1.
+      ValueError: as in `probability_of_improvement`, `level` does not lie between 0 and 1, or `repeats` is less than 1.
     """
     a, b = _scores(a), _scores(b)
-    rng = np.random.default_rng(seed)
+    rng = _generator(seed, repeats)
     probability_of_improvement(a, b)  # raises if they cannot be compared
     a, b = (scores[:, None] if scores.ndim == 1 else scores for scores in (a, b))  # [A, K], [B, K]
     wins = np.greater(a[:, None], b[None]) + np.equal(a[:, None], b[None]) / 2  # [A, B, K]
@@ -224,7 +224,7 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
     if 2**seeds <= repeats:
         signs = 1 - 2 * (np.arange(2**seeds)[:, None] >> np.arange(seeds) & 1)
     else:
-        signs = np.random.default_rng(seed).choice([-1, 1], size=(repeats, seeds))
+        signs = _generator(seed, repeats).choice([-1, 1], size=(repeats, seeds))
         signs[0] = 1  # the data itself
     # A monotone function of |t|: a flip does not change the sum of squares.
     scale = np.sqrt(number * np.square(values).sum(axis=1))
@@ -236,6 +236,12 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
     # Flips with equal sums are ties, although rounding of the scores makes some sums smaller.
     p_values = np.maximum.accumulate((largest >= t[0, order] * (1 - 1e-9) - 1e-9).mean(axis=0))
     return [float(p_values[rank]) for rank in np.argsort(order)]
+
+
+def _generator(seed: int, repeats: int) -> np.random.Generator:
+    if not isinstance(repeats, int) or repeats < 1:
+        raise ValueError(f"repeats must be an integer, 1 or more; got {repeats!r}")
+    return np.random.default_rng(seed)
 
 
 def _scores(scores: ArrayLike) -> NDArray:

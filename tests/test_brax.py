@@ -75,6 +75,8 @@ def test_goals_rewards_and_ends():
     np.testing.assert_allclose(near.obs["achieved_goal"], goal - 0.2, atol=1e-6)
     assert near.obs["desired_goal"] == first.obs["desired_goal"]  # the first one of the episode
     assert env.with_goal(first, jnp.array([start])).success == 1.0
+    with refuses("(2,)", "(1,)"):
+        env.with_goal(first, jnp.zeros(2))
     rewards = env.compute_reward(jnp.zeros((2, 3, 1)), jnp.array([0.2, 0.3, jnp.nan])[:, None])
     np.testing.assert_array_equal(rewards, np.tile([0.0, -1.0, -1.0], (2, 1)))
     assert last.success == 1.0  # of a tenth of the distance

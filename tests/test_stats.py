@@ -190,3 +190,5 @@ def test_curve_interval_is_the_interval_of_each_point():
         stats.curve_interval(curves[0])
     with refuses("level", 1.0):
         stats.curve_interval(curves, level=1.0)
+    with refuses("repeats", 0):
+        stats.curve_interval(curves, repeats=0)

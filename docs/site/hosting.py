@@ -12,7 +12,7 @@ from typing import Any
 
 HERE = Path(__file__).parent
 LONGEST = 200  # characters of a description
-CARD = "_static/card.png"
+CARD = "_static/card.png"  # by make_card.py
 
 
 def description(doctree: Any) -> str:

@@ -208,6 +208,7 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
 
         def begin() -> list[int]:
             stack.enter_context(files.made(args.out / grid.CELLS))
+            settings.check_writable(args.out / grid.CELLS)
             return [places[trial] for trial in _announce(args, trials, console)]
 
         todo = [trials[place] for place in processes.broadcast(begin)]
