@@ -18,7 +18,7 @@ from mjx_dher import rates
 from mjx_dher.contract import check_steps
 from mjx_dher.policy import TrainedPolicy
 from mjx_dher.rollout import Outcome, rollout
-from mjx_dher.types import Array, Env, EnvSpec, GoalObs, PRNGKey
+from mjx_dher.types import Array, Env, EnvSpec, GoalObs, PRNGKey, check_size
 
 CHUNK = 500  # episodes at once
 
@@ -38,6 +38,7 @@ def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -
     """Plays episodes of a policy from `load_policy`, with initial states drawn by `seed`. Returns outcomes [num_episodes] as
     NumPy arrays.
     """
+    check_size("num_episodes", num_episodes)
     chunk = min(num_episodes, CHUNK)
 
     @jax.jit

@@ -57,7 +57,7 @@ def _update(
     valid = jnp.ones((), bool) if valid is None else valid
     mask = jnp.broadcast_to(jnp.expand_dims(valid, range(valid.ndim, ndim)), values.shape[:ndim])
     mask = mask.reshape(-1, *(1,) * len(shape))
-    values = jnp.clip(values, -clip, clip).reshape(-1, *shape)
+    values = jnp.clip(values.astype(state.mean.dtype), -clip, clip).reshape(-1, *shape)
     number = split.total(jnp.sum(mask), axis_name).astype(jnp.float32)
     batch_mean = split.total(jnp.sum(jnp.where(mask, values, 0.0), axis=0), axis_name) / jnp.maximum(number, 1.0)
     squares = jnp.where(mask, jnp.square(values - batch_mean[None]), 0.0)

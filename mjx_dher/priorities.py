@@ -85,6 +85,7 @@ def weights(priority: PriorityFn | Priority, episodes: Episode, context: Context
     """Weights [N] of N episodes (leaves lead with [N]), float32. Any weight that is not positive and finite becomes 0. Raises
     ValueError if the priority does not return a real number [].
     """
+    episodes = episodes.filled()
     number, weigh = episodes.action.shape[0], whole(priority).weigh
     if weigh is None:
         return jnp.zeros(number, jnp.float32)

@@ -174,7 +174,7 @@ def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
 def _add_episodes(loop: Loop, state: TrainState, episodes: Episode) -> TrainState:
     """Adds an equal number of the episodes on each device."""
     rows = split.own_rows(episodes.action.shape[0], loop.axis_name)
-    episodes = jax.tree.map(lambda x: jnp.asarray(x)[rows], episodes)
+    episodes = jax.tree.map(lambda x: jnp.asarray(x)[rows], episodes.filled())
     context = _context(loop, state.learner, state.hparams, jnp.zeros(()))
     ring = replay.add(state.replay, episodes, priorities.weights(loop.priority, episodes, context))
     key = split.own_key(jax.random.fold_in(state.key, ADD), loop.axis_name)

@@ -164,6 +164,9 @@ def test_layers_for_export_are_those_of_the_means():
     np.testing.assert_allclose(hidden @ layers["Dense_1"]["kernel"] + layers["Dense_1"]["bias"], mean, rtol=1e-5)
     assert Gaussian().dense(Fixed(), params) is None
     assert Deterministic().dense(Straight(), {}) is None
+    for kind, network in ((Deterministic(), Actor), (Gaussian(), GaussianActor)):
+        own = type("Own", (network,), {})  # may compute something else
+        assert kind.dense(own(2, (8,)), {"params": {}, "network": {"params": {}}}) is None
     assert set(Deterministic().dense(Actor(2, (8,)), Deterministic().init(Actor(2, (8,)), KEY, *inputs))) == {
         "Dense_0",
         "Dense_1",

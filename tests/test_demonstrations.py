@@ -130,6 +130,13 @@ def test_the_ring_holds_them_and_the_normalizers_have_seen_them():
     assert int(jax.jit(train.epoch)(state)[0].replay.size) == 8  # of six and four, as many as the ring holds
 
 
+def test_the_ring_takes_episodes_without_length_and_terminal():
+    train = trainer.make_train(Ending(), TINY, priority=lambda episode, context: episode.length)
+    episodes = dataclasses.replace(played(), length=None, terminal=None)
+    state = train.add(train.init(jax.random.key(0), HParams()), episodes)
+    np.testing.assert_array_equal(state.replay.priority, [10.0] * 6 + [0.0] * 2)
+
+
 def test_a_run_is_trained_resumed_and_told_from_another_file_s(file, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     command = [*flags(TINY), "--final-episodes", "4", "--no-curve", "--demonstrations", str(file)]

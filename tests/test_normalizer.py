@@ -38,6 +38,13 @@ def test_normalize_by_hand():
     np.testing.assert_allclose(got, [[5.0, -5.0, 0.0]])
 
 
+def test_sums_of_float16_values_do_not_overflow():
+    values = jnp.linspace(90, 110, 3000, dtype=jnp.float16)[:, None]
+    state = update(normalizer.init(values[0]), values, 200.0)
+    exact = np.asarray(values, np.float64)
+    np.testing.assert_allclose([state.mean[0], state.var[0]], [exact.mean(), exact.var()], rtol=1e-4)
+
+
 def test_values_are_clipped_before_they_count():
     state = update(normalizer.init(jnp.zeros(1)), jnp.array([[1e9], [0.0]]), 200.0)
     np.testing.assert_allclose(state.mean, [100.0])

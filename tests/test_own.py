@@ -201,8 +201,11 @@ def test_its_policy_needs_no_module(folder):
 
 
 def test_a_policy_is_played_where_there_is_no_check(folder):
-    outcome = play_policy(PointMass(), mjx_dher.load_policy(folder / "run"), num_episodes=4, seed=0)
+    policy = mjx_dher.load_policy(folder / "run")
+    outcome = play_policy(PointMass(), policy, num_episodes=4, seed=0)
     assert outcome.success.shape == (4,)
+    with refuses("num_episodes", 0):
+        play_policy(PointMass(), policy, num_episodes=0, seed=0)
 
 
 def test_a_sweep_takes_them(folder, monkeypatch):

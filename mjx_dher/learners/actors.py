@@ -121,4 +121,4 @@ class Deterministic:
         return -jnp.mean(judge(action)) + hparams.action_l2 * jnp.mean(jnp.square(action)), {}
 
     def dense(self, network: Any, params: PyTree) -> Any:
-        return params["params"] if isinstance(network, Actor) and network.style.is_plain else None
+        return params["params"] if type(network) is Actor and network.style.is_plain else None

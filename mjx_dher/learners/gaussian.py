@@ -69,7 +69,7 @@ class Gaussian:
 
     def dense(self, network: Any, params: PyTree) -> Any:
         """Linear layers, without the last layer's outputs for standard deviations, or None for custom networks."""
-        if not (isinstance(network, GaussianActor) and network.style.is_plain):
+        if not (type(network) is GaussianActor and network.style.is_plain):
             return None
         layers = dict(params["network"]["params"])
         last = f"Dense_{len(layers) - 1}"
