@@ -292,6 +292,15 @@ def test_the_tables_hold_every_epoch_and_every_setting(tmp_path):
         assert learned({"observation": np.zeros(2), "achieved_goal": np.zeros(2), "desired_goal": np.zeros(2)}).shape == (2,)
 
 
+def test_a_metric_with_a_setting_s_name_has_its_own_column(tmp_path):
+    settings = dataclasses.asdict(CONFIG) | {"env_kwargs": (), "entropy_weight": 0.5}
+    curve = {name: [1] for name in ("epoch", "env_steps", "updates", "wall_seconds")} | {"entropy_weight": [0.4]}
+    trial = {"settings": settings, "seed": 0, "lanes": 1, "status": "finished", "reason": None, "curve": curve, "final": {}}
+    tables.write(tmp_path, [trial])
+    (row,) = csv.DictReader((tmp_path / tables.RESULTS).open())
+    assert (row["entropy_weight"], row["metric_entropy_weight"]) == ("0.5", "0.4")
+
+
 @pytest.mark.slow
 def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, monkeypatch):
     """All four rings would fit; four whole programs do not."""

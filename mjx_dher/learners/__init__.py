@@ -23,7 +23,7 @@ RESERVED = frozenset(
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
         *("relabelled_share", "relabel_distance", "discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
         *("epoch", "env_steps", "updates", "wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes"),
-        "train_length_mean",
+        *("train_length_mean", "digest"),
     )
 )
 
@@ -230,8 +230,9 @@ def check_metrics(method: str, metrics: Any, taken: Collection[str] = ()) -> Non
     if not isinstance(metrics, dict):
         raise ValueError(f"metrics of learner.{method} must be a dict of scalars; they are a {type(metrics).__name__}")
     for name, value in metrics.items():
-        if not isinstance(name, str) or name in RESERVED or name in taken:
-            reason = "is taken" if isinstance(name, str) else "is not a string"
+        fits_csv = isinstance(name, str) and name.isprintable() and not set(name) & set(',"') and name
+        if not fits_csv or name in RESERVED or name in taken:
+            reason = "is taken" if fits_csv else "is not a string without commas, quotes and line breaks"
             raise ValueError(f"metrics of learner.{method} must have unique names; {name!r} {reason}")
         check.array(f"metric {name} of learner.{method}", value, (), jnp.number)
 

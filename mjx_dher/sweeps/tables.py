@@ -76,7 +76,7 @@ def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
         sizes = "x".join(map(str, trial["settings"]["hidden_sizes"]))
         own = {"hidden_sizes": sizes, "env_kwargs": " ".join(trial["settings"]["env_kwargs"])}
         head = {**trial["settings"], **own, "seed": trial["seed"], "lanes": trial["lanes"]}
-        curve = trial["curve"]
+        curve = {f"metric_{name}" if name in head else name: values for name, values in trial["curve"].items()}
         epochs = range(len(curve.get("epoch", ())))
         results += [{**head, **{name: values[i] for name, values in curve.items()}} for i in epochs]
         last = {name: curve[name][-1] for name in ("epoch", "env_steps", "updates", "wall_seconds") if epochs}
