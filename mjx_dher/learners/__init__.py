@@ -23,7 +23,7 @@ RESERVED = frozenset(
         *("success_rate", "reset_success_rate", "return_mean", "train_success_rate", "train_return_mean", "priority_mean"),
         *("relabelled_share", "relabel_distance", "discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
         *("epoch", "env_steps", "updates", "wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes"),
-        *("train_length_mean", "digest"),
+        *("train_length_mean", "digest", "file"),
     )
 )
 
