@@ -4,9 +4,9 @@
     python bench/record.py --draw
 
 A line has the commit, the date, the machine, the versions, and the figures: environment steps per second of a rollout of Push,
-updates per second of DDPG with the machine's preset, and the seconds of `python train.py` from Enter to its first epoch,
-before and after compilation. It takes some minutes. A busy machine or a working tree with changes is an error, because the
-line would not describe the commit; with `--anyway` the line has a remark instead.
+updates per second of DDPG and of the learners of PickAndPlace and Slide with the machine's preset, and the seconds of `python
+train.py` from Enter to its first epoch, before and after compilation. It takes some minutes. A busy machine or a working tree
+with changes is an error, because the line would not describe the commit; with `--anyway` the line has a remark instead.
 
 --draw writes history.md and history.svg next to the file (extra `plot`).
 """
@@ -33,10 +33,13 @@ BUSY = 0.15  # of the cores, by the load of the last minute; beyond it other pro
 # Description and digits of the figures by name.
 FIGURES = {
     "env_steps_per_second": ("environment steps a second", 0),
-    "updates_per_second": ("updates a second", 0),
+    "updates_per_second": ("updates a second, ddpg", 0),
     "cold_start_seconds": ("seconds to the first epoch, nothing compiled", 1),
     "warm_start_seconds": ("seconds to the first epoch", 1),
+    "pick_and_place_updates_per_second": ("updates a second, PickAndPlace", 0),
+    "slide_updates_per_second": ("updates a second, Slide", 0),
 }
+FIRST = list(FIGURES)[:4]  # that all lines have
 FIELDS = ("date", "commit", "remarks", "machine", "versions", "setup", "figures")
 
 
@@ -58,7 +61,8 @@ def read(path: Path) -> list[dict[str, Any]]:
         try:
             entry = json.loads(line)
             missing = [name for name in FIELDS if name not in entry]
-            wrong = [name for name in FIGURES if not 0 < float(entry["figures"][name]) < math.inf]
+            numbers = {**dict.fromkeys(FIRST), **entry["figures"]}
+            wrong = [name for name, number in numbers.items() if name in FIGURES and not 0 < float(number) < math.inf]
             if missing or wrong:
                 raise ValueError(f"without {', '.join(missing + wrong)}")
         except (ValueError, KeyError, TypeError) as error:
@@ -74,7 +78,8 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
     from mjx_dher import config, presets
 
     preset = startup.machine_preset()
-    run = presets.preset(preset, "push", learner="ddpg").config
+    spec = presets.preset(preset, "push", learner="ddpg")
+    run = spec.config
     steps = str(2 * config.steps_per_epoch(run, 50))
     command = ["--env", "push", "--preset", preset, "--learner", "ddpg", "--total-steps", steps, "--no-curve"]
     with tempfile.TemporaryDirectory() as home:
@@ -86,14 +91,18 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
 
     from mjx_dher import learners, samplers
     from mjx_dher.envs.engines import resolve_engine
-    from mjx_dher.types import EnvSpec
 
     engine = resolve_engine("auto")
-    rates = [throughput.measure("push", engine, run.num_envs)[0] for _ in range(repeats)]
-    made = learners.make("ddpg", run, EnvSpec(jax.ShapeDtypeStruct((25,), jax.numpy.float32), 3, 4, episode_length=50))
-    timed = learner_bench.Timed(made, run.batch_size, 1, samplers.make("future"), 200)
+    rates = [throughput.measure("push", engine, run.num_envs, "auto", False, 3)[1] for _ in range(repeats)]
+
+    def updating(spec: Any, updates: int) -> Any:
+        made = learners.make(spec.learner, spec.config, learner_bench.SPEC, spec.networks)
+        return learner_bench.Timed(made, spec.config.batch_size, 1, samplers.make("future"), updates)
+
+    timed = updating(spec, 200)
     updates = [1 / timed.seconds()[0] for _ in range(repeats)]
-    medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]))
+    others = [1 / updating(presets.preset(preset, task), 50).seconds()[0] for task in ("pick_and_place", "slide")]
+    medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]), *others)
     setup = {"preset": preset, "engine": engine, "num_envs": run.num_envs, "batch_size": run.batch_size, "repeats": repeats}
     spread = {name: [float(f"{x:.4g}") for x in (min(many), max(many))] for name, many in zip(FIGURES, (rates, updates))}
     return dict(zip(FIGURES, medians)), {**setup, "lowest_and_highest": spread, "device": jax.devices()[0].device_kind}
@@ -139,7 +148,8 @@ def page(entries: list[dict[str, Any]]) -> str:
     head = ["date", "commit", *(label for label, _ in FIGURES.values()), "machine", "versions", "remarks"]
     lines += ["![Each figure over time](history.svg)", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for entry in reversed(entries):
-        figures = [f"{entry['figures'][name]:,.{digits}f}" for name, (_, digits) in FIGURES.items()]
+        known = entry["figures"]
+        figures = [f"{known[name]:,.{digits}f}" if name in known else "" for name, (_, digits) in FIGURES.items()]
         versions = ", ".join(f"{name} {version}" for name, version in entry["versions"].items())
         cells = [entry["date"][:10], f"`{entry['commit']}`", *figures, entry["machine"], versions, "; ".join(entry["remarks"])]
         lines.append(f"| {' | '.join(cells)} |")
@@ -150,11 +160,11 @@ def draw(entries: list[dict[str, Any]]) -> Any:
     """Draws each figure over time, one line per machine. Entries with remarks are hollow."""
     from mjx_dher.tools import figures
 
-    figure, axes = figures.subplots(2, 2, 11, 6)
+    figure, axes = figures.subplots(2, 3, 15, 6)
     machines = list(dict.fromkeys(entry["machine"] for entry in entries))
     for axis, (name, (label, _)) in zip(axes, FIGURES.items()):
         for machine, (color, line, marker) in zip(machines, figures.styles(len(machines))):
-            own = [entry for entry in entries if entry["machine"] == machine]
+            own = [entry for entry in entries if entry["machine"] == machine and name in entry["figures"]]
             dates = [datetime.datetime.fromisoformat(entry["date"]) for entry in own]
             axis.plot(dates, [entry["figures"][name] for entry in own], color=color, linestyle=line, label=machine)
             for date, entry in zip(dates, own):

@@ -36,7 +36,7 @@ def test_the_page_has_a_row_an_entry_the_newest_first(tmp_path):
     entries = record.read(path)
     assert entries == [ENTRY, LATER]
     rows = [line for line in record.page(entries).splitlines() if line.startswith("| 2026")]
-    assert rows[0].startswith("| 2026-11-21 | `0123456789ab` | 12,345 | 234 | 31.2 | 6.5 | other |")
+    assert rows[0].startswith("| 2026-11-21 | `0123456789ab` | 12,345 | 234 | 31.2 | 6.5 |  |  | other |")
     assert rows[0].endswith("| machine busy: load 1.00 on 2 cores |")
     assert len(rows) == 2
     figure = record.draw(entries)
