@@ -65,7 +65,7 @@ class Actuators(Control):
     """Actuators of any kind: -1 and 1 are the ends of the actuator's ctrlrange.
 
     Args:
-      names: names of actuators or of their joints, separated by spaces; "*" and "?" match any characters.
+      names: names of enabled actuators or of their joints, separated by spaces; "*" and "?" match any characters.
       together: whether one number of the action moves all actuators, like the fingers of a gripper.
     """
 
@@ -76,7 +76,7 @@ class Actuators(Control):
         check_number("scale of control", self.scale, "(0, inf)", float)
         bound = copy.copy(self)
         own, joints = [""] * model.nu, [""] * model.nu  # names of actuators of this kind, and of their joints
-        for i in filter(lambda i: self._suits(model, i), range(model.nu)):
+        for i in filter(lambda i: self._suits(model, i) and _acts(model, i), range(model.nu)):
             joints[i] = names_of(model, "joint")[joint] if (joint := _joint(model, i)) >= 0 else ""
             own[i] = model.actuator(i).name or joints[i] or Numbered(f"actuator_{i}")
         bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
@@ -226,6 +226,12 @@ def is_servo(model: mujoco.MjModel, index: int) -> bool:
     return _pulls(model, index) and model.actuator_dyntype[index] != _INTEGRATOR
 
 
+def _acts(model: mujoco.MjModel, index: int) -> bool:
+    """Whether no flag and no disabled group switches the actuator off."""
+    group, flag = int(model.actuator_group[index]), int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    return not (model.opt.disableflags & flag or (group in range(31) and model.opt.disableactuator >> group & 1))
+
+
 def _pulls(model: mujoco.MjModel, index: int) -> bool:
     """Whether an actuator's force is linear, and decreases with the position."""
     is_linear = model.actuator_gaintype[index] == _FIXED and model.actuator_biastype[index] == _AFFINE
@@ -243,36 +249,34 @@ class Holding:
     """Inputs and activations that hold a configuration: servos at their present lengths. Other actuators get 0.
 
     Args:
-      lengths: of the actuators, [nu].
+      data: a configuration of the model, with the actuators' lengths and moments.
     """
 
-    def __init__(self, model: mujoco.MjModel, lengths: np.ndarray):
-        self.ctrl, self.act = np.zeros(model.nu), np.zeros(model.na)
-        self._followers: dict[int, list[tuple[Any, ...]]] = {}  # by index in qpos, servos of a joint
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        moments = np.zeros((model.nu, model.nv))
+        sparse = (getattr(data, name) for name in ("actuator_moment", "moment_rownnz", "moment_rowadr", "moment_colind"))
+        mujoco.mju_sparse2dense(moments, *sparse)
+        lines = np.zeros((4, model.nu))  # slope, offset, lowest and highest target
+        inputs, self._owners, held = np.zeros(model.nu), np.zeros(model.na, int), np.zeros(model.na)
         for i in filter(lambda i: _pulls(model, i), range(model.nu)):
-            slope, offset = _holding(model, i)
-            part = "ctrl" if is_servo(model, i) else "act"  # a velocity servo's activation is its position
+            inputs[i] = is_servo(model, i)
+            part = "ctrl" if inputs[i] else "act"  # a velocity servo's activation is its position
             is_limited, ends = (getattr(model, f"actuator_{part}{field}")[i] for field in ("limited", "range"))
-            low, high = ends if is_limited else (-np.inf, np.inf)
-            target = np.clip(slope * lengths[i] + offset, low, high)
-            activation = int(model.actuator_actadr[i])
-            if activation >= 0:
-                self.act[activation] = target
-            if is_servo(model, i):
-                self.ctrl[i] = target
-                if (joint := _joint(model, i)) >= 0:
-                    slope *= model.actuator_gear[i, 0]
-                    numbers = np.array([slope, offset, low, high], np.float32)
-                    self._followers.setdefault(int(model.jnt_qposadr[joint]), []).append((i, activation, numbers))
+            lines[:, i] = *_holding(model, i), *(ends if is_limited else (-np.inf, np.inf))
+            if (activation := int(model.actuator_actadr[i])) >= 0:
+                self._owners[activation], held[activation] = i, 1.0
+        self._arrays = data.qpos.copy(), data.actuator_length.copy(), moments, lines, inputs, held
 
-    def at(self, places: Sequence[int], qpos: Array, ctrl: Array, act: Array) -> tuple[Array, Array]:
-        """Inputs and activations that also hold the joints with indices `places` in qpos at their positions in `qpos`."""
-        for place in places:
-            for i, activation, (slope, offset, low, high) in self._followers.get(place, []):
-                target = jnp.clip(slope * qpos[place] + offset, low, high)
-                ctrl = ctrl.at[i].set(target)
-                act = act if activation < 0 else act.at[activation].set(target)
-        return ctrl, act
+    def at(self, drawn: Sequence[Any], qpos: Array, xp: Any = jnp) -> tuple[Array, Array]:
+        """Inputs and activations that hold `qpos`, which differs in the ranges `drawn`. Lengths of spatial tendons and sites
+        are to first order. `xp` is NumPy or jax.numpy.
+        """
+        nominal, lengths, moments, lines, inputs, held = (xp.asarray(array, qpos.dtype) for array in self._arrays)
+        for at, dof, low, _ in drawn:
+            part = moments[:, dof : dof + len(low)] * (qpos - nominal)[at : at + len(low)]
+            lengths = lengths + xp.sum(part, axis=1)
+        targets = xp.clip(lines[0] * lengths + lines[1], lines[2], lines[3])
+        return inputs * targets, held * targets[self._owners]
 
 
 def _joint(model: mujoco.MjModel, index: int) -> int:
@@ -284,10 +288,13 @@ def _joint(model: mujoco.MjModel, index: int) -> int:
 def _range(model: mujoco.MjModel, index: int) -> Any:
     """Lowest and highest input of an actuator."""
     joint = _joint(model, index)
+    ends = np.array([-np.inf, np.inf])
     if model.actuator_ctrllimited[index]:
-        return model.actuator_ctrlrange[index]
-    if is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
+        ends = model.actuator_ctrlrange[index]
+    elif is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
         slope, offset = _holding(model, index)
-        return np.sort(slope * model.actuator_gear[index, 0] * model.jnt_range[joint] + offset)
+        ends = np.sort(slope * model.actuator_gear[index, 0] * model.jnt_range[joint] + offset)
+    if (abs(ends) <= mujoco.mjMAXVAL).all():  # MuJoCo replaces larger inputs by 0
+        return ends
     name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")
     raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")

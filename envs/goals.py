@@ -112,6 +112,7 @@ class Rotation(Goal):
         self.of, self.axis, self.threshold = of, axis, threshold
 
     def bind(self, model: mujoco.MjModel) -> Self:
+        check_number("threshold of the goal, rad,", self.threshold, "(0, 3.14]", float)  # distances are at most pi
         bound = super().bind(model)
         bound.place = Place(model, self.of)
         if self.axis is not None:
@@ -226,7 +227,7 @@ class Joints(Goal):
         unlimited = ~model.jnt_limited[bound.joints].astype(bool)
         if (self.low is None or self.high is None) and unlimited.any():
             raise ValueError(f"goal: joint {names[bound.joints[int(np.argmax(unlimited))]]!r} has no range; pass low and high")
-        limits[:, unlimited] = [[-np.inf], [np.inf]]
+        limits[:, unlimited] = [[-mujoco.mjMAXVAL], [mujoco.mjMAXVAL]]
         low, high = (limit if end is None else end for limit, end in zip(limits, (self.low, self.high)))
         bound.low, bound.high = box("goal", bound.size, (low, high))
         for i in np.flatnonzero((bound.low < limits[0] - 1e-6) | (bound.high > limits[1] + 1e-6))[:1]:

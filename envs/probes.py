@@ -31,7 +31,8 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
             warnings.warn(f"{names[0]!r} and {names[1]!r} overlap by {-contact.dist:.2g} m at the start", stacklevel=2)
             break
     rng = np.random.default_rng(0)
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, 0.0).T
+    finite = np.isfinite(model.actuator_ctrlrange) & model.actuator_ctrllimited[:, None].astype(bool)
+    low, high = np.where(finite, model.actuator_ctrlrange, 0.0).T
     inputs = {"held at the start": ctrl, "under random inputs": rng.uniform(low, high)}
     for what, held in inputs.items():
         data = _fresh(model, qpos)

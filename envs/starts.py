@@ -51,15 +51,14 @@ class Start:
             at, dof, low, high = places[name]
             drawn = Range(at, dof, *box(f"start: {name}", len(low), ends))
             if np.any(drawn.low < low) or np.any(drawn.high > high):
-                raise ValueError(f"start: joint {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
+                raise ValueError(f"start: {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
             bound.drawn.append(drawn)
             data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
-        given, ctrl, act = data.ctrl.any() or data.act.any(), data.ctrl.copy(), data.act.copy()
+        given = data.ctrl.any() or data.act.any()
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
             compute(model, data)  # the actuators' lengths
-        bound._holding = None if given else Holding(model, data.actuator_length)
-        if bound._holding:
-            ctrl, act = bound._holding.ctrl, bound._holding.act
+        bound._holding = None if given else Holding(model, data)
+        ctrl, act = bound._holding.at((), data.qpos, np) if bound._holding else (data.ctrl, data.act)
         mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
         # NumPy arrays become constants of the programs that use them, on any device.
         arrays: Any = [np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), act, ctrl, mocap)]
@@ -81,7 +80,7 @@ class Start:
         hold = jax.tree.map(jnp.asarray, self.hold)
         if self._holding is None:
             return physics, hold
-        ctrl, act = self._holding.at([drawn.qpos for drawn in self.drawn], physics.qpos, hold.ctrl, physics.act)
+        ctrl, act = self._holding.at(self.drawn, physics.qpos)
         return dataclasses.replace(physics, act=act), dataclasses.replace(hold, ctrl=ctrl)
 
     physics: Physics  # the start, with the middle of each range
@@ -92,12 +91,12 @@ class Start:
 
 def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
     """For each name of a free body, hinge or slide: first index in qpos and in qvel, and limits (3 numbers, or 1)."""
-    places = {}
+    places, free = {}, mujoco.mjMAXVAL * np.array([[-1.0], [1.0]])  # MuJoCo takes larger positions for a divergence
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
         if kind == FREE:
-            places[names_of(model, "body")[model.jnt_bodyid[i]]] = (*at, np.full(3, -np.inf), np.full(3, np.inf))
+            places[names_of(model, "body")[model.jnt_bodyid[i]]] = (*at, *np.repeat(free, 3, axis=1))
         elif kind in (HINGE, SLIDE):
-            low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] else np.array([[-np.inf], [np.inf]])
+            low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] else free
             places[names_of(model, "joint")[i]] = (*at, low - 1e-6, high + 1e-6)
     return places

@@ -67,6 +67,8 @@ class MujocoTask(SimulatedTask):
 
     def bind(self) -> None:
         """Looks up the declared names in the model, and probes the model."""
+        if not callable(self.controls):
+            raise ValueError(f"controls is a method of a task; the field is control; got controls = {self.controls!r}")
         declared = self.control if isinstance(self.control, Sequence) else (self.control,)
         self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
         self.action_size = sum(part.size for part in self.parts)

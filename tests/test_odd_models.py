@@ -32,6 +32,7 @@ def arm(actuators, joint="", more="", sensors=""):
 
 
 POSITION = '<position name="servo" joint="j" kp="20"/>'
+BALL = '<body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/></body>'
 
 
 def make(model, **declared):
@@ -49,12 +50,8 @@ def make(model, **declared):
     ],
 )
 def test_settling_holds_each_drawn_start(actuator):
-    control = task.Actuators() if "servo" not in actuator and "range" in actuator else task.JointDelta("j")
-    drawn = {} if "range" in actuator else {"j": (-1.0, 1.0)}
-    model = (
-        arm(actuator) if drawn else arm(actuator).replace("</mujoco>", '<keyframe><key name="k" qpos="1"/></keyframe></mujoco>')
-    )
-    env = make(model, control=control, start=task.Start(None if drawn else "k", drawn, settle=20))
+    control = task.Actuators() if "range" in actuator else task.JointDelta("j")
+    env = make(arm(actuator), control=control, start=task.Start(ranges={"j": (-1.0, 1.0)}, settle=20))
     key = jax.random.key(3)
     expected = env.start.draw(key)
     np.testing.assert_allclose(jax.jit(env.start_physics)(key).qpos, expected, atol=1e-3)
@@ -222,6 +219,14 @@ def test_a_robots_loop_rejects_a_quaternion_without_length():
         (arm(POSITION).replace('gravity="0 0 0"', 'wind="0 0 nan"'), {}, ["NaN", "wind"]),
         (arm(POSITION).replace('kp="20"', 'kp="nan"'), {}, ["NaN", "actuator_gainprm"]),
         (arm(POSITION).replace('mass="1"', 'friction="nan"'), {}, ["NaN", "geom_friction"]),
+        (arm(POSITION).replace("<option", '<option actuatorgroupdisable="0 3"'), {}, ["JointDelta", "j"]),
+        (arm(POSITION).replace("/><option", '/><option><flag actuation="disable"/></option><option'), {}, ["JointDelta", "j"]),
+        (arm('<motor joint="j" ctrlrange="-inf inf"/>'), {"control": task.Torque()}, ["j", "ctrlrange"]),
+        (arm('<motor joint="j" ctrlrange="-1e20 1e20"/>'), {"control": task.Torque()}, ["j", "ctrlrange"]),
+        (arm(POSITION, more=BALL), {"start": task.Start(ranges={"ball": ((0, 0, 1), (0, 0, 1e20))})}, ["ball", "1e+20"]),
+        (arm(POSITION), {"goal": task.Rotation("link", threshold=10)}, ["threshold", "rad", 10]),
+        (arm(POSITION), {"goal": task.Pose("link", (0, 0, 0), (1, 1, 1), angle=10.0)}, ["threshold", "rad", "10"]),
+        (arm(POSITION), {"controls": task.JointDelta("j")}, ["controls", "field", "control"]),
     ],
 )
 def test_an_unusual_declaration_is_rejected(model, declared, parts):
