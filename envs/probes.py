@@ -61,9 +61,12 @@ def _fresh(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
 def check_reachable(model: mujoco.MjModel, start: np.ndarray, goal: Goal) -> None:
     """Searches for poses that reach some goals, from the configuration `start` [nq], and warns if many are missed.
 
-    Goals of bodies that a free or ball joint moves are not tested. Raises ValueError if no goal is reached.
+    Goals of bodies that a free or ball joint moves are not tested. Raises ValueError if no goal is reached, or no joint moves
+    the site or body.
     """
     place = goal.place
+    if place is not None and not place.joints:
+        raise ValueError(f"goal: no joint moves {place.name!r}")
     if place is None or goal.low is None or not all(joint.kind in (HINGE, SLIDE) for joint in place.joints):
         return
     goals = np.random.default_rng(0).uniform(goal.low, goal.high, (8, 3))

@@ -226,6 +226,7 @@ def test_a_robots_loop_rejects_a_quaternion_without_length():
         (arm(POSITION, more=BALL), {"start": task.Start(ranges={"ball": ((0, 0, 1), (0, 0, 1e20))})}, ["ball", "1e+20"]),
         (arm(POSITION), {"goal": task.Rotation("link", threshold=10)}, ["threshold", "rad", 10]),
         (arm(POSITION), {"goal": task.Pose("link", (0, 0, 0), (1, 1, 1), angle=10.0)}, ["threshold", "rad", "10"]),
+        (arm(POSITION), {"goal": task.Rotation("world")}, ["joint", "body:world"]),
         (arm(POSITION), {"controls": task.JointDelta("j")}, ["controls", "field", "control"]),
     ],
 )

@@ -57,6 +57,14 @@ for key, shift in (("near", 0.1), ("far", -0.1)):  # along x, away from the robo
     frames["goal_" + key] = picture(env, qpos, np.array([1.3 + shift, 0.6, 0.425]))
     qpos[place : place + 2] = 1.3 + shift, 0.6
     frames["object_" + key] = picture(env, qpos, np.array([1.3, 0.9, 0.425]))
+
+import mujoco, types
+tendon = '''<mujoco><worldbody><light pos="0 -2 1"/><camera name="front" pos="0 -1 0" xyaxes="1 0 0 0 0 1"/>
+  <site name="a" pos="-.2 0 0"/>
+  <body pos=".2 0 0"><joint/><geom size=".01"/><site name="b"/></body></worldbody>
+  <tendon><spatial width=".03" rgba="0 0 1 1"><site site="a"/><site site="b"/></spatial></tendon></mujoco>'''
+model = mujoco.MjModel.from_xml_string(tendon)
+frames["tendon"] = picture(types.SimpleNamespace(model=model, goal_marks=lambda qpos, goal: []), np.zeros(1), np.zeros(3))
 np.savez(folder / "frames.npz", **frames)
 """
 
@@ -119,6 +127,11 @@ def test_every_task_shows_its_goal_and_its_object(frames):
 def test_a_thing_moved_is_drawn_moved(frames, what, colour):
     near, far = (centre(frames[f"{what}_{where}"], colour) for where in ("near", "far"))
     assert near[0] > far[0] + 20  # the camera looks at the robot: nearer to the camera is lower in the picture
+
+
+@pytest.mark.slow
+def test_a_tendon_is_drawn_between_its_sites(frames):
+    np.testing.assert_allclose(centre(frames["tendon"], "blue"), (120, 160), atol=5)
 
 
 def test_the_command_writes_every_frame(drawn):

@@ -92,3 +92,12 @@ def test_a_robots_loop_takes_the_sensor_of_a_difference():
 def test_a_sensor_that_is_missing_is_named():
     with refuses("sensor", "'tuoch'", "touch"):
         type("Wrong", (Press,), {"observations": ("sensor:tuoch",)})(engine="native")
+
+
+@pytest.mark.parametrize(("geom", "asset"), [("box", ""), ("cylinder", '<asset><material name="m"/></asset>')])
+def test_mjx_has_no_rays_that_hit_cylinders_or_need_a_material(geom, asset):
+    """They would pass through the cylinder. Without a material, reading them is a TypeError."""
+    far = f'{asset}<sensor><rangefinder name="far" site="pad"/>'
+    model = PRESS.replace('type="box"', f'type="{geom}"').replace("<sensor>", far)
+    with refuses("jax", "rangefinders", "cylinders", "material", "native"):
+        type("Far", (Press,), {"model": model, "observations": ("sensor:far",)})(engine="jax")

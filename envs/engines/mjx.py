@@ -36,11 +36,15 @@ _IGNORED = (
 )
 
 
-def _ignored(model: mujoco.MjModel) -> Iterator[str]:
-    """Features of a model that MJX 3.17 ignores without an error."""
+def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
+    """Features of a model, and of its sensors if they are read, that MJX 3.17 ignores without a clear error."""
     yield from beyond_defaults(model, _IGNORED.__contains__)
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         yield "flags that disable springs or dampers"
+    unseen = np.isin(model.geom_type, (int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD)))
+    rays = (model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)).any()
+    if sensors and rays and (unseen.any() or not model.nmat):
+        yield "rangefinders in a model with cylinders or height fields, or without a material"
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
     if len(muscles) and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         yield with_names("damping of muscles with the integrator implicitfast", model, "actuator", muscles)
@@ -138,7 +142,7 @@ class MjxEngine:
     ):
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
-        if ignored := [*_ignored(model)]:
+        if ignored := [*_ignored(model, sensors)]:
             raise ValueError(f"engine jax: MJX ignores features of the model: {', '.join(ignored)}; use engine native")
         self._variation = Variation(model, varied)
         model = with_stand_ins(model)

@@ -218,9 +218,7 @@ class Painter:
         import mujoco
 
         self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_comPos(self._model, self._data)  # cameras can follow a centre of mass
-        mujoco.mj_camlight(self._model, self._data)
+        mujoco.mj_fwdPosition(self._model, self._data)  # with cameras, tendons and flexes
         front = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, "front")  # -1, a free camera, if there is none
         self._renderer.update_scene(self._data, camera=front)
         for body, pos, quat in goal_marks(self._env, np.asarray(qpos), np.asarray(goal)):
