@@ -30,7 +30,7 @@ class Start:
       ranges: low and high, by the name of a free body (positions, [3] m each) or of a hinge or slide (rad or m). Starts are
         uniform between them.
       settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
-        Servos hold it, unless the keyframe has inputs or activations.
+        Servos hold it, those of spatial tendons and sites roughly, unless the keyframe has inputs or activations.
     """
 
     def __init__(self, keyframe: str | None = None, ranges: Mapping[str, tuple[Any, Any]] | None = None, settle: int = 0):

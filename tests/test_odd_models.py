@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from conftest import refuses
 
+from mjx_dher import testing
 from mjx_dher.envs import task
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.envs.robot import RobotLoop
@@ -195,6 +196,11 @@ def test_controls_that_are_not_finite_fail_the_step():
     first = env.reset(jax.random.key(0))
     assert not env.step(first, jnp.zeros(1)).failed
     assert env.step(first, jnp.ones(1)).failed
+
+
+def test_a_robot_that_is_too_fast_in_its_units_is_told_of_max_speed():
+    with refuses("failed", "max_speed", "0.01"):
+        testing.check_env(make(arm(POSITION), max_speed=0.01))
 
 
 def test_a_robots_loop_rejects_a_quaternion_without_length():
