@@ -79,7 +79,7 @@ def _check_arguments(name: str, constructor: Callable[..., Any], overrides: dict
         key for key, parameter in parameters.items() if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
     ]
     if len(named) < len(parameters):  # **options go to the engine
-        if name not in COMPONENTS["env"]:
+        if name not in COMPONENTS["env"] and "engine_options" not in parameters:
             return
         from mjx_dher.envs.engines import engine_options
 

@@ -140,6 +140,7 @@ def test_bad_names_and_overrides_are_rejected():
         ({"distance_threshold": 0}, ["distance_threshold", 0]),
         ({"episode_length": 0}, ["episode_length", 0]),
         ({"colour": 1}, ["argument", "colour", "num_threads"]),
+        ({"name": "my_arm:Push", "episode_lenght": 1}, ["episode_lenght", "episode_length", "num_threads"]),
         ({"engine": "jax", "num_threads": 1}, ["num_threads", "ls_iterations"]),
     ]
     for arguments, parts in cases:
