@@ -1,7 +1,5 @@
 """Goal-conditioned environments: `make`, `list_envs`, and `Simulator` for any MuJoCo model."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import inspect
@@ -23,7 +21,7 @@ def list_envs() -> tuple[str, ...]:
     return tuple(sorted(COMPONENTS["env"]))
 
 
-def make(name: str, /, engine: str = "auto", **overrides: Any) -> GoalEnv:
+def make(name: str, /, engine: str = "auto", **overrides: Any) -> "GoalEnv":
     """Makes an environment.
 
     Args:

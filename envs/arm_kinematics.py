@@ -1,7 +1,5 @@
 """Kinematics of an arm: pose and velocity of the gripper, free joints and rotations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -9,8 +9,6 @@ in MuJoCo C it does not, and the arm is then several times as fast. Here an arma
 engines, with Euler's integration. Without contacts, both compute the same numbers.
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from collections.abc import Sequence

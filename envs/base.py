@@ -1,7 +1,5 @@
 """The environment interface: unbatched, pure functions."""
 
-from __future__ import annotations
-
 import abc
 
 import jax

@@ -1,7 +1,5 @@
 """Environments with Brax's interface: Brax itself, MuJoCo Playground and JaxGCRL. Imports none of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Controls map actions to joint servos, motors or mocap bodies, within the ranges of the model."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from collections.abc import Sequence

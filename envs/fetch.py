@@ -4,8 +4,6 @@ The tasks follow version v4 of the Fetch environments in gymnasium-robotics 1.4.
 were measured there after the environment's set-up (docs/fidelity.md).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any, ClassVar

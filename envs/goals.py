@@ -1,7 +1,5 @@
 """Goal types. Each defines size, distance, threshold, sampling range, and the goal that a state achieves."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from typing import Any, Self

@@ -3,8 +3,6 @@
 They follow gymnasium-robotics 1.4.2 on mujoco 3.11.0. `bench/hand_model.py` writes the models (docs/fidelity.md).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import re

@@ -1,7 +1,5 @@
 """Forward kinematics of any model in JAX: pose and motion of a site or body from qpos and qvel, on every engine."""
 
-from __future__ import annotations
-
 import fnmatch
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Named entries of an observation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

@@ -1,7 +1,5 @@
 """Task of grasping a cube and bringing it to a goal on the table or in the air (FetchPickAndPlace-v4)."""
 
-from __future__ import annotations
-
 from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 

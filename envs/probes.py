@@ -1,7 +1,5 @@
 """Cheap checks of a model before training: stability, and reachable goals."""
 
-from __future__ import annotations
-
 import copy
 import warnings
 

@@ -1,7 +1,5 @@
 """Task of pushing a cube to a goal on the table, with the fingers closed (FetchPush-v4)."""
 
-from __future__ import annotations
-
 from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 

@@ -1,7 +1,5 @@
 """Task of reaching a point in the air with the gripper (FetchReach-v4)."""
 
-from __future__ import annotations
-
 from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 

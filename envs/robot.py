@@ -1,7 +1,5 @@
 """A policy on a robot: measurements to targets, with the task's own observation and controls."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tasks whose physics an engine advances: steps, rewards and goals. Subclasses add a model, controls and observations."""
 
-from __future__ import annotations
-
 import abc
 import dataclasses
 from collections.abc import Mapping

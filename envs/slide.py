@@ -1,7 +1,5 @@
 """Task of hitting a puck so that it slides to a goal out of the arm's reach (FetchSlide-v4)."""
 
-from __future__ import annotations
-
 from mjx_dher.envs.fetch import FetchEnv, FetchTask
 
 

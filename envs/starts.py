@@ -1,7 +1,5 @@
 """Starts of episodes."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A task from a robot's MJCF: `MujocoTask`, with its controls, goals, observations and starts."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import inspect

@@ -4,8 +4,6 @@ A wrapper is an environment. It has the members of the wrapped environment, and 
 With the same key, both start the same episode.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from typing import Any

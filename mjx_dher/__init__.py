@@ -3,8 +3,6 @@
 Importing this package loads neither JAX nor MuJoCo. Each name below loads its module on first use.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

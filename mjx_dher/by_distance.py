@@ -10,8 +10,6 @@ docs/samplers.md has the formulas.
 A goal that is not a candidate may get any number except NaN. Equally far candidates get equal numbers.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

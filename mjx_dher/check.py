@@ -1,7 +1,5 @@
 """Checks of arrays and states that user functions return."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Table of the built-in components. Loads neither JAX nor MuJoCo; `load` imports a component."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 from collections.abc import Mapping

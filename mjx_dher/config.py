@@ -3,8 +3,6 @@
 Each field declares its range and help text; `validation` checks the range. Loads neither JAX nor MuJoCo.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints

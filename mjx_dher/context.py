@@ -4,8 +4,6 @@ It holds the task's goal functions, the run's numbers and progress, and the lear
 with the current learner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

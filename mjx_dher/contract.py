@@ -1,7 +1,5 @@
 """Contract of an environment: its spec, and checks of the states from `reset` and `step`. Runs no environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

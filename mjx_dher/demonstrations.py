@@ -4,8 +4,6 @@ A file is a Minari data set, or an .npz with the arrays of a batched `Episode`. 
 "observation/NAME".
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from pathlib import Path

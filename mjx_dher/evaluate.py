@@ -4,8 +4,6 @@ The trainer and compiled programs trace `evaluate`. `play_policy` evaluates a tr
 confidence intervals. More than `CHUNK` episodes are played in chunks with different keys.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Any

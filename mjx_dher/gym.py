@@ -6,8 +6,6 @@
 Importing this module registers them. JAX and MuJoCo are loaded when an environment is made.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -285,7 +283,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         return obs, rewards, infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
 
 
-def _spaces(spec: EnvSpec) -> tuple[Any, Any]:
+def _spaces(spec: "EnvSpec") -> tuple[Any, Any]:
     """Observation space, in which floats are unbounded, and action space."""
     goal = gymnasium.spaces.Box(-np.inf, np.inf, (spec.goal_size,), np.float32)
     spaces: dict[str, Any] = {"observation": _space(spec.observation), "achieved_goal": goal, "desired_goal": goal}
@@ -303,7 +301,7 @@ def _space(observation: Any) -> Any:
     return gymnasium.spaces.Box(low, high, observation.shape, dtype)
 
 
-def _to_numpy(state: State) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
+def _to_numpy(state: "State") -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
     """Copies observation, reward (float64) and info of one state or a batch to writable arrays."""
     obs = {key: _copied(value) for key, value in state.obs.items()}
     failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))

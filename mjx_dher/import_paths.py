@@ -1,7 +1,5 @@
 """Custom components as "module:attribute": finds, checks and imports them. Loads neither JAX nor MuJoCo by itself."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import importlib.util

@@ -3,8 +3,6 @@
 Loads neither JAX nor MuJoCo.
 """
 
-from __future__ import annotations
-
 import difflib
 import importlib.util
 import inspect

@@ -1,7 +1,5 @@
 """Actor and critic networks. The default `mlp` has four linear layers, as in the paper, with ReLU between them."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ Values are an array, or a tree of arrays such as a dict observation; its moments
 are not floats, such as uint8 images, are not normalized and have no moments (None).
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from flax import struct

@@ -1,7 +1,5 @@
 """Presets: tuned settings, and the paper's. Loads neither JAX nor MuJoCo, except in `machine_preset`."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 from collections.abc import Callable, Mapping

@@ -8,8 +8,6 @@ The ring stores the weight with the episode, and `replay.draw_rows` draws episod
 renew all weights once per cycle, and choose among relabelled transitions.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,7 +1,5 @@
 """Intervals of success rates, for the end of every run. Loads no other library. `stats` has the rest."""
 
-from __future__ import annotations
-
 import math
 
 

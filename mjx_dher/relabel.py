@@ -1,7 +1,5 @@
 """Hindsight relabelling: replaces goals by achieved ones and recomputes the rewards."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

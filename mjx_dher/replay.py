@@ -4,8 +4,6 @@ Each observation is stored once, without a next-observation copy. A sampled tran
 that end early are padded to T steps, and padded steps are never drawn. All functions are pure.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 
@@ -31,6 +29,13 @@ class ReplayState:
     ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T (`EnvSpec.ends`)
 
 
+class Pool(NamedTuple):
+    """Achieved goals of one random episode per transition."""
+
+    goals: Array  # [B, T+1, G]
+    length: Array  # [B] int32
+
+
 @struct.dataclass
 class Sample:
     """Transitions drawn from the ring, with everything that relabelling reads."""
@@ -47,13 +52,6 @@ class Sample:
     pool: Pool | None = None  # goals of other episodes, if the sampler uses them
     score: Array | None = None  # [B, T+1] scores of `episode_goals`, if the sampler has a score
     ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T
-
-
-class Pool(NamedTuple):
-    """Achieved goals of one random episode per transition."""
-
-    goals: Array  # [B, T+1, G]
-    length: Array  # [B] int32
 
 
 class Cumulative(NamedTuple):

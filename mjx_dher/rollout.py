@@ -1,7 +1,5 @@
 """Rollouts of many whole episodes: a reset and a scan."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -11,8 +11,6 @@ goal. A transition keeps its own goal if it has no weights, or any weight is NaN
 transitions as `no_goal_share`.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable, Sequence
@@ -49,7 +47,7 @@ class Sampler:
     # Scores of each stored episode's goals, computed once per cycle and passed to `log_weights` as its last argument.
     score: ScoreFn | None = struct.field(pytree_node=False, default=None)
     # The sampler for another goal distance. None unless it measures by the environment's (`of_distance`).
-    measure_by: Callable[[DistanceFn], Sampler] | None = struct.field(pytree_node=False, default=None, kw_only=True)
+    measure_by: "Callable[[DistanceFn], Sampler] | None" = struct.field(pytree_node=False, default=None, kw_only=True)
 
 
 @struct.dataclass

@@ -1,7 +1,5 @@
 """`RunSpec`, the description of a run: names of components, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json
@@ -69,7 +67,7 @@ class RunSpec:
         return self.sampler, self.weight_kernel, self.metric, self.weight_normalization
 
     @property
-    def program(self) -> RunSpec:
+    def program(self) -> "RunSpec":
         """The settings that all runs in one compiled program must share; all other fields have their defaults."""
         table, default = COMPONENTS["priority"], RunSpec(env=self.env)
         group = table[self.priority].group if self.priority in table else None

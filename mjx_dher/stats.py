@@ -6,8 +6,6 @@ environment steps or seconds). A run that never reaches a threshold has an infin
 Functions import scipy.stats when called, because that takes a second.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

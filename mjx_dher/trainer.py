@@ -5,8 +5,6 @@ cycle = roll out -> add to the ring, with priorities -> update the normalizers -
 learn = scan over draws of many batches: update, and move the targets every `target_period` updates
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -4,14 +4,13 @@ Training records the names that the user typed or passed, with their files, in t
 needs such a record, or `--trust` (`trust=True` in Python).
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Self
 
 from mjx_dher import lookup
 
@@ -23,7 +22,7 @@ class FromFile(str):
     arguments: tuple[str, ...]  # of an environment, from the same file
 
     @classmethod
-    def of(cls, name: str, file: Path, arguments: Sequence[str] = ()) -> FromFile:
+    def of(cls, name: str, file: Path, arguments: Sequence[str] = ()) -> Self:
         """Marks a name as coming from a file."""
         marked = cls(name)
         marked.file, marked.arguments = file, tuple(arguments)

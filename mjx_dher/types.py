@@ -7,8 +7,6 @@ Shape comments use these dimension letters:
     S  seeds                     G  goal size
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, Protocol, TypedDict
@@ -45,7 +43,7 @@ class Episode:
     length: Array = None  # type: ignore[assignment]  # [] steps played, int32; None means T (`filled`)
     terminal: Array = None  # type: ignore[assignment]  # [] whether no future follows, for any goal; None means False
 
-    def filled(self) -> Episode:
+    def filled(self) -> "Episode":
         """Fills in `length` and `terminal` if they are None. Arrays may be `jax.ShapeDtypeStruct`s."""
         sizes = np.shape(self.action)
         if len(sizes) < 2:

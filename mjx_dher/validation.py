@@ -1,7 +1,5 @@
 """Validation of settings. Errors name the field, its value and the allowed values. Loads neither JAX nor MuJoCo."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 

@@ -1,7 +1,5 @@
 """The physics engines, one file each, and `make_engine`."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The engine interface, the part of an environment that advances physics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol
 

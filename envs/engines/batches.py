@@ -1,7 +1,5 @@
 """Batches of MuJoCo C as arrays: rows of float32 go in and come out."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import sys

@@ -1,7 +1,5 @@
 """What MJX 3.17 leaves out of MuJoCo C's timestep: terms of equality constraints, and details of implicitfast."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

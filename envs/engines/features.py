@@ -1,7 +1,5 @@
 """Fields of MuJoCo's MjModel that an engine ignores, and that must therefore have their defaults."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Fields of MuJoCo's MjData: the state `Data`, the ones that a simulation can return, and the functions that fill them."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

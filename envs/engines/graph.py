@@ -3,7 +3,6 @@
 All substeps of an environment step are one CUDA graph on fixed memory, so starting some hundred kernels per substep costs
 little. Only the state is copied in and out.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of kernels as types.
 
 import copy
 from collections.abc import Sequence

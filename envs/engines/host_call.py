@@ -5,8 +5,6 @@ as an attribute of a call of XLA's foreign function interface. The structs below
 binary interface.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

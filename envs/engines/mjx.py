@@ -1,7 +1,5 @@
 """MuJoCo MJX, the JAX implementation, which runs on any device that JAX supports."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import dataclasses

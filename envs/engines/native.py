@@ -1,7 +1,5 @@
 """MuJoCo C for any model, in batches on all cores of the host, called from compiled JAX programs: `Simulator`."""
 
-from __future__ import annotations
-
 import contextvars
 import copy
 import hashlib

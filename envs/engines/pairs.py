@@ -1,7 +1,5 @@
 """Geoms of a model that can touch, and the number of possible contacts."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import mujoco

@@ -1,7 +1,5 @@
 """Reads a model's sensors on every engine, as computed by `mj_forward` for the current state and inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Physics that differs between simulations of one model: factors of masses, friction, damping and gains."""
 
-from __future__ import annotations
-
 import copy
 import re
 from collections.abc import Mapping, Sequence

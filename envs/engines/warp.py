@@ -2,7 +2,6 @@
 
 Only the state is passed in and out. `mjx.step` would pass some 170 arrays between XLA and Warp in every substep.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of `advance_all` as types.
 
 import concurrent.futures
 import copy

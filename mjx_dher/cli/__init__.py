@@ -1,7 +1,5 @@
 """The command line: `python train.py COMMAND`. Arguments are checked before JAX or MuJoCo is loaded."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import gc

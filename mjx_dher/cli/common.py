@@ -1,7 +1,5 @@
 """Shared parts of the commands: flags, progress on the screen, and the summary of an evaluation."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import time

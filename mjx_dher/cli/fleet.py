@@ -1,7 +1,5 @@
 """A sweep on a Ray cluster: `sweep --ray`."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

@@ -1,7 +1,5 @@
 """Standard output that may fail without stopping the command."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """The commands `eval`, `render`, `transfer` and `export`, which use a trained policy."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

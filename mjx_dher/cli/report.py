@@ -1,7 +1,5 @@
 """The commands `plot` and `report`."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -25,7 +23,9 @@ if TYPE_CHECKING:
 EPISODES = 3  # per video
 
 
-def compare(folder: Path, by_env: dict[str, list[Group]], baseline: str, threshold: float, console: Console) -> Sequence[Row]:
+def compare(
+    folder: Path, by_env: dict[str, "list[Group]"], baseline: str, threshold: float, console: Console
+) -> "Sequence[Row]":
     """Prints the comparison of all settings of a sweep, and writes it to `folder`. Returns its rows."""
     from mjx_dher.sweeps import comparison
 

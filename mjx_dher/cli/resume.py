@@ -1,7 +1,5 @@
 """The command `resume`."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a run from a file, and the amount of work and memory that they need."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """The commands `list`, `check`, `engines`, `doctor` and `completion`. They show components and this machine's state."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import importlib

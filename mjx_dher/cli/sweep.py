@@ -1,7 +1,5 @@
 """The command `sweep`, and the comparison that it prints."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """The commands `view` and `demo`."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

@@ -1,7 +1,5 @@
 """Episode priorities by rarity and by diversity of achieved goals."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

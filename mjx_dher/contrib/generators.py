@@ -7,8 +7,6 @@ numbers and, if the generator has `uses_values`, the learner's values. A goal th
 Evaluations always use the reset's goals.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Choice of hindsight goals and of rollout goals: Next-Future, and Hindsight Goal Generation."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -5,8 +5,6 @@
 Velocities are differences of successive achieved goals, in m per step. The first is 0.
 """
 
-from __future__ import annotations
-
 import functools
 
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Priorities that choose among drawn and relabelled transitions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

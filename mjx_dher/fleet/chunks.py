@@ -1,7 +1,5 @@
 """Options of a sweep on a Ray cluster, and its chunks: runs of a task, resources and code. Loads neither Ray nor JAX."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

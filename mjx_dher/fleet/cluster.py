@@ -1,7 +1,5 @@
 """A Ray cluster: joins or starts one, and runs chunks as its tasks."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
@@ -62,7 +60,7 @@ class Board:
 
 
 @contextlib.contextmanager
-def joined(address: str, code: Path | None) -> Iterator[Cluster]:
+def joined(address: str, code: Path | None) -> Iterator["Cluster"]:
     """Joins a cluster (auto or HOST:PORT), or starts one on this machine (local), for the duration of the block.
 
     `code` is a folder with custom code, which is sent to the nodes. Raises ValueError if there is no such cluster, this machine

@@ -1,7 +1,5 @@
 """Driver of a sweep on a cluster: submits chunks, and writes returned runs into the sweep's folder."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections import deque

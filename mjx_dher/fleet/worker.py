@@ -3,8 +3,6 @@
 A chunk is trained as a small sweep, in its folder of the storage or in a temporary folder of the node.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Learners: the protocol `Learner`, and `make`."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

@@ -7,8 +7,6 @@
 Targets, including the entropy term, are clipped to the bounds of returns (Hiraoka 2023).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -3,8 +3,6 @@
 `judge` maps actions [B, A] to the critics' values [B].
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol, cast

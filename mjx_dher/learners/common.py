@@ -1,7 +1,5 @@
 """Shared parts of the built-in learners: normalization, acting, target updates and export."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar

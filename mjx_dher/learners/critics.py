@@ -4,8 +4,6 @@ C critics return values [C, B, M]. M is 1 for an expected return, or the number 
 target has K atoms, one for an expected return.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeVar, cast

@@ -9,8 +9,6 @@ logarithm of the discounted probability of reaching g after (s, a). The critic l
 learns from the batch's goals: hindsight goals, and one in her_k + 1 that its episode was played for.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

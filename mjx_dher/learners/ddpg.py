@@ -1,7 +1,5 @@
 """DDPG (Lillicrap et al. 2016) as in HER (Andrychowicz et al. 2017)."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import cast
 

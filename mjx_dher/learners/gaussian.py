@@ -1,7 +1,5 @@
 """The tanh-Gaussian actor, with entropy regularization."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any, ClassVar

@@ -4,8 +4,6 @@ Parallel runs exchange nothing. The shards of a run have equal parts of its envi
 gradients (`split`), so their learners stay equal.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Every process must call each function here at the same point. With one process they do nothing.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ipaddress
 import json

@@ -5,8 +5,6 @@ would round differently, because XLA simplifies it in another order.) For a run 
 the mesh.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import dataclasses
 import functools
@@ -83,7 +81,7 @@ class _PerDevice:
     def eval_shape(self, *arguments: Any) -> Any:
         return self._stages[0].eval_shape(*arguments)
 
-    def lower(self, *arguments: Any) -> _PerDevice:
+    def lower(self, *arguments: Any) -> "_PerDevice":
 
         def shape_on(device: Any, x: Any) -> jax.ShapeDtypeStruct:
             shape = (x.shape[0] // self._layout.lanes, *x.shape[1:])
@@ -92,7 +90,7 @@ class _PerDevice:
         shapes = [jax.tree.map(functools.partial(shape_on, device), arguments) for _, device in self._layout.own_devices]
         return _PerDevice(self._layout, [stage.lower(*own) for stage, own in zip(self._stages, shapes)])
 
-    def compile(self, compiler_options: Any = None) -> _PerDevice:
+    def compile(self, compiler_options: Any = None) -> "_PerDevice":
         """Compiles the function for each device. On GPUs, only the first compilation takes time; the others use JAX's cache."""
         return _PerDevice(self._layout, [stage.compile(compiler_options=compiler_options) for stage in self._stages])
 

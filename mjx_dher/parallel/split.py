@@ -1,7 +1,5 @@
 """Collectives over the devices that share one run. The axis name is the one of `jax.shard_map`, or None for one device."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import jax

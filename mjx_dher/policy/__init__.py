@@ -4,8 +4,6 @@
 explicitly.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks the arrays of a policy file, and makes a `Policy` of them. Needs only NumPy."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any

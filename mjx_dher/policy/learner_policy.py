@@ -1,7 +1,5 @@
 """Policies of custom learners and networks: the learner's state in a file. They need JAX and the learner."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Mapping

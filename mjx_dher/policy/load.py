@@ -1,7 +1,5 @@
 """Loads trained policies. Needs only NumPy, unless the run had a custom learner or custom networks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Failures and warnings derived from an epoch's metrics."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

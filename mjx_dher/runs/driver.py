@@ -4,8 +4,6 @@ Runs that differ only in `spec._LANE_FIELDS` are *lanes* of one vmapped program.
 `train`, `resume` and `sweep` all call `train_runs`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

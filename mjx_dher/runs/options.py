@@ -1,7 +1,5 @@
 """Training options that do not affect a run's result."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Compares a sweep's settings with each other and with a baseline."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable

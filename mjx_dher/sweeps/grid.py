@@ -1,7 +1,5 @@
 """Grid of a sweep: trials for each environment, sampler, number and seed. Loads neither JAX nor MuJoCo."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Figures of a sweep, drawn with Matplotlib (extra `plot`) and readable without colour."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """HTML report of a run or a sweep, in one file that opens without a server: curves, tables, settings and videos."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path

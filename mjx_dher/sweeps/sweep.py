@@ -4,8 +4,6 @@ A trial is a run folder, named after its settings and their digest. To finish or
 missing trials, and unfinished runs resume from their checkpoint.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of a sweep: reads its finished trials and writes results.csv, results.npz and finals.csv."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from pathlib import Path

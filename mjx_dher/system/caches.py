@@ -1,7 +1,5 @@
 """The user's cache folder, and JAX's compiled programs in it."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files and folders: locks, writes that survive a power cut, and early checks."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import itertools
@@ -130,7 +128,7 @@ def lock(folder: Path, wait: bool = False) -> Iterator[None]:
         held.release()
 
 
-def _mark(folder: Path, timeout: float) -> BaseFileLock:
+def _mark(folder: Path, timeout: float) -> "BaseFileLock":
     """Locks a folder on a file system without locks."""
     from filelock import SoftFileLock, Timeout
 

@@ -1,7 +1,5 @@
 """Cores and memory that this process may use: the machine's, or its control groups' (containers, Slurm, systemd) if less."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

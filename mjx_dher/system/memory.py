@@ -1,7 +1,5 @@
 """Available and used memory, and settings that make the C library return freed memory."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads untrusted .npz files: headers first, and arrays only if they match their headers."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 import zlib

@@ -10,8 +10,6 @@ Two uses of internals stay where they are, because they are not Python names:
   issue known).
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib

@@ -5,8 +5,6 @@ can be lost in a library's callback. So the interpreter writes each signal to a 
 process at once, unless a block is `held`, which ends in order.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """Subprocesses: their output, and the reason for a failure in one line."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

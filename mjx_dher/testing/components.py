@@ -5,8 +5,6 @@ the run's numbers (by default HParams()) and an untrained learner whose values t
 returns a line about its findings, and raises ComponentError for the first violation.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Conformance test for environments, which tests everything that the library relies on."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Check of a custom learner or custom networks: one update on random episodes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """Shared parts of the checks: random episodes, and calls whose errors become one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

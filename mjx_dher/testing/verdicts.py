@@ -1,7 +1,5 @@
 """Cached verdicts: components that have passed are not checked again until one of their dependencies changes."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

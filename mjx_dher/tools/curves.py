@@ -1,7 +1,5 @@
 """Learning curves of single runs: read from their folders, and drawn one by one or together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

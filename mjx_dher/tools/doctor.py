@@ -4,8 +4,6 @@ JAX and MuJoCo are loaded in child processes with a time limit, so a driver that
 process runs this file: `python -m mjx_dher.tools.doctor machine|native|jax|warp`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

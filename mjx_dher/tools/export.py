@@ -3,8 +3,6 @@
 docs/policies.md describes both files. Neither writing nor reading them needs JAX or MuJoCo.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shared parts of all pictures: line styles, and figures without a screen. Matplotlib is loaded with the first figure."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """Parts of a self-contained HTML page, without external files, scripts, fonts or addresses."""
 
-from __future__ import annotations
-
 import base64
 import html
 from collections.abc import Iterable, Sequence

@@ -3,8 +3,6 @@
 Functions import the modules that draw, because these are slow to import.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import itertools

@@ -6,8 +6,6 @@ NumPy, but neither JAX nor this library's MuJoCo:
     python -m mjx_dher.tools.transfer RUN EPISODES FIRST_SEED
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Address of the viewer's page, and the browser. Loads neither JAX, MuJoCo nor viser."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import ipaddress

@@ -4,8 +4,6 @@ Any web page can make a browser call this port, and so can any program on the ma
 page, and messages must come from its panel and handle, with allowed values.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http
@@ -113,7 +111,7 @@ class Guard:
             "logger": log,
         }
 
-    def _answer(self, connection: Connection, request: Request, page: Callable[..., Response | None]) -> Response | None:
+    def _answer(self, connection: "Connection", request: Request, page: Callable[..., Response | None]) -> Response | None:
         """Answers a request. Returns None if the browser may connect."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
@@ -139,7 +137,7 @@ class Guard:
             return False
         return name in self._names or address.is_ip(name)
 
-    def _admit(self, connection: Connection) -> bool:
+    def _admit(self, connection: "Connection") -> bool:
         """Admits a browser. If there are too many, it replaces one that has not sent its camera."""
         if len(self.clients) >= CLIENTS:
             silent = next((client for client in self.clients if not client.has_camera), None)

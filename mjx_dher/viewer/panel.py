@@ -1,7 +1,5 @@
 """The panel next to the scene: policy, speed and progress. Each user action is a command; commands run in order."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Plays a policy in an environment in real time: play, pause, move goal and object, count successes. Draws nothing."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """A MuJoCo model as a viser scene, with nodes that move with its bodies."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import mujoco

@@ -1,12 +1,10 @@
 """The viewer's server: a page in the browser that shows a player's scene and takes user commands. Needs viser."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -47,7 +45,7 @@ class Viewer:
         self._draw_scene()
         self._name()
 
-    def __enter__(self) -> Viewer:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

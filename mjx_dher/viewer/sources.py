@@ -1,7 +1,5 @@
 """Policies for the viewer: of run folders, which may still be training, bundled ones, and random actions."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -4,7 +4,6 @@ Residuals u = J a - aref are multiplied by friction, the first one by mu = frict
 weight W. N is the first one and T the length of the others. A contact costs nothing if N >= mu T, W / 2 |u|^2 if
 mu N + T <= 0, and otherwise W / 2 (N - mu T)^2 / (1 + mu^2): https://mujoco.readthedocs.io/en/3.17.0/computation/index.html#friction-cones.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused.constraints import asked
 from mjx_dher.envs.engines.fused.model import Contacts, Dofs, Floats, Memory

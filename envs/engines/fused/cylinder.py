@@ -9,7 +9,6 @@ XenoCollide, Game Programming Gems 7 (2008); MuJoCo C takes it from libccd.
 All is in double precision, as in C: a puck sinks 0.02 mm into the table, and in single precision the normals of so thin an
 overlap are noise.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.system.warp_setup import wp
 

@@ -6,7 +6,6 @@ shape is a convex function, so Newton's method, kept within the segment or box, 
 convex solver (GJK and EPA) here, which finds the same contact up to a depth of about a third of the shortest half axis.
 Source: D. Bertsekas, Projected Newton methods for optimization problems with simple constraints (1982).
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of, put

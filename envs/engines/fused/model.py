@@ -1,6 +1,5 @@
 # mypy: disable-error-code="valid-type"
 """Structs of Warp arrays that hold a model and an environment's memory."""
-# Not `from __future__ import annotations`: Warp reads the annotations of structs as types.
 
 from mjx_dher.system.warp_setup import wp
 

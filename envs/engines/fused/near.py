@@ -4,7 +4,6 @@ Most pairs of a hand are far apart in any one state. Memory for the contacts of 
 environments. So each substep lists the pairs whose bounding boxes meet, finds their contacts in memory that is later used for
 the rows of constraints, and keeps those that touch. All lists are in the order of the pairs for any schedule of the threads.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of

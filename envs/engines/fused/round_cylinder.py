@@ -5,7 +5,6 @@ followed by bisection. Where it is flat, for example on parallel axes, the conta
 end of the cylinder has a contact where it enters the end's circle, and one where it leaves, as in MuJoCo C. C takes a polygon
 for the circle, so its two contacts are up to a twentieth of the radius further inside.
 """
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.contacts import geom_of, put

@@ -1,6 +1,5 @@
 # mypy: disable-error-code="valid-type, empty-body"
 """Numbers of a model that each environment has for itself, behind its inputs. Other kernels have none of this code."""
-# Not `from __future__ import annotations`: Warp reads the annotations of functions as types.
 
 from typing import Any
 

@@ -3,8 +3,6 @@
 `docs/publish_policy.py` makes them. This module needs only Python.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ A checkpoint is a folder, RUN/checkpoints/epoch-000010. It has `state`, with a N
 manifest.json, with the SHA-256 of every file and of itself, and each leaf's name, shape and dtype.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

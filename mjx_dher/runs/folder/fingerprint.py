@@ -1,7 +1,5 @@
 """Identity of a run: its settings, digests of custom source files, and a digest of all of these that its files carry."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

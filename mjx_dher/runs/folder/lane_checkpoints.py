@@ -1,7 +1,5 @@
 """Checkpoints of parallel runs."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools
@@ -98,7 +96,7 @@ class LaneCheckpoints:
             self.report(lack)
         return has_some
 
-    def _read(self, template: TrainState) -> Restored:
+    def _read(self, template: TrainState) -> "Restored":
         """Reads the newest undamaged checkpoint. Raises FolderError in all processes if one of them cannot read it."""
         from mjx_dher.runs.folder import restoring, results
 
@@ -116,7 +114,7 @@ class LaneCheckpoints:
         sharding = leaf.sharding if len(leaf.sharding.device_set) > 1 else None
         return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
 
-    def _compare(self, restored: Restored) -> None:
+    def _compare(self, restored: "Restored") -> None:
         """Reports changes of settings since the checkpoint. Raises FolderError for settings that must not change."""
         if len(restored.runs) != len(self.runs):
             raise FolderError(f"{restored.path} has {len(restored.runs)} runs, not {len(self.runs)}")

@@ -1,7 +1,5 @@
 """Loggers of a run's metrics: a CSV file, and optionally JSON lines, TensorBoard or Weights & Biases."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -56,7 +54,7 @@ class CsvSink:
     def close(self) -> None:
         self._file.close()
 
-    def _make_writer(self, columns: Sequence[str]) -> csv.DictWriter[str]:
+    def _make_writer(self, columns: Sequence[str]) -> "csv.DictWriter[str]":
         # A resumed run keeps the columns of its file.
         return csv.DictWriter(self._file, columns, extrasaction="ignore")
 

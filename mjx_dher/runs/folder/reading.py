@@ -1,7 +1,5 @@
 """Reads the files of a run, and checks that they belong together."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

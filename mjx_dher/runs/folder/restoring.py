@@ -1,7 +1,5 @@
 """Restores a run's newest undamaged checkpoint. `checkpoint` writes it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

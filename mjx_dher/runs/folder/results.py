@@ -1,7 +1,5 @@
 """Metrics and results of runs, with checks that their files are complete."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import warnings

@@ -1,7 +1,5 @@
 """A run on disk: config.json, metrics.csv, policy.npz, checkpoints, result.json. `reading` and `results` read them."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import datetime

@@ -1,7 +1,5 @@
 """Runs a training loop: compiles it, checks that it fits into memory, and calls it epoch by epoch."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import os
 import time

@@ -1,7 +1,5 @@
 """A compiled program for parallel runs: lanes of one `vmap`, or one run without a lane axis."""
 
-from __future__ import annotations
-
 import collections
 import concurrent.futures
 import functools
