@@ -1,4 +1,4 @@
-"""Common part of the Fetch tasks: action, observation, goals, reward and reset, as functions of (qpos, qvel).
+"""The Fetch tasks: reach, push, pick and place, slide. All parts are functions of (qpos, qvel).
 
 The tasks follow version v4 of the Fetch environments in gymnasium-robotics 1.4.2 on mujoco 3.11.0. Constants named "settled"
 were measured there after the environment's set-up (docs/fidelity.md).
@@ -272,3 +272,63 @@ def _joint_slices(model: mujoco.MjModel, joint: str, width: int) -> tuple[slice,
     """Slices of qpos and qvel that hold `width` coordinates from `joint` on (7 and 6 for a free joint)."""
     qpos, qvel = int(model.joint(joint).qposadr[0]), int(model.joint(joint).dofadr[0])
     return slice(qpos, qpos + width), slice(qvel, qvel + (6 if width == 7 else width))
+
+
+class Reach(FetchEnv):
+    """FetchReach: the goal is a position of the grip point, up to 15 cm away along each axis. The observation is [10]."""
+
+    name = "reach"
+    task = FetchTask(
+        xml="reach.xml",
+        arm_qpos=(0.00969146345, -0.825628071, -0.00312048482, 1.4438479, 0.00263934828, 0.953287132, 0.0058733811),
+        arm_qvel=(0.000743176, 0.00594367, -0.00138399, -0.000864239, 0.00109662, -0.00279652, -0.000919709),
+        initial_grip_pos=(1.3418334, 0.74910102, 0.53473344),
+        target_range=0.15,
+    )
+
+
+class Push(FetchEnv):
+    """FetchPush: the goal lies on the table, up to 15 cm from the gripper along x and y."""
+
+    name = "push"
+    task = FetchTask(
+        xml="push.xml",
+        arm_qpos=(0.0116377772, -0.580433428, -0.00457914917, 1.42152997, 0.00145336833, 0.690240166, 0.00724187328),
+        arm_qvel=(0.00379832, -0.0436523, -0.00313292, 0.109691, 0.00269572, 0.0891523, 0.00103944),
+        initial_grip_pos=(1.3631267, 0.7490998, 0.41601148),
+        object_height=0.42489222,
+        object_range=0.15,
+        target_range=0.15,
+    )
+
+
+class PickAndPlace(FetchEnv):
+    """FetchPickAndPlace: like Push, but `action[3]` moves the fingers, and half of the goals lie up to 45 cm higher."""
+
+    name = "pick_and_place"
+    task = FetchTask(
+        xml="pick_and_place.xml",
+        arm_qpos=(0.00969037654, -0.825628108, -0.00311989443, 1.44384795, 0.00264075557, 0.953287094, 0.00587191243),
+        arm_qvel=(0.000744743, 0.00594378, -0.0013853, -0.000864291, 0.00109634, -0.00279653, -0.000918971),
+        initial_grip_pos=(1.3419341, 0.7491005, 0.53473306),
+        target_range=0.15,
+        object_height=0.42489222,
+        max_goal_lift=0.45,
+    )
+
+
+class Slide(FetchEnv):
+    """FetchSlide: a puck on a slippery table. The goal lies up to 30 cm around a point 40 cm ahead of the gripper."""
+
+    name = "slide"
+    task = FetchTask(
+        xml="slide.xml",
+        arm_qpos=(0.0133685885, -0.575905496, -0.005929734, 1.4139215, -1.28234476e-06, 0.682503565, 0.00871218759),
+        arm_qvel=(0.00697181, -0.0504703, -0.00531813, 0.120123, 0.00142379, 0.116102, 0.00411597),
+        initial_grip_pos=(1.0132714, 0.7491539, 0.4155006),
+        target_range=0.3,
+        target_offset=(0.4, 0.0, 0.0),
+        object_height=0.41999957,
+        object_range=0.1,
+        finger_qvel=(3.60453e-06, 0.00245563),
+    )

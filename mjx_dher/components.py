@@ -53,11 +53,11 @@ _TABLE = {
         "pen": Component("envs.hand:Pen", "bring a pen in the Shadow hand to a pose (HandManipulatePen-v1)"),
         "pen_rotate": Component("envs.hand:PenRotate", "turn a pen to any direction (HandManipulatePenRotate-v1)"),
         "pick_and_place": Component(
-            "envs.pick_and_place:PickAndPlace", "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)"
+            "envs.fetch:PickAndPlace", "lift a block to a goal, half of which are in the air (FetchPickAndPlace-v4)"
         ),
-        "push": Component("envs.push:Push", "push a block on the table to a goal (FetchPush-v4)"),
-        "reach": Component("envs.reach:Reach", "move the gripper to a goal (FetchReach-v4)"),
-        "slide": Component("envs.slide:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
+        "push": Component("envs.fetch:Push", "push a block on the table to a goal (FetchPush-v4)"),
+        "reach": Component("envs.fetch:Reach", "move the gripper to a goal (FetchReach-v4)"),
+        "slide": Component("envs.fetch:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
     },
     "sampler": {
         "random": Component("samplers:random", "any goal of any episode"),

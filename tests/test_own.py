@@ -246,14 +246,14 @@ def test_make_imports_it():
     env = envs.make("point_mass:PointMass", episode_length=7)
     assert isinstance(env, PointMass)
     assert env.episode_length == 7
-    assert envs.make("mjx_dher.envs.reach:Reach", engine="native", episode_length=3).engine.name == "native"
+    assert envs.make("mjx_dher.envs.fetch:Reach", engine="native", episode_length=3).engine.name == "native"
     assert samplers.make("point_mass:soon").log_weights is soon
     assert "point_mass:PointMass" not in envs.list_envs()
 
 
 UNUSABLE = [  # constructor, name, and what the error must name
     (envs.make, "pont_mass:PointMass", ["pont_mass", "point_mass"]),
-    (envs.make, "mjx_dher.envs.rech:Reach", ["mjx_dher.envs.rech", "mjx_dher.envs.reach"]),
+    (envs.make, "mjx_dher.envs.fetsh:Reach", ["mjx_dher.envs.fetsh", "mjx_dher.envs.fetch"]),
     (envs.make, "point_mass.py:PointMass", ["point_mass.py", "point_mass"]),
     (envs.make, "point_mass:PontMass", ["point_mass", "PontMass", "PointMass"]),
     (envs.make, "point_mass:a:b", ["env", "module:attribute", "point_mass:a:b"]),

@@ -116,7 +116,7 @@ def test_the_wheel_works_away_from_any_checkout(distributions, tmp_path):
     assert "  weighted " in run(sys.executable, script, "list")
     assert run(sys.executable, script, "eval", "--help").startswith("usage: mjx-dher eval ")
     where = run(
-        sys.executable, "-P", "-c", "import mjx_dher.envs.push as push; print(push.__file__); push.Push(engine='native')"
+        sys.executable, "-P", "-c", "import mjx_dher.envs.fetch as fetch; print(fetch.__file__); fetch.Push(engine='native')"
     )
     assert where.startswith(str(tmp_path / "site"))
     hint = run(sys.executable, "-P", "-c", "from mjx_dher import lookup; print(lookup.missing_extra('', '', 'view'))")

@@ -232,14 +232,10 @@ def test_bounds_are_those_of_resets():
 
 
 def _task(name):
-    from mjx_dher.envs import pick_and_place, push, reach, slide
+    from mjx_dher.envs import fetch
 
-    return {
-        "push": push.Push,
-        "pick_and_place": pick_and_place.PickAndPlace,
-        "slide": slide.Slide,
-        "reach": reach.Reach,
-    }[name].task
+    tasks = {"push": fetch.Push, "pick_and_place": fetch.PickAndPlace, "slide": fetch.Slide, "reach": fetch.Reach}
+    return tasks[name].task
 
 
 @pytest.fixture(scope="module")

@@ -139,7 +139,7 @@ def _try_engine(engine: str) -> Iterator[tuple[str, str]]:
     import jax.numpy as jnp
 
     from mjx_dher import envs
-    from mjx_dher.envs import engines, reach  # noqa: F401 - as `make` will
+    from mjx_dher.envs import engines, fetch  # noqa: F401 - as `make` will
 
     yield "import", f"{time.perf_counter() - start:.1f} s"
     start = time.perf_counter()
