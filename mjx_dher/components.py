@@ -16,7 +16,7 @@ class Component(NamedTuple):
     path: str  # module:attribute
     line: str  # description in `list`
     reads: tuple[str, ...] = ()  # settings that it reads and others of its field do not
-    group: str = ""  # runs of one compiled program can differ within a group
+    group: str = "episodes"  # of a priority: what it chooses among. Runs of one compiled program can differ within a group
 
 
 _BY_METRIC = ("metric",)
@@ -103,19 +103,13 @@ _TABLE = {
         "time_to_goal": Component("contrib.metrics:time_to_goal", "steps to the goal as estimated by the learner's critic"),
     },
     "priority": {
-        "eventful": Component(
-            "priorities:eventful", "episodes whose last achieved goal was not yet reached at their start", group="episodes"
-        ),
-        "energy": Component("priorities:energy", "episodes by the energy given to the object (EBP)", group="episodes"),
-        "energy_clipped": Component(
-            "priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg", group="episodes"
-        ),
+        "eventful": Component("priorities:eventful", "episodes whose last achieved goal was not yet reached at their start"),
+        "energy": Component("priorities:energy", "episodes by the energy given to the object (EBP)"),
+        "energy_clipped": Component("priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg"),
         "max_entropy": Component(
-            "contrib.episodes:max_entropy", "episodes by how rare their achieved goals are in the ring (MEP)", group="episodes"
+            "contrib.episodes:max_entropy", "episodes by how rare their achieved goals are in the ring (MEP)"
         ),
-        "diversity": Component(
-            "contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)", group="episodes"
-        ),
+        "diversity": Component("contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)"),
         "dpp": Component(
             "contrib.transitions:dpp",
             "diversity, and pairs of transitions with goals far apart (DTGSH's k-DPP)",
