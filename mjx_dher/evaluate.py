@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher import rates
 from mjx_dher.contract import check_steps
 from mjx_dher.policy import TrainedPolicy
 from mjx_dher.rollout import Outcome, rollout
+from mjx_dher.stats import wilson_interval
 from mjx_dher.types import Array, Env, EnvSpec, GoalObs, PRNGKey, check_size
 
 CHUNK = 500  # episodes at once
@@ -71,7 +71,7 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
     if wrong := [float(x) for x in np.ravel((success, reset_success)) if x not in (0.0, 1.0)]:
         raise ValueError(f"success must be 0 or 1; of {np.size(success)} episodes it is {wrong[0]:g} in {len(wrong)}")
     ret = np.asarray(ret, np.float64)[slice(None) if valid is None else np.asarray(valid, bool)]
-    low, high = rates.wilson_interval(int(np.sum(success)), len(success))
+    low, high = wilson_interval(int(np.sum(success)), len(success))
     return {
         "episodes": len(success),
         "success_rate": float(np.mean(success, dtype=np.float64)),

@@ -11,7 +11,7 @@ README = (ROOT / "README.md").read_text()
 INNER = (
     "__main__ cli system envs.engines.fused envs.engines.warp envs.engines.graph envs.engines.features"
     " envs.engines.fields envs.engines.pairs envs.engines.sensors envs.engines.batches envs.engines.corrections"
-    " runs sweeps testing tools lookup import_paths rates trust viewer fleet check parallel"
+    " runs sweeps testing tools lookup import_paths trust viewer fleet check parallel"
     " policy.learner_policy policy.arrays"
 )
 

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher.rates import wilson_interval
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
+from mjx_dher.stats import wilson_interval
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import figures
 
