@@ -16,8 +16,7 @@ import numpy as np
 from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat_to_matrix
 from mjx_dher.envs.base import State
-from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.engines.base import check_shape
+from mjx_dher.envs.engines import Controls, Physics, check_shape
 from mjx_dher.envs.simulated import Range, SimulatedTask
 from mjx_dher.types import Array, EnvSpec, PRNGKey
 

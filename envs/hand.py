@@ -16,8 +16,7 @@ import numpy as np
 from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import matrix_to_euler, quat_multiply, quat_to_matrix
 from mjx_dher.envs.base import State
-from mjx_dher.envs.engines import Physics
-from mjx_dher.envs.engines.base import check_shape
+from mjx_dher.envs.engines import Physics, check_shape
 from mjx_dher.envs.goals import Goal, Mark
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.starts import Start

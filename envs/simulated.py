@@ -12,8 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.base import GoalEnv, State
-from mjx_dher.envs.engines import Controls, Physics, make_engine
-from mjx_dher.envs.engines.base import check_shape
+from mjx_dher.envs.engines import Controls, Physics, check_shape, make_engine
 from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
 from mjx_dher.validation import check_count, check_number
 

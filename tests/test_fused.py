@@ -10,7 +10,7 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import envs
-from mjx_dher.envs.engines.base import Controls, Physics
+from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.engines.fused import kernel, setup, simulation
 from mjx_dher.envs.engines.fused.cylinder import cylinder_box
 from mjx_dher.envs.engines.fused.memory import carve, layout_of

@@ -28,7 +28,7 @@ class Rows:
       outputs: fields of the state that `read` returns.
       derived: other fields that it returns, after the outputs and factors.
       digits: numbers at the start of a row: the digits of `EXACT` that float32 omits, or 0 if rows do not have them.
-      variation: numbers of the model that vary (`base.variation_of`). Their factors follow the inputs in a row.
+      variation: numbers of the model that vary (`engines.variation_of`). Their factors follow the inputs in a row.
     """
 
     def __init__(

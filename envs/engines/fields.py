@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import DATA_FIELDS
 
-from mjx_dher.envs.engines.base import check_shape
+from mjx_dher.envs.engines import check_shape
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 

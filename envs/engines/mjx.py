@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines import pairs
-from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
+from mjx_dher.envs.engines import Controls, Physics, check_shapes, pairs
 from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system import private_api

@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from mjx_dher.envs.engines import host_call
-from mjx_dher.envs.engines.base import Controls, Physics, check_shapes, variation_of
+from mjx_dher.envs.engines import Controls, Physics, check_shapes, host_call, variation_of
 from mjx_dher.envs.engines.batches import EXACT, FULL, UNTIMED, Choice, Rows, residue
 from mjx_dher.envs.engines.fields import LATE, STATE, Data, Layout, derived_fields
 from mjx_dher.system.limits import usable_cores

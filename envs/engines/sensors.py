@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mjx_dher.envs.engines.base import Controls, Physics
+from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.types import Array
 
 

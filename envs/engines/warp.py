@@ -15,8 +15,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from mjx_dher.envs.engines import graph
-from mjx_dher.envs.engines.base import Controls, Physics, check_shapes
+from mjx_dher.envs.engines import Controls, Physics, check_shapes, graph
 from mjx_dher.envs.engines.fused import simulation, support
 from mjx_dher.envs.engines.fused.varied import NONE, Numbers
 from mjx_dher.envs.engines.variation import Variation
