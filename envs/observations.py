@@ -1,11 +1,14 @@
-"""Named entries of an observation."""
+"""Named entries of an observation, and sensors, which some of them read."""
 
 from collections.abc import Sequence
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines import Physics
+from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.kinematics import Place, names_of, pick
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
@@ -74,3 +77,48 @@ def _indices(model: mujoco.MjModel, joint: int, kind: str) -> np.ndarray:
     entry = model.joint(joint)
     start, size = (entry.qposadr, len(entry.qpos0)) if kind == "qpos" else (entry.dofadr, len(entry.damping))
     return start[0] + np.arange(size)
+
+
+class Sensors:
+    """Sensors of a model on any engine, as `mj_forward` computes them for the current state and inputs.
+
+    Args:
+      engine: "native", "jax", "warp" or "warp graph". MuJoCo Warp reads them for both paths of warp.
+      varied: as in `make_engine`.
+      **options: the engine's options. Used are `num_threads` of native and `allow_cpu` of warp.
+
+    Raises:
+      ValueError: the implementation does not support the model.
+    """
+
+    def __init__(self, engine: str, model: mujoco.MjModel, varied: Sequence[str] = (), **options: Any):
+        self._reader: Any
+        if engine == "native":
+            from mjx_dher.envs.engines.native import Simulator
+
+            self._reader = Simulator(model, derived=("sensordata",), num_threads=options.get("num_threads"), varied=varied)
+            self._rest = jax.device_get(self._reader.make_data())
+        elif engine == "jax":
+            from mjx_dher.envs.engines.mjx import MjxEngine
+
+            self._reader = MjxEngine(model, 1, sensors=True, varied=varied)
+        else:
+            from mjx_dher.envs.engines.warp import WarpEngine
+
+            self._reader = WarpEngine(
+                model, 0, path="graph", allow_cpu=options.get("allow_cpu", False), sensors=True, varied=varied
+            )
+
+    def read(self, physics: Physics, controls: Controls) -> Array:
+        """Values [nsensordata] of all sensors, in the model's order."""
+        if not hasattr(self, "_rest"):
+            return self._reader.read_sensors(physics, controls)
+        state = {"qpos": physics.qpos, "qvel": physics.qvel, "act": physics.act, "qacc_warmstart": physics.warmstart}
+        mocap = {"mocap_pos": controls.mocap[:, :3], "mocap_quat": controls.mocap[:, 3:]}
+        varied = {} if physics.factors is None else {"factors": physics.factors}
+        data = jax.tree.map(jnp.asarray, self._rest).replace(ctrl=controls.ctrl, **varied, **state, **mocap)
+        return self._reader.forward(data).derived["sensordata"]
+
+    def check(self) -> None:
+        """Raises ValueError if contacts were left out, like `Engine.check`."""
+        self._reader.check()

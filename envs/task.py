@@ -16,10 +16,9 @@ from mjx_dher.envs import probes
 from mjx_dher.envs.base import State
 from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.engines.sensors import Sensors
 from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation
 from mjx_dher.envs.kinematics import Place
-from mjx_dher.envs.observations import Entry
+from mjx_dher.envs.observations import Entry, Sensors
 from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.starts import Start
 from mjx_dher.types import Array, PRNGKey

@@ -10,7 +10,7 @@ from test_export import random_policy, save_run
 import mjx_dher
 from mjx_dher import cli
 from mjx_dher.config import Config, HParams
-from mjx_dher.policy.arrays import from_arrays
+from mjx_dher.policy import from_arrays
 from mjx_dher.runs.folder import results
 from mjx_dher.system.files import FolderError
 from mjx_dher.validation import validate

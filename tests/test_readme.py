@@ -10,9 +10,9 @@ README = (ROOT / "README.md").read_text()
 # What commands and engines are made of; some of it has a place among the API pages, too.
 INNER = (
     "__main__ cli system envs.engines.fused envs.engines.warp envs.engines.graph envs.engines.features"
-    " envs.engines.fields envs.engines.pairs envs.engines.sensors envs.engines.batches envs.engines.corrections"
+    " envs.engines.fields envs.engines.pairs envs.engines.batches envs.engines.corrections"
     " runs sweeps testing tools lookup import_paths trust viewer fleet check parallel"
-    " policy.learner_policy policy.arrays"
+    " policy.learner_policy"
 )
 
 

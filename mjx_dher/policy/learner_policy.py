@@ -13,7 +13,7 @@ import numpy as np
 from mjx_dher import learners
 from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
-from mjx_dher.policy.arrays import read_interface
+from mjx_dher.policy import read_interface
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import atomic_write
 from mjx_dher.types import Array, EnvSpec, PyTree

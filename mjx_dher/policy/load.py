@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from mjx_dher.policy import Policy, TrainedPolicy, bundled
-from mjx_dher.policy.arrays import from_arrays
+from mjx_dher.policy import Policy, TrainedPolicy, bundled, from_arrays
 from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.system import npz
 from mjx_dher.system.files import FolderError

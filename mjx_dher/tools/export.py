@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_dher import __version__, lookup
-from mjx_dher.policy import Policy
-from mjx_dher.policy.arrays import from_arrays
+from mjx_dher.policy import Policy, from_arrays
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
 
