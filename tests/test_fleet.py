@@ -117,12 +117,11 @@ def test_the_screen_shows_all_nodes(capsys):
 
 
 def test_checkpoints_of_one_machine_lie_in_its_sweep(tmp_path):
-    order = fleet.Order(FleetOptions(ray="local"), tmp_path, "auto", None, OPTIONS, list, list)
-    assert order.storage.parent == tmp_path / "unfinished"
-    assert dataclasses.replace(order, fleet=FleetOptions(ray="auto")).storage is None
-    own = dataclasses.replace(order, fleet=FleetOptions(ray="auto", storage=Path("/shared")))
-    assert own.storage.parent == Path("/shared")
-    assert dataclasses.replace(own, out=tmp_path / "other").storage != own.storage
+    assert fleet.storage_of(FleetOptions(ray="local"), tmp_path).parent == tmp_path / "unfinished"
+    assert fleet.storage_of(FleetOptions(ray="auto"), tmp_path) is None
+    own = FleetOptions(ray="auto", storage=Path("/shared"))
+    assert fleet.storage_of(own, tmp_path).parent == Path("/shared")
+    assert fleet.storage_of(own, tmp_path / "other") != fleet.storage_of(own, tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,19 @@
 """A sweep on a Ray cluster: `sweep --ray`."""
 
 import contextlib
-import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_components
+from mjx_dher.cli.sweep import SweepArgs, announce, trials_of
 from mjx_dher.fleet import chunks, cluster, driver, worker
 from mjx_dher.fleet.chunks import LOCAL, Chunk, FleetOptions
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.run_folder import Claims
-from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
@@ -23,25 +22,12 @@ from mjx_dher.system.caches import prepare
 SECONDS_WITHOUT_NEWS = 8.0  # after a signal; then the cluster is gone
 
 
-@dataclasses.dataclass(frozen=True)
-class Order:
-    """A sweep to train on a cluster."""
-
-    fleet: FleetOptions
-    out: Path
-    engine: str
-    lanes: int | None
-    options: Options
-    make_trials: Callable[[str], list[RunSpec]]  # takes the preset, cpu or gpu, to use if the user names none
-    announce: Callable[[list[RunSpec]], list[RunSpec]]  # prints the remaining work, and returns its trials
-
-    @property
-    def storage(self) -> Path | None:
-        """Folder for checkpoints: the user's, or one in the sweep's folder if all tasks run on this machine."""
-        if self.fleet.storage is None and self.fleet.ray != LOCAL:
-            return None
-        root = self.fleet.storage or self.out / "unfinished"
-        return (root / f"fleet-{fingerprint.sha256_of(str(self.out.absolute()))[:10]}").absolute()
+def storage_of(fleet: FleetOptions, out: Path) -> Path | None:
+    """Folder for checkpoints: the user's, or one in the sweep's folder `out` if all tasks run on this machine."""
+    if fleet.storage is None and fleet.ray != LOCAL:
+        return None
+    root = fleet.storage or out / "unfinished"
+    return (root / f"fleet-{fingerprint.sha256_of(str(out.absolute()))[:10]}").absolute()
 
 
 def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
@@ -51,70 +37,72 @@ def train_chunk(chunk: Chunk, tell: Tell) -> list[bytes]:
     return worker.train(chunk, make_env, tell)
 
 
-def train(order: Order, console: Console) -> tuple[list[RunSpec], list[RunSpec]]:
-    """Trains a sweep on a cluster. Returns all trials, and those that had not ended before. Raises ValueError if the cluster
-    cannot be used, or a run cannot be trained.
+def train(args: SweepArgs, console: Console) -> tuple[list[RunSpec], list[RunSpec]]:
+    """Trains a sweep on a cluster, whose machines decide the preset if the user names none. Returns all trials, and those that
+    had not ended before. Raises ValueError if the cluster cannot be used, or a run cannot be trained.
     """
     import jax
 
     jax.config.update("jax_platforms", "cpu")  # the GPUs are for the tasks
-    code = chunks.custom_code(order.make_trials("cpu"))
-    with cluster.joined(str(order.fleet.ray), code) as ray:
-        task = chunks.task_of(order.fleet.ray_cpus, ray.resources())
-        trials = order.make_trials("gpu" if task.gpus else "cpu")
-        settle_compiler(order.engine)
+    storage, named = storage_of(args.fleet, args.out), args.preset != "auto"
+    code = chunks.custom_code(trials_of(args, args.preset if named else "cpu"))
+    with cluster.joined(str(args.fleet.ray), code) as ray:
+        task = chunks.task_of(args.fleet.ray_cpus, ray.resources())
+        trials = trials_of(args, args.preset if named else "gpu" if task.gpus else "cpu")
+        settle_compiler(args.engine)
         try_components(trials, console, on_cpu=True)  # JAX starts here, after Ray has forked its processes
         report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
-        if order.storage is not None:
+        if storage is not None:
             try:
-                files.make_folder(order.storage)
+                files.make_folder(storage)
             except OSError as error:
-                raise ValueError(f"storage: {order.storage} cannot be written to ({error.strerror})") from error
-        files.make_folder(order.out / grid.CELLS)
-        with files.lock(order.out):
-            todo = order.announce(trials)
+                raise ValueError(f"storage: {storage} cannot be written to ({error.strerror})") from error
+        files.make_folder(args.out / grid.CELLS)
+        with files.lock(args.out):
+            todo = announce(args, trials, console)
             claims = Claims(True, report)
-            free = [run for run in todo if claims.is_free(run, grid.folder_of(order.out, run))]
+            free = [run for run in todo if claims.is_free(run, grid.folder_of(args.out, run))]
             if free:
-                _train(order, ray, task, trials, free, report, console)
+                _train(args, storage, ray, task, trials, free, console)
     return trials, todo
 
 
 def _train(
-    order: Order,
+    args: SweepArgs,
+    storage: Path | None,
     ray: cluster.Cluster,
     task: chunks.Task,
     trials: Sequence[RunSpec],
     todo: Sequence[RunSpec],
-    report: Callable[[str], None],
     console: Console,
 ) -> None:
     """Trains runs that no other process trains, until a signal requests a stop."""
+    report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
     nodes = [node for node in ray.resources() if task.slots(node)]
     slots = sum(map(task.slots, nodes))
     report(
         f"ray: {len(nodes)} nodes, {slots} parallel tasks, each with {task.gpus} GPUs and {task.cpus} CPUs; {len(todo)} runs"
     )
-    before = chunks.unfinished(order.storage, trials, todo)
+    before = chunks.unfinished(storage, trials, todo)
     others = [run for run in todo if not any(run in chunk for chunk in before)]
-    parts = [*before, *chunks.split(others, task, slots, order.lanes, order.fleet.ray_chunk)]
+    parts = [*before, *chunks.split(others, task, slots, args.lanes, args.fleet.ray_chunk)]
     screen = _Screen(console, todo)
     code = chunks.code_of(todo)
     for run in todo:  # the nodes write the folders
         run_folder.record_names(run)
-    with signals.held(report, order.out, SECONDS_WITHOUT_NEWS) as held:
+    with signals.held(report, args.out, SECONDS_WITHOUT_NEWS) as held:
 
         def show(state: driver.State) -> None:
             held.alive()
             screen.show(state)
 
-        own = (order.options, order.lanes, task, order.storage, code, train_chunk)
-        lost = driver.run(ray, driver.Job(order.out, parts, *own, report, show, signals.are_asked))
+        own = (args.options, args.lanes, task, storage, code, train_chunk)
+        lost = driver.run(ray, driver.Job(args.out, parts, *own, report, show, signals.are_asked))
     if lost:
         tries = cluster.RETRIES + 1
         raise ValueError(f"ray: {len(lost)} tasks were lost {tries} times ({'; '.join(lost[:3])}); run the same command again")
-    if not signals.are_asked() and order.storage is not None:
-        for path in (order.storage, order.storage.parent) if order.fleet.storage is None else (order.storage,):
+    if not signals.are_asked() and storage is not None:
+        for path in (storage, storage.parent) if args.fleet.storage is None else (storage,):
             with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
 

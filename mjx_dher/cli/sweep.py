@@ -113,11 +113,11 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
     args = parse(SweepArgs, argv, default=default)
     _check(args)
     preset: str = "cpu" if args.preset == "auto" else args.preset
-    args = _without_unread(args, _trials(args, preset), report)
+    args = _without_unread(args, trials_of(args, preset), report)
     if args.preset == "auto" and args.fleet.ray is None:  # else the preset is known once the cluster is joined
-        _trials(args, preset)  # raises for invalid ones before CUDA starts
+        trials_of(args, preset)  # raises for invalid ones before CUDA starts
         preset = presets.machine_preset()
-    return args, _trials(args, preset)
+    return args, trials_of(args, preset)
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:
@@ -161,7 +161,7 @@ def _check(args: SweepArgs) -> None:
     files.inside(args.out, [*args.out.glob("*"), *args.out.glob("*/*")])
 
 
-def _trials(args: SweepArgs, preset: str) -> list[RunSpec]:
+def trials_of(args: SweepArgs, preset: str) -> list[RunSpec]:
     """All trials of the grid. Raises ValueError if one of them cannot run."""
     specs, plain = [], []
     changes = {name: value for name, value in vars(args.changes).items() if value is not None}
@@ -190,7 +190,9 @@ def sweep_command(argv: list[str], console: Console) -> int:
     if args.dry_run:
         return _dry_run(args, trials, console)
     if args.fleet.ray is not None:
-        return _sweep_fleet(args, console)
+        from mjx_dher.cli import fleet
+
+        return _end(args, *fleet.train(args, console), signals.asked() or 0, console)
     settle_compiler(args.engine)
     described = {name: value for name, value in dataclasses.asdict(args).items() if name != "out"}
     screen = join(args.distributed, {**described, "trials": [*map(fingerprint.trial_name, trials)]}, console)
@@ -207,7 +209,7 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         def begin() -> list[int]:
             stack.enter_context(files.made(args.out / grid.CELLS))
             settings.check_writable(args.out / grid.CELLS)
-            return [places[trial] for trial in _announce(args, trials, console)]
+            return [places[trial] for trial in announce(args, trials, console)]
 
         todo = [trials[place] for place in processes.broadcast(begin)]
         if todo:
@@ -216,19 +218,7 @@ def _sweep(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
         return int(processes.broadcast(lambda: _end(args, trials, todo, number, console)))
 
 
-def _sweep_fleet(args: SweepArgs, console: Console) -> int:
-    """Trains a grid of runs on a cluster. Its machines decide the preset if the user names none."""
-    from mjx_dher.cli import fleet
-
-    def make_trials(preset: str) -> list[RunSpec]:
-        return _trials(args, preset if args.preset == "auto" else args.preset)
-
-    announce = lambda trials: _announce(args, trials, console)  # noqa: E731
-    order = fleet.Order(args.fleet, args.out, args.engine, args.lanes, args.options, make_trials, announce)
-    return _end(args, *fleet.train(order, console), signals.asked() or 0, console)
-
-
-def _announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
+def announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[RunSpec]:
     """Prints the number of runs. Returns the trials that have not ended."""
     for text in grid.changed_files(args.out, trials):
         console.print(text, soft_wrap=True)
