@@ -122,9 +122,7 @@ class SimulatedTask(GoalEnv):
         return dataclasses.replace(physics, factors=draw(self._ranges, key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """First state of an episode that starts from `physics`, with a goal [G]. If `physics` has diverged, it is like a state
-        from `step`.
-        """
+        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`."""
         check_shape("desired_goal", desired_goal, (self.goal_size,))
         physics = self._sensed(physics)
         sound = self.is_sound(physics)

@@ -72,9 +72,7 @@ class Start:
         return qpos
 
     def held(self, physics: Physics) -> tuple[Physics, Controls]:
-        """A drawn start with activations that hold it, and the inputs that hold it. Both are the model's keyframe's if it has
-        inputs or activations.
-        """
+        """A drawn start with activations, and inputs, that hold it: the keyframe's if it has inputs or activations."""
         hold = jax.tree.map(jnp.asarray, self.hold)
         if self._holding is None:
             return physics, hold

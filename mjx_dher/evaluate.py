@@ -33,9 +33,7 @@ def evaluate(
 
 
 def play_policy(env: Env, policy: TrainedPolicy, num_episodes: int, seed: int) -> Outcome:
-    """Plays episodes of a policy from `load_policy`, with initial states drawn by `seed`. Returns outcomes [num_episodes] as
-    NumPy arrays.
-    """
+    """Outcomes [num_episodes], in NumPy, of a policy from `load_policy`. `seed` draws the initial states."""
     check_size("num_episodes", num_episodes)
     chunk = min(num_episodes, CHUNK)
 

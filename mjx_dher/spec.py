@@ -127,9 +127,7 @@ def _to_argument(value: str) -> Argument:
 
 
 def validate_values(spec: RunSpec) -> None:
-    """Checks each value on its own, for any environment and any components. Raises ValueError with each invalid field, its
-    value and the allowed values.
-    """
+    """Checks each value alone, for any environment and components. Raises ValueError with each invalid field and value."""
     validation.check_all(
         *((_check_text, name, getattr(spec, name)) for name in COMPONENTS),
         (_check_text, "demonstrations", "" if spec.demonstrations is None else spec.demonstrations),

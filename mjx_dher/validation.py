@@ -19,9 +19,7 @@ def check_devices(devices: Any) -> None:
 
 
 def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[str, int]:
-    """Splits an address, such as "[::1]:8000", into a host, without brackets, and a port. Raises ValueError that names the
-    setting and the `allowed` form.
-    """
+    """Splits "[::1]:8000" into a host, without brackets, and a port. Raises ValueError with the setting's `allowed` form."""
     host, _, port = value.rpartition(":")
     if not host or "/" in host or not (port.isascii() and port.isdecimal()) or not 0 < int(port[:6]) < 1 << 16:
         raise ValueError(f"{name} must be {allowed}; got {value!r}")
@@ -62,9 +60,7 @@ def check_all(*calls: tuple[Any, ...]) -> None:
 
 
 def check_number(field: str, value: Any, interval: str, kind: type = int) -> None:
-    """Raises ValueError, naming `field`, unless `value` is a number in an interval, such as "[0, 1)". The kind float allows
-    integers too.
-    """
+    """Raises ValueError, naming `field`, unless `value` is a number in an interval, such as "[0, 1)". A float may be an int."""
     if problem := _number_problem(field, value, Number(interval), kind):
         raise ValueError(problem)
 

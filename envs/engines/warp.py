@@ -225,9 +225,7 @@ class WarpEngine:
 
 
 def _choose(model: mujoco.MjModel, path: str, constraints: int | None) -> tuple[str, str, int]:
-    """Path that runs, the reason, and the constraint rows that `fused` has memory for. Raises ValueError if the path does not
-    support the model.
-    """
+    """Path that runs, the reason, and the rows of `fused`. Raises ValueError if the path does not support the model."""
     left_out, reason = support.unsupported(model), "as asked"
     if left_out and path != "graph":
         reason = f"the fused kernel does not support features of the model: {', '.join(left_out)}"

@@ -63,9 +63,7 @@ def changes(before: RunSpec, now: RunSpec) -> str:
 
 
 def check_out(out: Path | None) -> None:
-    """Checks that a run folder can be made at `out`, without leaving a trace. Raises FolderError if it exists, or its parent
-    folder is not writable.
-    """
+    """Raises FolderError if there is something at `out`, or its parent folder is not writable. Leaves no trace."""
     if out is None:
         return
     if (out.is_symlink() or out.exists()) and (not out.is_dir() or files.is_used(out)):

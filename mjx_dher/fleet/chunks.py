@@ -83,9 +83,7 @@ class Chunk(NamedTuple):
 
 
 def task_of(cpus: int | None, nodes: Sequence[Mapping[str, float]]) -> Task:
-    """Resources of a task: one GPU if the cluster has any, else `cpus` cores, by default all cores of a node. Raises ValueError
-    if no node has them.
-    """
+    """Resources of a task: one GPU if there are any, else `cpus` or a node's cores. Raises ValueError if no node has them."""
     cores = [int(node["CPU"]) for node in nodes if node.get("CPU", 0) >= 1]
     if cpus is None and any(node.get("GPU", 0) >= 1 for node in nodes):
         task = Task(1, 1 if cores else 0)

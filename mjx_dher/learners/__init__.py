@@ -165,9 +165,7 @@ def values_of(learner: Any, state: PyTree, hparams: HParams) -> Values:
 
 
 def over_axis(learner: Any, axis_name: str | None) -> Learner:
-    """Learner of a run that the devices of a mapped axis share. Raises ValueError if the learner has no field `axis_name`, so
-    the devices' copies would diverge.
-    """
+    """Learner of a run that several devices share. Raises ValueError without a field `axis_name`: copies would diverge."""
     if not hasattr(learner, "axis_name"):
         raise ValueError(
             f"devices: learner {type(learner).__name__} cannot share one run between devices, because it has no field axis_name"

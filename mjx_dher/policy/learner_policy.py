@@ -98,9 +98,7 @@ def _leading(key: str, obs: Mapping[str, Any], like: PyTree) -> set[tuple[int, .
 
 
 def from_arrays(arrays: Mapping[str, np.ndarray], spec: RunSpec) -> LearnerPolicy:
-    """Makes a policy from the arrays of `LearnerPolicy.save`, for the run `spec`. Raises ValueError if the arrays do not fit
-    this learner.
-    """
+    """Policy of the run `spec` from the arrays of `LearnerPolicy.save`. Raises ValueError if they do not fit its learner."""
     if "env_spec" in arrays:
         env_spec = from_json(str(arrays["env_spec"]))
     else:  # older files have only the sizes D, G and A

@@ -35,9 +35,7 @@ def keep_compiled_programs() -> None:
 
 
 def check_platform() -> None:
-    """Starts JAX's devices, with at most as many CPU threads as this process may use. Raises ValueError if this machine lacks
-    the platform in JAX_PLATFORMS.
-    """
+    """Starts JAX's devices, on at most the usable cores. Raises ValueError if this machine lacks the one in JAX_PLATFORMS."""
     import jax
 
     limits.limit_threads()

@@ -28,9 +28,7 @@ KEPT_SECONDS = 90 * 24 * 3600.0  # lifetime of a verdict
 
 
 def check(env: Env, specs: Sequence[RunSpec], again: bool = False) -> Iterator[str]:
-    """Checks the custom components of runs of `env`, each once, or `again`. Yields lines for the screen. Raises ComponentError
-    for the first violation.
-    """
+    """Checks custom components of runs of `env`, each once, or `again`. Yields lines. Raises ComponentError if one fails."""
     runs = list(dict.fromkeys(_read(spec) for spec in specs if custom_components(spec)))
     if not runs:
         return

@@ -161,9 +161,7 @@ def record_episodes(
 
 
 def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int, fps: float) -> Iterator[np.ndarray]:
-    """Yields frames [height, width, 3] uint8 of all episodes, and holds each last one for `HOLD_SECONDS`. Arguments as in
-    `stills`.
-    """
+    """Yields frames [height, width, 3] uint8 of all episodes, each last one for `HOLD_SECONDS`. Arguments as in `stills`."""
     for episode, goal in zip(qpos, goals):
         for frame in draw_frames(env, episode, goal, width, height):
             yield frame

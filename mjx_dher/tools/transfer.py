@@ -48,9 +48,7 @@ def default_environment() -> Path:
 
 
 def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> None:
-    """Creates a virtual environment with the original tasks, unless it is complete. Raises ValueError if pip failed. The
-    message includes its output.
-    """
+    """Creates a virtual environment with the original tasks, unless it is complete. Raises ValueError with pip's output."""
     if is_ready(interpreter(environment), requirements):
         return
     venv.create(environment, with_pip=True, clear=True)
@@ -66,9 +64,7 @@ def interpreter(environment: Path) -> Path:
 
 
 def check_original(env_name: str, python: Path) -> str:
-    """Gymnasium id of a task's original. Raises ValueError if the task has no original, or `python` does not have the original
-    tasks.
-    """
+    """Gymnasium id of a task's original. Raises ValueError if it has none, or `python` does not have the original tasks."""
     if env_name not in ORIGINALS:
         raise ValueError(f"{env_name} has no original to transfer to; tasks with an original: {', '.join(ORIGINALS)}")
     if not is_ready(python):

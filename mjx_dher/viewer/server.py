@@ -205,9 +205,7 @@ class Viewer:
 
 
 def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]:
-    """Starts viser's server. Returns it, and a dict for the panel's controls. Raises ValueError if another process has taken
-    the port since it was checked.
-    """
+    """Starts viser's server. Returns it, and a dict for the panel's controls. Raises ValueError if the port was taken since."""
     import viser
 
     from mjx_dher.viewer.guard import Guard

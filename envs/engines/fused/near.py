@@ -25,13 +25,7 @@ def near_pairs(
 
     Pairs that there is no room for are counted in `lost`.
     """
-    near = Contacts()
-    near.geom_body = contacts.geom_body
-    near.geom_pos = contacts.geom_pos
-    near.geom_mat = contacts.geom_mat
-    near.geom_size = contacts.geom_size
-    near.geom_reach = contacts.geom_reach
-    near.rounds = contacts.rounds
+    near = contacts
     size, most = layout.size, contacts.near
     near.geom1 = ints(spare, size, 0, most, threads)
     near.geom2 = ints(spare, size, most, most, threads)
@@ -77,9 +71,7 @@ def near_pairs(
 @wp.func
 def memory_of(contacts: Contacts, memory: Memory, layout: Layout, spare: Floats, threads: int) -> Memory:
     """Returns the memory in which contacts of the pairs that are near are found."""
-    scratch = Memory()
-    scratch.pos = memory.pos
-    scratch.mat = memory.mat
+    scratch = memory
     begin, slots = wp.static(PAIR_WORDS) * contacts.near, contacts.near_slots
     scratch.distance = floats(spare, layout.size, begin, slots, threads)
     scratch.place = vec3s(spare, layout.size, begin + slots, slots, threads)
@@ -103,21 +95,7 @@ def keep(
 
     Contacts that there is no room for are counted in `lost`.
     """
-    held = Contacts()
-    held.geom_body = contacts.geom_body
-    held.geom_mat = contacts.geom_mat
-    held.geom1 = contacts.geom1
-    held.geom2 = contacts.geom2
-    held.kind = contacts.kind
-    held.margin = contacts.margin
-    held.dim = contacts.dim
-    held.edges = contacts.edges
-    held.mu = contacts.mu
-    held.slip = contacts.slip
-    held.friction = contacts.friction
-    held.rolling = contacts.rolling
-    held.soft = contacts.soft
-    held.weight = contacts.weight
+    held = contacts
     held.pair = ints(spare, layout.size, layout.pair, contacts.slots, threads)
     kept = int(0)
     for begin in range(0, near.pairs, threads):

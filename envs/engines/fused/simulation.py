@@ -95,9 +95,7 @@ def check_fits(model: mujoco.MjModel, rows: int) -> None:
 
 
 def most_warps(size: int, shared: int, threads: int = THREADS) -> int:
-    """Number of warps of a block, if an environment takes `size` floats and a block has `shared` bytes. Raises ValueError if
-    not even one warp fits.
-    """
+    """Warps of a block with `shared` bytes, if an environment takes `size` floats. Raises ValueError if not even one fits."""
     a_warp = 4 * size * (32 // threads)
     if a_warp > shared:
         raise ValueError(

@@ -97,9 +97,7 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
 
 
 def check_runs(env: Env, specs: Sequence[RunSpec], lanes: int | None = None, devices: int | str = 1) -> Train:
-    """Training loop of runs that share a program. Raises ValueError, before compilation, if they cannot be trained with these
-    arguments of `train_runs`.
-    """
+    """Training loop of runs that share a program. Raises ValueError, before compilation, if they cannot be trained."""
     for spec in specs:
         spec_lib.validate(spec, env.episode_length)
     placed_on = mesh.find(devices)
