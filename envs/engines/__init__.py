@@ -113,8 +113,7 @@ def _has_warp() -> bool:
 def make_engine(name: str, model: mujoco.MjModel, substeps: int, varied: Sequence[str] = (), **options: Any) -> Engine:
     """Makes an engine that advances `model` by `substeps` timesteps per call.
 
-    `native` supports any model without sleeping bodies, `jax` any that MJX supports, and `warp` any whose features its kernels
-    support.
+    `native` takes any model without sleeping bodies, `jax` any that MJX supports, `warp` any that its kernels support.
 
     Args:
       name: "native", "jax", "warp" or "auto".

@@ -32,13 +32,7 @@ class Rows:
     """
 
     def __init__(
-        self,
-        batch: Batch,
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        derived: Sequence[str],
-        digits: int,
-        variation: Any,
+        self, batch: Batch, inputs: Sequence[str], outputs: Sequence[str], derived: Sequence[str], digits: int, variation: Any
     ):
         self.batch, self.seconds = batch, 0.0  # that a call takes
         self._inputs = _placed(batch, inputs, digits, EXACT if digits else ())

@@ -6,7 +6,7 @@ little. Only the state is copied in and out.
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -20,6 +20,11 @@ from mjx_dher.system.warp_setup import wp
 IGNORED = ("actuator_armature", "opt.disableactuator")
 _PROBE = 2000  # timesteps
 _FEW_CONTACTS, _FEW_ROWS = 48, 160  # always allocated, if they can occur
+
+if TYPE_CHECKING:
+    Rows = Any
+else:
+    Rows = wp.array2d(dtype=float)  # argument of a kernel, a row per environment
 
 
 def unsupported(model: mujoco.MjModel) -> list[str]:
@@ -66,17 +71,17 @@ def probe(model: mujoco.MjModel) -> tuple[int, int, int]:
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")
 def _begin(
-    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    rest: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    warmstart_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    act_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    qpos: Rows,
+    qvel: Rows,
+    rest: Rows,
+    inputs: Rows,
+    qpos_out: Rows,
+    qvel_out: Rows,
+    warmstart_out: Rows,
+    act_out: Rows,
     mocap_pos: wp.array2d(dtype=wp.vec3),  # type: ignore[valid-type]
     mocap_quat: wp.array2d(dtype=wp.quat),  # type: ignore[valid-type]
-    ctrl: wp.array2d(dtype=float),  # type: ignore[valid-type]
+    ctrl: Rows,
     time: wp.array(dtype=float),  # type: ignore[valid-type]
 ):
     """Copies state and controls into MuJoCo Warp's memory."""
@@ -100,26 +105,14 @@ def _begin(
 
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")
-def _vary(
-    inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    begin: int,
-    field: wp.array2d(dtype=float),  # type: ignore[valid-type]
-):
+def _vary(inputs: Rows, begin: int, field: Rows):
     """Copies the numbers of a field of the model that differ between environments."""
     env, i = wp.tid()  # type: ignore[misc]
     field[env, i] = inputs[env, begin + i]
 
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")
-def _end(
-    qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    warmstart: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    act: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-):
+def _end(qpos: Rows, qvel: Rows, warmstart: Rows, act: Rows, qpos_out: Rows, qvel_out: Rows, rest_out: Rows):
     """Copies the state out of MuJoCo Warp's memory."""
     env = wp.tid()
     for i in range(qpos_out.shape[1]):
@@ -133,10 +126,7 @@ def _end(
 
 
 @wp.kernel(enable_backward=False, module="mjx_dher_graph")
-def _end_sensors(
-    sensordata: wp.array2d(dtype=float),  # type: ignore[valid-type]
-    rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-):
+def _end_sensors(sensordata: Rows, rest_out: Rows):
     """Copies the sensors out of MuJoCo Warp's memory, to the end of the rows."""
     env = wp.tid()
     first = rest_out.shape[1] - sensordata.shape[1]

@@ -18,6 +18,7 @@ import mujoco
 from mjx_dher.envs.engines import Controls, Physics, check_shapes, graph
 from mjx_dher.envs.engines.fused import simulation, support
 from mjx_dher.envs.engines.fused.varied import NONE, Numbers
+from mjx_dher.envs.engines.graph import Rows
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.lookup import check_name
 from mjx_dher.system import private_api
@@ -112,15 +113,7 @@ class WarpEngine:
         """JAX function that advances a batch, and allocates its memory on the first call."""
         engine = weakref.ref(self)  # Warp never frees the function
 
-        def advance_all(
-            qpos: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            qvel: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            rest: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            inputs: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            qpos_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            qvel_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-            rest_out: wp.array2d(dtype=float),  # type: ignore[valid-type]
-        ):
+        def advance_all(qpos: Rows, qvel: Rows, rest: Rows, inputs: Rows, qpos_out: Rows, qvel_out: Rows, rest_out: Rows):
             if (me := engine()) is None:
                 raise RuntimeError("the engine of this program no longer exists; keep it as long as the program")
             me._wait()
@@ -166,8 +159,7 @@ class WarpEngine:
         """Checks that no contacts were lost since the last call. Waits for the kernel to compile.
 
         Raises ValueError if the size that the engine was made with did not suffice, with a sufficient one. If the fused kernel
-        had no room by default, which is rare, a warning says so. The states of these environments have become NaN, so their
-        episodes are discarded.
+        had no room by default, which is rare, a warning says so. Their episodes are discarded, because the states are NaN.
         """
         self._wait()
         with self._lock:

@@ -6,8 +6,7 @@ of the two centres) through the origin leaves it somewhere. The algorithm looks 
 ray, the portal, and pushes it outwards until it lies on the surface. It finds one contact, not several. Source: G. Snethen,
 XenoCollide, Game Programming Gems 7 (2008); MuJoCo C takes it from libccd.
 
-All is in double precision, as in C: a puck sinks 0.02 mm into the table, and in single precision the normals of so thin an
-overlap are noise.
+All is in double precision, as in C: a puck sinks 0.02 mm into the table. In single, the normals of that overlap are noise.
 """
 
 from mjx_dher.system.warp_setup import wp

@@ -12,8 +12,7 @@ from mjx_dher.envs.engines.fused.ellipsoid import collide_ellipsoids
 from mjx_dher.envs.engines.fused.memory import carve, copy
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Floats, Floats2d, Ints, Layout, Memory, Sparse, World
 from mjx_dher.envs.engines.fused.near import keep, memory_of, near_pairs
-from mjx_dher.envs.engines.fused.round import collide_round
-from mjx_dher.envs.engines.fused.round_cylinder import collide_cylinders_with_round
+from mjx_dher.envs.engines.fused.round import collide_cylinders_with_round, collide_round
 from mjx_dher.envs.engines.fused.solver import accelerate, solve
 from mjx_dher.envs.engines.fused.sparse import ask_sparse
 from mjx_dher.envs.engines.fused.tendons import soften

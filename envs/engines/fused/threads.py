@@ -9,6 +9,13 @@ from mjx_dher.envs.engines.fused.model import Ints, Memory
 from mjx_dher.system.warp_setup import wp
 
 _GROUP = "const unsigned group = threads == 32 ? ~0u : ((1u << threads) - 1u) << (threadIdx.x & 31 & ~(threads - 1));"
+_SUM = f"""
+#if defined(__CUDA_ARCH__)
+    {_GROUP}
+    for (int other = threads / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
+#endif
+    return x;
+"""
 
 
 @wp.func_native(f"""
@@ -34,13 +41,7 @@ def gather(warps: int):  # type: ignore[no-untyped-def]
     """
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    {_GROUP}
-    for (int other = threads / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
-#endif
-    return x;
-""")
+@wp.func_native(_SUM)
 def total(x: float, threads: int) -> float:
     """Sum of the threads' numbers, with the same bits in each thread."""
 
@@ -62,13 +63,7 @@ def earlier(x: int, thread: int, threads: int) -> int:
     """Sum of the numbers of the threads before this one."""
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    {_GROUP}
-    for (int other = threads / 2; other > 0; other /= 2) x += __shfl_xor_sync(group, x, other);
-#endif
-    return x;
-""")
+@wp.func_native(_SUM)
 def all_of(x: int, threads: int) -> int:
     """Sum of the threads' numbers."""
 
