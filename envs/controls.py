@@ -162,8 +162,7 @@ class Mocap(Control):
     Args:
       body: name of the mocap body.
       scale: m per action of 1.
-      turn: rad per action of 1 about the world's x, y or z. 0 keeps the model's orientation, and the action has three numbers
-        instead of six.
+      turn: rad per action of 1 about the world's x, y or z. With 0, actions have three numbers instead of six.
     """
 
     def __init__(self, body: str, scale: float = 0.05, turn: float = 0.0):

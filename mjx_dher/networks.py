@@ -203,8 +203,7 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
     """Residual networks of any depth, with layer normalization and swish, for actor and critic.
 
     Each pair of layers after the first has a skip connection around it (He et al. 2016). Deep contrastive critics need all
-    three parts (Wang et al. 2025, "1000 Layer Networks for Self-Supervised RL"). Raises ValueError if `hidden_sizes` are not
-    all equal.
+    three parts (Wang et al. 2025, "1000 Layer Networks for Self-Supervised RL"). Raises ValueError for unequal `hidden_sizes`.
     """
     if len(set(hidden_sizes)) != 1:
         raise ValueError(f"networks residual and unit_norm need equal hidden_sizes; got {hidden_sizes}")
@@ -215,8 +214,7 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
 def unit_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
     """`residual` with the weights of each hidden unit projected to length 1 after each update, as in XQC and SimbaV2 (2025).
 
-    Layer normalization makes the outputs independent of these lengths. Kept at 1, they do not grow and lower the effective
-    step size.
+    Layer normalization makes the outputs independent of these lengths. Kept at 1, they do not grow and shorten the steps.
     """
     return residual(action_size, hidden_sizes, dtype, heads)._replace(project=_to_unit_length)
 

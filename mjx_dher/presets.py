@@ -34,8 +34,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     rolls out the workers' episodes in parallel and takes the gradient of their joint batch.
 
     Args:
-      learner: learner. Default: the preset's, which may bring its own numbers and priority. Other learners use the numbers of
-        `ddpg`.
+      learner: learner. Default: the preset's, which may bring its own numbers and priority. Others use the numbers of `ddpg`.
       networks: networks. Default: the preset's for this learner.
       **changes: other fields of the run, such as `sampler` or `seed`.
 

@@ -231,8 +231,7 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array
 
     Args:
       state: the ring. It must not be empty.
-      fraction: probability of drawing a row by priority instead of uniformly. All draws are uniform while all priorities are
-        0.
+      fraction: probability of drawing a row by priority, not uniformly. All draws are uniform while all priorities are 0.
       weights: `cumulative(state)`.
     """
     coin_key, bits_key = jax.random.split(key)

@@ -55,8 +55,7 @@ def rollout(
       key: random key, or keys [N], of the initial states.
       num_envs: number of episodes N.
       inputs: other inputs of the policy, such as noise or keys; leaves lead with [T].
-      goals: function from the initial observations to goals [N, G], which `env.with_goal` sets. Default: the goals of the
-        resets.
+      goals: function from the initial observations to goals [N, G], which `env.with_goal` sets. Default: the resets' own.
       spec: `contract.env_spec` of `env`, if it is known. It takes a trace of `env`.
 
     Returns:

@@ -272,8 +272,7 @@ def probabilities(log_weights: Array) -> Array:
 def draw(key: PRNGKey, log_weights: Array) -> Array:
     """Draws one index [B] per row of log weights [B, T+1], by inverting the cumulative distribution.
 
-    A goal without weight is never drawn, despite rounding. A row without weights, or with NaN or +inf, gives T+1, which is not
-    an index.
+    A goal without weight is never drawn, despite rounding. A row without weights, or with NaN or +inf, gives T+1 (no index).
     """
     num_goals = log_weights.shape[-1]
     weights = jnp.exp(log_weights - jnp.max(log_weights, axis=-1, keepdims=True))

@@ -130,9 +130,8 @@ def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
     """Probability that a score of `a` exceeds one of `b`, averaged over tasks. Ties count half.
 
-    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). The shapes are [S] or
-    [S, K]; the numbers of seeds may differ. Raises ValueError if there are no scores, or `a` and `b` have different numbers of
-    tasks.
+    For each task it is the Mann-Whitney U statistic divided by the number of pairs (Agarwal et al. 2021). The shapes are [S]
+    or [S, K]; the numbers of seeds may differ. Raises ValueError without scores, or if the tasks differ in number.
     """
     a, b = (np.atleast_2d(_scores(scores).T).T for scores in (a, b))
     if a.shape[1] != b.shape[1]:

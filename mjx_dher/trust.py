@@ -49,8 +49,7 @@ def check(field: str, name: str, place: Path | None) -> None:
 
 
 def record(field: str, name: str, place: Path | None, arguments: Sequence[str] = ()) -> None:
-    """Records a name that the user typed or passed, with the file of its module or data. Does nothing if there is no state
-    folder.
+    """Records a name that the user typed or passed, with the file of its module or data, unless there is no state folder.
 
     A `FromFile` is recorded with other `arguments`, which the user typed, if the user has trained with those of its file.
     """

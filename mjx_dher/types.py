@@ -133,8 +133,7 @@ class EnvState(Protocol):
 
     - `failed`: the simulation diverged. Nothing is learned from the episode.
     - `done`: the episode ends here (needs `EnvSpec.ends`).
-    - `terminal`: the episode ends here and no future follows for any goal, for example after an object was dropped (needs
-      `EnvSpec.ends`).
+    - `terminal`: the episode ends here without a future for any goal, as after an object was dropped (needs `EnvSpec.ends`).
     """
 
     @property

@@ -74,8 +74,7 @@ def settle_compiler(engine: str) -> None:
 def try_components(specs: Sequence[RunSpec], console: Console, env: Any = None, on_cpu: bool = False) -> None:
     """Tests the custom components of runs, grouped by environment, before anything is compiled or written.
 
-    Without `env`, the environments are made, with native physics in place of warp if `on_cpu`. Raises ValueError for the first
-    violation.
+    Without `env`, it is made, with native physics in place of warp if `on_cpu`. Raises ValueError for the first violation.
     """
     own = [spec for spec in specs if custom_components(spec)]
     for _, group in itertools.groupby(own, key=lambda spec: spec.env):

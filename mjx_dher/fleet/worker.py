@@ -46,8 +46,7 @@ Tell = Callable[[News], bool]  # returns True to stop
 
 
 def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[bytes]:
-    """Trains a chunk, from its checkpoints if its folder in the storage has any. `tell` reports progress, and returns True to
-    stop.
+    """Trains a chunk, from the checkpoints in the storage if there are any. `tell` reports progress, and returns True to stop.
 
     Returns each run folder as bytes from `pack`, or empty bytes if a run was stopped. Raises ValueError as `train_runs` does,
     or if this node has other code or storage than the driver.

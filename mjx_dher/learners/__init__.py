@@ -88,8 +88,7 @@ class Learner(Protocol):
         Args:
           observation: [N, T+1, D] of the rollout's episodes.
           goal: relabelled goals [B, G].
-          valid: bool [N], or [N, T+1] if episodes can end early. Observations for which it is False may be NaN and must be
-            ignored.
+          valid: bool [N], or [N, T+1] if episodes can end early. Where it is False, observations may be NaN; ignore them.
 
         Returns:
           The next state.

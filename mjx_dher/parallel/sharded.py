@@ -1,8 +1,7 @@
 """Functions of a training loop, placed on the devices of a `Layout`. They lower and compile like the ones of `jax.jit`.
 
 For parallel runs, every device runs the single-device program, so results are bit-identical. (A program for several devices
-would round differently, because XLA simplifies it in another order.) For a run on several devices, there is one program for
-the mesh.
+would round differently, because XLA simplifies it in another order.) A run on several devices has one program for the mesh.
 """
 
 import concurrent.futures

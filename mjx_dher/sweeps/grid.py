@@ -15,8 +15,7 @@ CELLS = "cells"
 def trials(specs: Sequence[RunSpec], seeds: Sequence[int], plain: Sequence[RunSpec] | None = None) -> list[RunSpec]:
     """Every setting with every seed, sorted by environment, then seed, so that runs to compare end together.
 
-    Settings that a run does not read get the values of its run in `plain`, by default the environment's first one, and
-    duplicates are dropped.
+    Settings that a run does not read are as in its run in `plain`, by default the environment's first. Duplicates are dropped.
     """
     settings: dict[RunSpec, None] = {}
     first: dict[str, RunSpec] = {}

@@ -28,8 +28,7 @@ def run(
     """Trains trials into the folder of a sweep, which is made if necessary. Trials share programs if possible, in any order.
 
     `make_env` makes the environment of a trial. The options, and errors, are those of `train_runs`. Returns one Result per
-    trained trial. Trials that had ended before, that another process trains, or that were waiting when the sweep was stopped
-    have none.
+    trained trial, none for those that had ended, that another process trains, or that were waiting at a stop.
     """
     options |= {"should_stop": should_stop, "shared": folder / UNFINISHED, "sweep": True}
     results: list[Result] = []

@@ -165,8 +165,7 @@ def array_checkpointer() -> Any:
 def viser_served_with(adapt: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> Iterator[None]:
     """Makes a viser server that starts during the block use the options that `adapt` makes from viser's.
 
-    Private: that viser calls `websockets.asyncio.server.serve` by this name, which is replaced during the block, for every
-      thread.
+    Private: that viser calls `websockets.asyncio.server.serve` by this name, replaced for every thread during the block.
     Why: viser has no option for a check of requests, a limit of clients or a log.
     Needed by: viser 1.1.1. No upstream issue known.
     """

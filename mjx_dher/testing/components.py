@@ -69,8 +69,7 @@ def check_sampler(
 ) -> str:
     """Checks the log weights at every step of random episodes.
 
-    They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal under `jax.vmap`, alone, and in a
-    second call.
+    They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal in a second call and `jax.vmap`.
     """
     made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, learner)
     episodes, numbers = trial.episodes, trainer.as_arrays(trial.hparams)
@@ -237,8 +236,7 @@ def check_generator(
 ) -> str:
     """Checks the goals of random resets, with an empty ring and with random episodes in it.
 
-    They must be floats [N, G], equal for equal keys, and finite for some reset once there are episodes. The environment must
-    have `with_goal`.
+    They must be floats [N, G], equal for equal keys, and finite for some reset once there are episodes. Needs `with_goal`.
     """
     made, trial = attempt("generator", generators.make, generator), trial_of(env, hparams, learner)
     attempt("generator", check_with_goal, trial.env)

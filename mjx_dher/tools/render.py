@@ -64,8 +64,7 @@ def ffmpeg() -> str:
 def choose_gl() -> str:
     """Sets MUJOCO_GL to the first backend that can draw without a screen here, and returns its name.
 
-    If the user has set MUJOCO_GL, only that backend is tested. A backend is tested once per process. Raises ValueError if no
-    backend works.
+    If the user has set MUJOCO_GL, only that one is tested. Each is tested once per process. Raises ValueError if none works.
     """
     requested = os.environ.get("MUJOCO_GL")
     if not requested and sys.platform != "linux":

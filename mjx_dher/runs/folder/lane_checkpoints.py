@@ -56,8 +56,7 @@ class LaneCheckpoints:
 
     def restore(self, init: Callable[[], TrainState], will_save: bool) -> Start:
         """Restores the newest checkpoint. Without one, the runs start with the state from `init`. Raises FolderError if no
-        checkpoint is usable and `restart` is False, or there is none and the disk is too full for one that the runs
-        `will_save`.
+        checkpoint is usable and `restart` is False, or there is none and no space for one that the runs `will_save`.
         """
         state = init()
         if not processes.broadcast(functools.partial(self._find, state, will_save)):

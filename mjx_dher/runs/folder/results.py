@@ -51,8 +51,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
 def read_rows(path: Path, digests: Sequence[str] | None = None) -> list[dict[str, Any]]:
     """Reads the lines of a metrics.csv as numbers, up to the first truncated one. The digest stays text.
 
-    `digests` are those that the run has had, in order. Raises FolderError if a line is missing, has an invalid value, or
-    belongs to another run.
+    `digests` are those that the run has had, in order. Raises FolderError if a line is missing, invalid or of another run.
     """
     head, *lines = list(csv.reader(whole_lines(path))) or [[]]
     rows: list[dict[str, Any]] = []

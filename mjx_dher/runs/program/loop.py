@@ -200,8 +200,7 @@ def state_template(program: Train) -> TrainState:
 
 
 def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
-    """Raises ValueError, before compilation, if replay ring or networks do not fit into the memory that `sharers` devices
-    share.
+    """Raises ValueError, before compilation, if ring or networks do not fit into the memory that `sharers` devices share.
 
     The message has the needed and the free memory and, for the ring, a replay_size that fits.
     """
