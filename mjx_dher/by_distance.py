@@ -29,7 +29,6 @@ def closest(
     achieved: Array, desired: Array, step: Array, hparams: HParams, metric: MetricFn = position, length: Array | None = None
 ) -> Array:
     """The future goal nearest to the desired one (the paper's method 1). Equally near goals are equally likely."""
-    del hparams
     mask = future_mask(achieved.shape[0], step, length)
     distance = jnp.where(mask, distances(metric, achieved, desired), jnp.inf)
     return uniform(mask & (distance == jnp.min(distance)))  # all can be inf
@@ -46,7 +45,6 @@ def epsilon_closest(
 
 def by_mean(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """d / mean d, or 1 if every candidate lies on the goal. `linear` at temperature 1 is then 2 - d / mean d."""
-    del scale
     distance = jnp.where(candidates, distance, 0.0)
     mean = _sum(distance) / jnp.sum(candidates, dtype=distance.dtype)
     return jnp.where(candidates & (mean != 0), distance / jnp.where(mean != 0, mean, 1.0), 1.0)
@@ -59,19 +57,16 @@ def mirrored(distance: Array, candidates: Array, scale: Array | float) -> Array:
 
 def by_sum(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """1 + d / sum d: `linear` at temperature 1 is 1 - d / sum d."""
-    del scale
     return _one_and(distance, _sum(jnp.where(candidates, distance, 0.0)), candidates)
 
 
 def by_max(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """1 + d / max d: `linear` at temperature 1 is 1 - d / max d."""
-    del scale
     return _one_and(distance, _largest(distance, candidates), candidates)
 
 
 def by_range(distance: Array, candidates: Array, scale: Array | float) -> Array:
     """1 + (d - min d) / (max d - min d): `linear` at temperature 1 falls from 1, the nearest, to 0, the farthest."""
-    del scale
     least = jnp.min(jnp.where(candidates, distance, jnp.inf))
     return _one_and(distance - least, _largest(distance, candidates) - least, candidates)
 

@@ -75,7 +75,6 @@ def uniform(mask: Array) -> Array:
 
 def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
     """Any goal of the episode, uniformly."""
-    del desired, step, hparams
     return jnp.zeros(achieved.shape[0])
 
 
@@ -86,13 +85,11 @@ def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
 
 def future(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """Any goal after the step, uniformly (Andrychowicz et al. 2017, the paper's baseline). See `weigh` for the arguments."""
-    del desired, hparams
     return uniform(future_mask(achieved.shape[0], step, length))
 
 
 def final(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
     """The last goal of the episode."""
-    del desired, step, hparams
     last = achieved.shape[0] - 1 if length is None else length
     return uniform(jnp.arange(achieved.shape[0]) == last)
 

@@ -18,7 +18,6 @@ def diversity(episode: Episode, context: Context) -> Array:
     The sum over pairs of successive goals of det(X X') = 1 - c^2, where X is the pair as unit vectors and c their cosine. It
     is computed as d^2 - d^4 / 4 from their distance d, which keeps small angles despite rounding.
     """
-    del context
     goals = episode.achieved_goal
     unit = goals / jnp.maximum(jnp.linalg.norm(goals, axis=-1, keepdims=True), 1e-12)
     squared = jnp.sum(jnp.square(unit[1:] - unit[:-1]), axis=-1)
@@ -71,7 +70,6 @@ def _by_rarity(ring: ReplayState, context: Context) -> Array:
     In Zhao, Sun & Tresp 2019 ("MEP"), a mixture of three Gaussians over sequences of achieved goals gives their density.
     Episodes are drawn in proportion to their rank by negative log density.
     """
-    del context
     goals = ring.episodes.achieved_goal
     filled = jnp.arange(goals.shape[0]) < ring.size
     rows = goals.reshape(goals.shape[0], -1)

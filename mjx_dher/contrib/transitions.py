@@ -82,7 +82,6 @@ def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, contex
     P(i, j) is proportional to det(L_ij) = 1 - exp(-d^2 / w^2) for the kernel L = exp(-d^2 / 2 w^2), so goals that lie close
     together are rarely both drawn.
     """
-    del context
     size = sample.step.shape[0]
     if number == 1:
         return jax.random.randint(key, (1,), 0, size)

@@ -114,7 +114,6 @@ class Deterministic:
         self, network: Any, params: PyTree, observation: Array, goal: Array, judge: Judge, normal: Array, hparams: HParams
     ) -> tuple[Array, Metrics]:
         """Minus the mean value of the actions, plus `action_l2` times their mean square."""
-        del normal
         action = self.act(network, params, observation, goal)
         return -jnp.mean(judge(action)) + hparams.action_l2 * jnp.mean(jnp.square(action)), {}
 

@@ -40,12 +40,10 @@ class Critics:
 
     def returns(self, outputs: Array, low: Array | float, high: Array | float) -> Array:
         """Estimated returns [C, B, K] of the networks' outputs [C, B, M], for returns in [low, high]."""
-        del low, high
         return outputs
 
     def error(self, outputs: Array, atoms: Array, low: Array | float, high: Array | float) -> Array:
         """Loss [] of the networks' outputs [C, B, M] for a target's atoms [B, K], for returns in [low, high]."""
-        del low, high
         return self.loss(outputs, atoms)
 
 
@@ -80,7 +78,6 @@ def values(network: Any, params: PyTree, observation: Array, goal: Array, action
 
 def smallest(values: Array, key: PRNGKey) -> Array:
     """Smallest of the critics' values, the target [B, M] (Fujimoto et al. 2018, algorithm 1)."""
-    del key
     return jnp.min(values, axis=0)
 
 
@@ -98,7 +95,6 @@ def truncated(dropped: int) -> CombineFn:
     """Makes the function that pools all quantiles and drops the `dropped` * C largest (Kuznetsov et al. 2020, equation 11)."""
 
     def combine(values: Array, key: PRNGKey) -> Array:
-        del key
         num_critics, batch_size, size = values.shape
         pooled = jnp.moveaxis(values, 0, 1).reshape(batch_size, num_critics * size)
         return least(pooled, num_critics * (size - dropped))

@@ -48,7 +48,6 @@ class LearnerPolicy:
 
     def forward(self, observation: Any, goal: Any, xp: Any = jnp) -> Array:
         """Actions for observations [..., D] and goals [..., G]. Ignores `xp`."""
-        del xp
         obs: Any = {"observation": observation, "desired_goal": goal}
         return self.learner.act(self.state, obs, self.hparams)
 
