@@ -28,8 +28,8 @@ _ENTROPY = ("entropy_weight", "entropy_target")
 _CONTRAST = ("energy", "contrastive_loss", "representation_size", "same_episode", "logsumexp_penalty")
 _QUANTILES = ("num_quantiles", "dropped_quantiles")
 
-# Built-in components by `RunSpec` field and name, with paths inside mjx_dher. Each field also takes a custom component as
-# "module:attribute".
+# Built-in components by `RunSpec` field and name. Paths are inside mjx_dher, and the attribute is the name unless it is given.
+# Each field also takes a custom component as "module:attribute".
 _TABLE = {
     "env": {
         "arm_reach": Component("envs.arms:ArmReach", "move the end of a Panda to a goal (JaxGCRL's arm_reach)"),
@@ -60,28 +60,22 @@ _TABLE = {
         "slide": Component("envs.fetch:Slide", "hit a puck so that it slides to a goal out of reach (FetchSlide-v4)"),
     },
     "sampler": {
-        "random": Component("samplers:random", "any goal of any episode"),
-        "episode": Component("samplers:episode", "any goal of the episode"),
-        "future": Component("samplers:future", "any goal after the step (Andrychowicz et al. 2017)"),
-        "final": Component("samplers:final", "the last goal of the episode"),
-        "geometric": Component("samplers:geometric", "goals after the step, those t steps later with weight gamma^t"),
-        "closest": Component(
-            "by_distance:closest", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC
-        ),
+        "random": Component("samplers", "any goal of any episode"),
+        "episode": Component("samplers", "any goal of the episode"),
+        "future": Component("samplers", "any goal after the step (Andrychowicz et al. 2017)"),
+        "final": Component("samplers", "the last goal of the episode"),
+        "geometric": Component("samplers", "goals after the step, those t steps later with weight gamma^t"),
+        "closest": Component("by_distance", "the future goal nearest to the desired one (the paper's method 1)", _BY_METRIC),
         "epsilon_closest": Component(
-            "by_distance:epsilon_closest",
-            "any future goal with probability epsilon, else the closest (method 2)",
-            (*_BY_METRIC, "epsilon"),
+            "by_distance", "any future goal with probability epsilon, else the closest (method 2)", (*_BY_METRIC, "epsilon")
         ),
-        "weighted": Component("by_distance:weighted", "nearer future goals likelier (method 3)", _WEIGHTED),
-        "next_future": Component(
-            "contrib.goals:next_future", "the next goal with probability 1/her_k, else any future one (Next-Future)"
-        ),
+        "weighted": Component("by_distance", "nearer future goals likelier (method 3)", _WEIGHTED),
+        "next_future": Component("contrib.goals", "the next goal with probability 1/her_k, else any future one (Next-Future)"),
     },
     "weight_kernel": {
-        "linear": Component("by_distance:linear", "weights fall linearly with distance"),
-        "inverse": Component("by_distance:inverse", "weights fall as a power of distance"),
-        "softmax": Component("by_distance:softmax", "weights fall exponentially with distance"),
+        "linear": Component("by_distance", "weights fall linearly with distance"),
+        "inverse": Component("by_distance", "weights fall as a power of distance"),
+        "softmax": Component("by_distance", "weights fall exponentially with distance"),
     },
     "weight_normalization": {
         "mean": Component("by_distance:by_mean", "distances relative to their mean"),
@@ -92,78 +86,67 @@ _TABLE = {
         "far": Component("by_distance:mirrored", "mean, mirrored: farther goals likelier"),
     },
     "metric": {
-        "position": Component("samplers:position", "Euclidean distance between goals"),
-        "velocity": Component("contrib.metrics:velocity", "distance in position and velocity to rest at the goal"),
-        "resting_point": Component(
-            "contrib.metrics:resting_point", "distance from the point where Slide's puck would come to rest"
-        ),
-        "resting_point_rough": Component(
-            "contrib.metrics:resting_point_rough", "the same with the friction of Push's and PickAndPlace's block"
-        ),
-        "time_to_goal": Component("contrib.metrics:time_to_goal", "steps to the goal as estimated by the learner's critic"),
+        "position": Component("samplers", "Euclidean distance between goals"),
+        "velocity": Component("contrib.metrics", "distance in position and velocity to rest at the goal"),
+        "resting_point": Component("contrib.metrics", "distance from the point where Slide's puck would come to rest"),
+        "resting_point_rough": Component("contrib.metrics", "the same with the friction of Push's and PickAndPlace's block"),
+        "time_to_goal": Component("contrib.metrics", "steps to the goal as estimated by the learner's critic"),
     },
     "priority": {
-        "eventful": Component("priorities:eventful", "episodes whose last achieved goal was not yet reached at their start"),
-        "energy": Component("priorities:energy", "episodes by the energy given to the object (EBP)"),
-        "energy_clipped": Component("priorities:energy_clipped", "the same, each step's energy clipped at 0.5 J per kg"),
-        "max_entropy": Component(
-            "contrib.episodes:max_entropy", "episodes by how rare their achieved goals are in the ring (MEP)"
-        ),
-        "diversity": Component("contrib.episodes:diversity", "episodes by how diverse their achieved goals are (DTGSH)"),
+        "eventful": Component("priorities", "episodes whose last achieved goal was not yet reached at their start"),
+        "energy": Component("priorities", "episodes by the energy given to the object (EBP)"),
+        "energy_clipped": Component("priorities", "the same, each step's energy clipped at 0.5 J per kg"),
+        "max_entropy": Component("contrib.priorities", "episodes by how rare their achieved goals are in the ring (MEP)"),
+        "diversity": Component("contrib.priorities", "episodes by how diverse their achieved goals are (DTGSH)"),
         "dpp": Component(
-            "contrib.transitions:dpp",
+            "contrib.priorities",
             "diversity, and pairs of transitions with goals far apart (DTGSH's k-DPP)",
             group="transitions",
         ),
         "td_error": Component(
-            "priorities:td_error",
-            "episodes and relabelled transitions by their one-step errors (HGR)",
-            ("renewals",),
-            "transitions",
+            "priorities", "episodes and relabelled transitions by their one-step errors (HGR)", ("renewals",), "transitions"
         ),
         "curriculum": Component(
-            "contrib.transitions:curriculum",
-            "transitions with diverse goals at first, near goals later (CHER)",
-            group="transitions",
+            "contrib.priorities", "transitions with diverse goals at first, near goals later (CHER)", group="transitions"
         ),
         "not_misleading": Component(
-            "contrib.transitions:not_misleading",
+            "contrib.priorities",
             "transitions whose hindsight goal was not reached before they began (bias-reduced HER)",
             group="transitions",
         ),
     },
     "generator": {
-        "reset": Component("contrib.generators:reset", "goals from the environment's reset"),
-        "hgg": Component("contrib.goals:hgg", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"),
+        "reset": Component("contrib.generators", "goals from the environment's reset"),
+        "hgg": Component("contrib.goals", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"),
     },
     "learner": {
         "ddpg": Component("learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE),
         "td3": Component(
-            "learners.actor_critic:td3",
+            "learners.actor_critic",
             "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",
             (*_NOISE, *_CRITICS, *_SMOOTHING),
         ),
         "sac": Component(
-            "learners.actor_critic:sac",
+            "learners.actor_critic",
             "SAC (Haarnoja et al. 2018): stochastic actor, twin critics, entropy",
             (*_CRITICS, *_ENTROPY),
         ),
-        "csac": Component("learners.actor_critic:csac", "sac with categorical critics", (*_CRITICS, "num_bins", *_ENTROPY)),
+        "csac": Component("learners.actor_critic", "sac with categorical critics", (*_CRITICS, "num_bins", *_ENTROPY)),
         "ctd3": Component(
-            "learners.actor_critic:ctd3", "td3 with categorical critics", (*_NOISE, *_CRITICS, "num_bins", *_SMOOTHING)
+            "learners.actor_critic", "td3 with categorical critics", (*_NOISE, *_CRITICS, "num_bins", *_SMOOTHING)
         ),
         "redq": Component(
-            "learners.actor_critic:redq",
+            "learners.actor_critic",
             "REDQ (Chen et al. 2021): SAC with many critics, a random subset per target",
             (*_CRITICS, "subset_critics", *_ENTROPY),
         ),
         "tqc": Component(
-            "learners.actor_critic:tqc",
+            "learners.actor_critic",
             "TQC (Kuznetsov et al. 2020): SAC with quantile critics, the largest quantiles dropped",
             (*_CRITICS, *_QUANTILES, *_ENTROPY),
         ),
         "dtqc": Component(
-            "learners.actor_critic:dtqc", "tqc with a deterministic actor", (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING)
+            "learners.actor_critic", "tqc with a deterministic actor", (*_NOISE, *_CRITICS, *_QUANTILES, *_SMOOTHING)
         ),
         "crl": Component(
             "learners.crl:make",
@@ -172,15 +155,22 @@ _TABLE = {
         ),
     },
     "networks": {
-        "mlp": Component("networks:mlp", "hidden layers with ReLU"),
-        "layer_norm": Component("networks:layer_norm", "mlp with layer normalization in the critics"),
-        "fan_in": Component("networks:fan_in", "mlp with PyTorch's initialization"),
-        "unit_norm": Component("networks:unit_norm", "residual, with hidden weights projected to length 1"),
-        "residual": Component("networks:residual", "residual blocks with layer normalization and swish, of any depth"),
+        "mlp": Component("networks", "hidden layers with ReLU"),
+        "layer_norm": Component("networks", "mlp with layer normalization in the critics"),
+        "fan_in": Component("networks", "mlp with PyTorch's initialization"),
+        "unit_norm": Component("networks", "residual, with hidden weights projected to length 1"),
+        "residual": Component("networks", "residual blocks with layer normalization and swish, of any depth"),
     },
 }
+
+
+def _located(name: str, row: Component) -> Component:
+    path = row.path if ":" in row.path else f"{row.path}:{name}"
+    return row._replace(path=f"mjx_dher.{path}")
+
+
 COMPONENTS: dict[str, dict[str, Component]] = {
-    field: {name: row._replace(path=f"mjx_dher.{row.path}") for name, row in rows.items()} for field, rows in _TABLE.items()
+    field: {name: _located(name, row) for name, row in rows.items()} for field, rows in _TABLE.items()
 }
 
 

@@ -13,7 +13,8 @@ from scipy.optimize import linear_sum_assignment
 from mjx_dher import priorities, relabel, replay, samplers
 from mjx_dher.config import HParams
 from mjx_dher.context import Context, Values
-from mjx_dher.contrib import episodes, goals, metrics, transitions
+from mjx_dher.contrib import goals, metrics
+from mjx_dher.contrib import priorities as contributed
 from mjx_dher.replay import Sample
 from mjx_dher.types import Batch, Episode
 from probes import Clock
@@ -110,7 +111,7 @@ def test_diversity_is_a_sum_of_determinants():
     unit = [(np.array(a) / np.linalg.norm(a), np.array(b) / np.linalg.norm(b)) for a, b in pairs]
     by_hand = sum(np.linalg.det(np.stack(pair) @ np.stack(pair).T) for pair in unit)  # 1 + 1/2 + 0
     np.testing.assert_allclose(by_hand, 1.5, rtol=1e-6)
-    np.testing.assert_allclose(episodes.diversity(episode_of(path), CONTEXT), by_hand, rtol=1e-5)
+    np.testing.assert_allclose(contributed.diversity(episode_of(path), CONTEXT), by_hand, rtol=1e-5)
 
 
 def ring_with(paths, rows=None):
@@ -132,7 +133,7 @@ def chosen(priority, seed, sample, batch, number, context):
 def test_max_entropy_ranks_rare_episodes_above_common_ones():
     common = [[[0.0, 0.0], [0.01 * i, 0.0]] for i in range(10)]
     rare = [[[0.0, 0.0], [0.0, 1.0]], [[0.0, 0.0], [0.0, -3.0]]]
-    renew = jax.jit(lambda ring: priorities.renew(episodes.max_entropy, ring, CONTEXT))
+    renew = jax.jit(lambda ring: priorities.renew(contributed.max_entropy, ring, CONTEXT))
     renewed = renew(ring_with([*common, *rare], rows=20))
     weights = np.asarray(renewed.priority)
     assert sorted(weights[:12]) == list(range(12))
@@ -142,7 +143,7 @@ def test_max_entropy_ranks_rare_episodes_above_common_ones():
 
 def test_a_mixture_of_one_cluster_is_its_gaussian():
     rows = jnp.asarray(np.random.default_rng(0).normal(2.0, 0.5, (500, 1)), jnp.float32)
-    found = jax.jit(episodes.fit_mixture)(rows, jnp.ones(500, bool))
+    found = jax.jit(contributed.fit_mixture)(rows, jnp.ones(500, bool))
     by_hand = -0.5 * ((rows[:, 0] - rows.mean()) / rows.std()) ** 2 - jnp.log(rows.std() * math.sqrt(2 * math.pi))
     assert float(jnp.mean(jnp.abs(found - by_hand))) < 0.1
 
@@ -163,16 +164,16 @@ def candidates(desired, achieved_before, number, hindsight=True):
 @pytest.mark.slow
 def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
     sample, batch = candidates([0.0, 0.05, 0.5, 0.05] * 50, [0.0] * 200, 50)
-    np.testing.assert_array_equal(transitions.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
-    kept = chosen(transitions.not_misleading, 0, sample, batch, 50, CONTEXT)
+    np.testing.assert_array_equal(contributed.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
+    kept = chosen(contributed.not_misleading, 0, sample, batch, 50, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
     own, as_it_is = candidates([0.0] * 4, [0.0] * 4, 1, hindsight=False)
-    np.testing.assert_array_equal(transitions.not_misled(own, as_it_is, CONTEXT), 1)
+    np.testing.assert_array_equal(contributed.not_misled(own, as_it_is, CONTEXT), 1)
 
 
 def test_where_all_candidates_are_misleading_any_is_kept():
     sample, batch = candidates([0.0, 0.01, 0.02, 0.03] * 200, [0.0] * 800, 200)
-    kept = chosen(transitions.not_misleading, 0, sample, batch, 200, CONTEXT)
+    kept = chosen(contributed.not_misleading, 0, sample, batch, 200, CONTEXT)
     assert len(np.unique(kept.desired_goal[:, 0])) == 4
 
 
@@ -238,7 +239,7 @@ def test_the_curriculum_chooses_as_its_authors_code_does(updates):
     zeros = np.zeros(256, np.int32)
     sample = Sample(goals_, goals_, goals_, np.stack([achieved, achieved], axis=1), goals_, zeros, zeros, zeros + 1, zeros > 0)
     batch = Batch(goals_, goals_, jnp.asarray(goals_), achieved, zeros, zeros, zeros)
-    found = transitions.pick_curriculum(jax.random.key(3), sample, batch, 64, CONTEXT._replace(updates=updates))
+    found = contributed.pick_curriculum(jax.random.key(3), sample, batch, 64, CONTEXT._replace(updates=updates))
     uniforms = [np.asarray(jax.random.uniform(key, (128,))) for key in jax.random.split(jax.random.key(3), 64)]
     assert found.tolist() == curriculum_by_numpy(goals_[:128], achieved[:128], uniforms, 1.0001**updates)
     assert len(set(found.tolist())) == 64
@@ -255,7 +256,7 @@ def test_the_curriculum_goes_from_diverse_to_near_goals_by_hand():
     @jax.jit
     def first_choices(updates):
         context = CONTEXT._replace(updates=updates)
-        return jax.vmap(lambda key: transitions.pick_curriculum(key, sample, batch, 2, context)[0])(keys)
+        return jax.vmap(lambda key: contributed.pick_curriculum(key, sample, batch, 2, context)[0])(keys)
 
     # Far below 0 updates there is no proximity; after 10,000 its weight is 2.718, and goal 0 is at the achieved one.
     for updates, ranking in ((-1e6, [1, 0, 2, 3]), (1e4, [0, 1, 2, 3])):
@@ -270,7 +271,7 @@ def test_a_2_dpp_draws_pairs_in_proportion_to_determinants():
     line = np.array([0.0, 0.3, 1.0, 1.0])
     sample, batch = candidates(line, [0.0] * 4, 1)
     keys = jax.random.split(jax.random.key(0), 20_000)
-    pairs = np.sort(jax.vmap(lambda key: transitions.pick_diverse(key, sample, batch, 2, CONTEXT))(keys), axis=1)
+    pairs = np.sort(jax.vmap(lambda key: contributed.pick_diverse(key, sample, batch, 2, CONTEXT))(keys), axis=1)
     kernel = np.exp(-((line[:, None] - line) ** 2) / (2 * 0.5**2))
     expected = {(i, j): np.linalg.det(kernel[np.ix_([i, j], [i, j])]) for i in range(4) for j in range(i + 1, 4)}
     total = sum(expected.values())
@@ -282,7 +283,7 @@ def test_a_2_dpp_draws_pairs_in_proportion_to_determinants():
 def test_groups_keep_their_own_and_take_any_number():
     for number in (1, 6):
         sample, batch = candidates(np.arange(4.0 * number), [0.0] * 4 * number, number)
-        for priority in (transitions.curriculum, transitions.dpp):
+        for priority in (contributed.curriculum, contributed.dpp):
             indices = np.asarray(priority.choose(jax.random.key(0), sample, batch, number, CONTEXT))
             assert indices.shape == (number,)
             assert len(set(indices)) == number

@@ -12,7 +12,7 @@ from configs import SMALL
 
 from mjx_dher import HParams, make_train, priorities, replay, testing
 from mjx_dher.context import Context
-from mjx_dher.contrib import episodes
+from mjx_dher.contrib import priorities as contributed
 from mjx_dher.priorities import Priority
 from mjx_dher.runs.program.program import Lane
 from point_mass import PointMass
@@ -107,7 +107,7 @@ def test_a_priority_that_compares_episodes_is_handed_all_of_them():
     np.testing.assert_array_equal(renewed_at(1, dataclasses.replace(BY_CYCLE, by_part=False)), 3)
     assert priorities.join([priorities.eventful, BY_CYCLE]).by_part
     assert priorities.td_error.by_part
-    assert not episodes.max_entropy.by_part
+    assert not contributed.max_entropy.by_part
 
 
 @pytest.mark.parametrize("renewals", [0, 1, 2, 10**6])
