@@ -48,20 +48,19 @@ class ActorKind(Protocol):
     [..., G], and standard normal numbers `normal` [B, A].
     """
 
-    @property
-    def is_gaussian(self) -> bool: ...  # whether the network returns moments (`networks.Heads.gaussian`)
-
-    @property
-    def has_target(self) -> bool: ...  # whether the critics' targets use a slower copy of the actor
+    is_gaussian: ClassVar[bool] = False  # whether the network returns moments (`networks.Heads.gaussian`)
+    has_target: ClassVar[bool] = True  # whether the critics' targets use a slower copy of the actor
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
         """Parameters for inputs like `inputs`: an observation [D] and a goal [G]."""
+        return network.init(key, *inputs)
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
         """Deterministic actions [..., A]."""
 
     def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
         """Draws the noise for `explore`; leaves lead with [T, N]."""
+        return exploration_noise(key, num_steps, num_envs, action_size, hparams)
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
         """Exploring actions [N, A] with the noise of one step."""
@@ -81,20 +80,11 @@ class ActorKind(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Deterministic:
+class Deterministic(ActorKind):
     """A deterministic actor with exploration noise, and clipped noise on target actions (TD3)."""
-
-    is_gaussian: ClassVar[bool] = False
-    has_target: ClassVar[bool] = True
-
-    def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        return network.init(key, *inputs)
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
         return cast(Array, network.apply(params, observation, goal))
-
-    def noise(self, key: PRNGKey, num_steps: int, num_envs: int, action_size: int, hparams: HParams) -> Noise:
-        return exploration_noise(key, num_steps, num_envs, action_size, hparams)
 
     def explore(self, network: Any, params: PyTree, observation: Array, goal: Array, noise: Noise) -> Array:
         """Actions [N, A] with added noise, clipped, or uniformly random."""

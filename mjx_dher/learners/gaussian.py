@@ -2,13 +2,13 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import HParams
-from mjx_dher.learners.actors import Judge, Noise, exploration_noise
+from mjx_dher.learners.actors import ActorKind, Judge, Noise, exploration_noise
 from mjx_dher.networks import GaussianActor
 from mjx_dher.types import Array, Metrics, PRNGKey, PyTree
 
@@ -16,15 +16,15 @@ _LOG_STD_RANGE = (-20.0, 2.0)  # Haarnoja et al. 2018, their code
 
 
 @dataclasses.dataclass(frozen=True)
-class Gaussian:
+class Gaussian(ActorKind):
     """A tanh-Gaussian actor with entropy regularization (SAC, Haarnoja et al. 2018).
 
     Parameters are {"network", "log_alpha"}. The entropy weight alpha is `entropy_weight` exp(log_alpha). It is learned so that
     the mean of log pi becomes -`entropy_target` A.
     """
 
-    is_gaussian: ClassVar[bool] = True
-    has_target: ClassVar[bool] = False
+    is_gaussian = True
+    has_target = False
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
         return {"network": network.init(key, *inputs), "log_alpha": jnp.zeros(())}
