@@ -50,15 +50,15 @@ def test_losses_by_hand(state):
     losses = losses_of(BATCH, state)
     # Q' of the next states: -0.5 * 0 - 0.25 + 0.5 * tanh(0) = -0.25 and -1 - 1 + 0.5 * tanh(2).
     y = np.array([-1 + 0.5 * -0.25, 0.5 * (-2 + 0.5 * np.tanh(2))])
-    np.testing.assert_allclose([losses.critic_loss, losses.q_mean], [np.mean((Q - y) ** 2), -0.875], rtol=1e-6)
+    np.testing.assert_allclose([losses["critic_loss"], losses["q_mean"]], [np.mean((Q - y) ** 2), -0.875], rtol=1e-6)
     # pi: tanh(1) and 0; Q: -0.75 + tanh(1) / 2 and -1.
     a = np.tanh(1.0)
-    np.testing.assert_allclose(losses.actor_loss, -((-0.75 + a / 2) - 1) / 2 + 0.25 * a * a / 2, rtol=1e-6)
+    np.testing.assert_allclose(losses["actor_loss"], -((-0.75 + a / 2) - 1) / 2 + 0.25 * a * a / 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("reward", "clipped"), [(-9.0, -2.0), (9.0, 0.0)])
 def test_targets_are_clipped_to_what_returns_can_be(state, reward, clipped):
-    loss = losses_of(BATCH.replace(reward=jnp.full(2, reward)), state).critic_loss
+    loss = losses_of(BATCH.replace(reward=jnp.full(2, reward)), state)["critic_loss"]
     np.testing.assert_allclose(loss, np.mean((Q - clipped) ** 2), rtol=1e-6)
 
 
@@ -81,7 +81,7 @@ def test_gradients_are_those_of_each_loss_by_its_own_network(state):
     for name, loss in (("critic", "critic_loss"), ("actor", "actor_loss")):
         moved = [jax.tree.map(lambda x, d=d: x + d, getattr(state.params, name)) for d in (0.01, -0.01)]
         up, down = (losses_of(BATCH, state.replace(params=state.params.replace(**{name: params}))) for params in moved)
-        slope = (getattr(up, loss) - getattr(down, loss)) / 0.02
+        slope = (up[loss] - down[loss]) / 0.02
         np.testing.assert_allclose(slope, sum(x.sum() for x in jax.tree.leaves(getattr(gradients, name))), rtol=1e-3)
 
 
@@ -224,7 +224,7 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding():
         assert action.dtype == networks.critic.apply(params.critic, observation, goal, action).dtype == jnp.float32
         compute = jax.jit(lambda params, batch: ddpg.compute_gradients(networks, params, params, batch, (-50.0, 0.0), hparams))
         gradients, losses = compute(params, batch)
-        return losses.critic_loss, ravel_pytree(gradients.critic)[0], ravel_pytree(gradients.actor)[0]
+        return losses["critic_loss"], ravel_pytree(gradients.critic)[0], ravel_pytree(gradients.actor)[0]
 
     (loss, *gradients), (near, *others) = passes(exact), passes(rounded)
     assert 0 < abs(float(loss - near)) < 0.05 * float(loss)

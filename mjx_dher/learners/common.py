@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.flatten_util
@@ -29,14 +29,6 @@ class Params:
 
     actor: PyTree
     critic: PyTree
-
-
-class Losses(NamedTuple):
-    """Losses of one update, each []."""
-
-    critic_loss: Array  # mean squared Bellman error
-    actor_loss: Array  # minus the mean Q value, plus the action penalty
-    q_mean: Array  # mean Q value of the critic on the batch
 
 
 def adam(learning_rate: Any, eps: Any = 1e-8) -> optax.GradientTransformation:

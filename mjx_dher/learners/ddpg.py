@@ -10,7 +10,7 @@ from flax import struct
 
 from mjx_dher.config import Config, HParams
 from mjx_dher.learners import common
-from mjx_dher.learners.common import ActorCriticBase, Losses, Params
+from mjx_dher.learners.common import ActorCriticBase, Params
 from mjx_dher.networks import Networks, NetworksFn, zeros
 from mjx_dher.normalizer import NormalizerState
 from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyTree
@@ -33,8 +33,8 @@ Bounds = tuple[Array | float, Array | float]  # of returns
 
 def compute_gradients(
     networks: Networks, params: Params, target: Params, batch: Batch, bounds: Bounds, hparams: HParams
-) -> tuple[Params, Losses]:
-    """Gradients of both losses on a normalized batch, each with respect to its own network's parameters.
+) -> tuple[Params, Metrics]:
+    """Gradients of both losses on a normalized batch, each with respect to its own network's parameters, and the metrics.
 
     y = r + discount Q'(s', pi'(s')), clipped to the bounds of returns
     critic: mean (Q(s, a) - y)^2;  actor: -mean Q(s, pi(s)) + action_l2 mean pi(s)^2
@@ -55,7 +55,7 @@ def compute_gradients(
 
     (c_loss, q_mean), c_gradient = jax.value_and_grad(critic_loss, has_aux=True)(params.critic)
     a_loss, a_gradient = jax.value_and_grad(actor_loss)(params.actor)
-    return Params(actor=a_gradient, critic=c_gradient), Losses(critic_loss=c_loss, actor_loss=a_loss, q_mean=q_mean)
+    return Params(actor=a_gradient, critic=c_gradient), {"critic_loss": c_loss, "actor_loss": a_loss, "q_mean": q_mean}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,12 +85,12 @@ class DDPG(ActorCriticBase):
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
         """Takes one Adam step for critic and actor, both from the old parameters."""
         batch, bounds = self.normalize_batch(state, batch, hparams), self.return_bounds(hparams)
-        gradients, losses = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
+        gradients, metrics = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
         updates, opt_state = adam.update(self.mean(gradients), state.opt_state)
         params = self.project(optax.apply_updates(state.params, updates))
         state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
-        return state, losses._asdict()
+        return state, metrics
 
 
 def make(config: Config, spec: EnvSpec, networks: NetworksFn) -> DDPG:
