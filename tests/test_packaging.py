@@ -35,8 +35,8 @@ print(*sorted(own), len(own), lines)
 """
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     *names, modules, lines = printed.splitlines()[-1].split()
-    assert int(modules) <= 66, names
-    assert int(lines) <= 10_400, names
+    assert int(modules) <= 64, names
+    assert int(lines) <= 10_300, names
 
 
 @pytest.mark.slow
