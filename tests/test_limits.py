@@ -96,6 +96,11 @@ def test_xla_keeps_to_a_quota(quotas, threads, monkeypatch):
     assert os.environ.get("NPROC") == threads
 
 
+def test_training_without_compilation_is_refused():
+    with jax.disable_jit(), pytest.raises(ValueError, match="JAX_DISABLE_JIT"):
+        caches.prepare()
+
+
 @pytest.fixture
 def no_home(monkeypatch):
     """A user without HOME and without a line in /etc/passwd."""

@@ -2,6 +2,7 @@ import csv
 import json
 import math
 import struct
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -97,6 +98,15 @@ def test_wandb_takes_the_metrics_offline_and_keeps_them_in_the_run_folder(tmp_pa
     again = loggers.open_sinks(tmp_path / "run", ["wandb"])[1]
     assert again._run.id == run.id
     again.close()
+
+
+@pytest.mark.parametrize("kind", ["UsageError", "CommError"])
+def test_wandb_that_cannot_start_is_an_error_with_a_cure(kind, tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.setattr(wandb, "init", Mock(side_effect=getattr(wandb.errors, kind)("No API key configured.")))
+    run_folder.write_config(tmp_path / "run", RunSpec(), "native", {})
+    with refuses("log", "wandb", "key", "WANDB_MODE=offline"):
+        loggers.open_sinks(tmp_path / "run", ["wandb"])
 
 
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):

@@ -48,6 +48,12 @@ def check_platform() -> None:
 
 
 def prepare() -> None:
-    """Prepares a process for long training: it caches compiled programs, and returns freed memory."""
+    """Prepares a process for training: it caches compiled programs, and returns freed memory. Raises ValueError if the user has
+    disabled compilation.
+    """
+    import jax
+
+    if jax.config.jax_disable_jit:  # type: ignore[attr-defined]
+        raise ValueError("JAX_DISABLE_JIT is set, but training needs compiled programs; unset it")
     memory.keep_heap_small()  # before JAX starts threads
     keep_compiled_programs()

@@ -113,7 +113,7 @@ class TensorBoardSink:
 class WandbSink:
     """A Weights & Biases run, configured by its environment variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
 
-    The run folder holds offline logs, and a resumed run continues the same W&B run.
+    The run folder holds offline logs, and a resumed run continues the same W&B run. Raises ValueError if W&B cannot start.
     """
 
     def __init__(self, folder: Path):
@@ -125,15 +125,19 @@ class WandbSink:
         run = reading.to_spec(folder, content)
         # A resumed run keeps its id, which therefore excludes settings that may change.
         described = {name: x for name, x in reading.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
-        self._run = wandb.init(
-            project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
-            name=folder.absolute().name,
-            id=fingerprint.sha256_of([folder.absolute().name, described])[:16],
-            resume="allow",
-            dir=folder,
-            config={**fingerprint.settings(run), "seed": run.seed, "engine": content["physics"]},
-            settings=wandb.Settings(silent=True),
-        )
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
+                name=folder.absolute().name,
+                id=fingerprint.sha256_of([folder.absolute().name, described])[:16],
+                resume="allow",
+                dir=folder,
+                config={**fingerprint.settings(run), "seed": run.seed, "engine": content["physics"]},
+                settings=wandb.Settings(silent=True),
+            )
+        except (wandb.Error, ValueError) as error:  # no key, no answer, or a wrong variable
+            reason = "; ".join(map(str.strip, str(error).splitlines()[:3]))
+            raise ValueError(f"log wandb cannot start ({reason}); WANDB_MODE=offline needs no account") from error
 
     def write(self, row: dict[str, Any]) -> None:
         self._run.log(row, step=row["epoch"], commit=True)
