@@ -241,9 +241,13 @@ def test_the_engine_follows_native():
 
 
 @pytest.mark.slow
-def test_the_kernel_compiles_for_a_gpu(tmp_path):
-    """Warp compiles CUDA code without a GPU, too. The code is that for one thread an environment."""
-    engine = envs.make("push", engine="warp", allow_cpu=True).engine
-    wp.compile_aot_module(engine._made(1)._kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+@pytest.mark.parametrize("task", ["slide", "block"])  # a cylinder, a search for near pairs
+def test_the_kernel_compiles_for_a_gpu(task, tmp_path):
+    """Warp compiles CUDA code without a GPU, too."""
+    model, shared = envs.make(task, engine="native").model, 230_000  # bytes of a block on an H100
+    structs, threads = simulation.structs_of(model, simulation.rows_for(model, shared)), simulation.threads_for(model)
+    made = simulation.kernel_of(model, structs, threads, most_warps(structs[-1].size, shared, threads))
+    made.module.options["optimization_level"] = 3  # otherwise it takes ten minutes
+    wp.compile_aot_module(made.module, arch=90, module_dir=tmp_path, use_ptx=True)
     (ptx,) = tmp_path.glob("*.sm90.ptx")
     assert ".visible .entry" in ptx.read_text()

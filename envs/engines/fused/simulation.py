@@ -32,17 +32,13 @@ class Simulation:
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, substeps: int, rows: int = 10**6, varied: Begins = NONE):
-        structs = _structs(model, rows)
-        size, contacts, sparse = structs[-1].size, structs[3], structs[4]
+        structs = structs_of(model, rows)
+        size = structs[-1].size
         device = wp.get_device()
         self._threads = 1 if device.is_cpu else threads_for(model)
         warps = 0 if device.is_cpu else most_warps(size, device.max_shared_memory_per_block - _STATIC, self._threads)
         self._block = max(1, 32 * warps)
-        kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
-        edges = int(max([6, *contacts.edges.numpy()]))
-        pulls = bool(structs[2].tendons.number)
-        traits = kernel.Traits(kinds, edges, contacts.near == 0, sparse.rows > 0, pulls, bool(contacts.elliptic), varied)
-        self._kernel = kernel.make(size if warps else 0, self._threads, warps, model.nv, traits)
+        self._kernel = kernel_of(model, structs, self._threads, warps, varied)
         memory = wp.zeros((num_envs, size) if device.is_cpu else (1, 1), dtype=float)
         self._kept = (*structs, memory)
         self._lost = wp.zeros(1, dtype=int)
@@ -70,12 +66,22 @@ class Simulation:
         return lost
 
 
-def _structs(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
+def structs_of(model: mujoco.MjModel, rows: int) -> tuple[Any, ...]:
     """The kernel's structs for a model, with room for `rows` rows of constraints."""
     bodies, dofs, sparse = setup.bodies_of(model), setup.dofs_of(model), sparse_of(model)
     contacts = setup.contacts_of(model, rows)
     world = setup.world_of(model, contacts, rows)
     return world, bodies, dofs, contacts, sparse, memory.layout_of(model, world, contacts, dofs, sparse)
+
+
+def kernel_of(model: mujoco.MjModel, structs: tuple[Any, ...], threads: int, warps: int, varied: Begins = NONE) -> Any:
+    """The kernel for a model and the structs from `structs_of`, with `warps` of 32 threads in a block, 0 on a CPU."""
+    contacts, sparse = structs[3], structs[4]
+    kinds = tuple(sorted({*map(int, contacts.kind.numpy())}))
+    edges = int(max([6, *contacts.edges.numpy()]))
+    pulls = bool(structs[2].tendons.number)
+    traits = kernel.Traits(kinds, edges, contacts.near == 0, sparse.rows > 0, pulls, bool(contacts.elliptic), varied)
+    return kernel.make(structs[-1].size if warps else 0, threads, warps, model.nv, traits)
 
 
 def shared_memory() -> int | None:
@@ -91,7 +97,7 @@ def threads_for(model: mujoco.MjModel) -> int:
 def check_fits(model: mujoco.MjModel, rows: int) -> None:
     """Raises ValueError if the GPU's shared memory does not suffice for an environment with `rows` rows of constraints."""
     if (shared := shared_memory()) is not None:
-        most_warps(_structs(model, rows)[-1].size, shared, threads_for(model))
+        most_warps(structs_of(model, rows)[-1].size, shared, threads_for(model))
 
 
 def most_warps(size: int, shared: int, threads: int = THREADS) -> int:
@@ -116,11 +122,11 @@ def rows_for(model: mujoco.MjModel, shared: int | None) -> int:
     controls cause, and for all further rows that fit without reducing the number of environments.
     """
     most, threads = most_rows(model), threads_for(model)
-    a_warp = lambda rows: 4 * _structs(model, rows)[-1].size * (32 // threads)  # noqa: E731
+    a_warp = lambda rows: 4 * structs_of(model, rows)[-1].size * (32 // threads)  # noqa: E731
     if shared is None or a_warp(most) * (1 if threads == THREADS else WARPS) <= shared:
         return most
     rows = min(most, max(_FEW_ROWS, setup.other_rows(model) + round(1.5 * graph.probe(model)[2])))
-    warps = most_warps(_structs(model, rows)[-1].size, shared, threads)
+    warps = most_warps(structs_of(model, rows)[-1].size, shared, threads)
     for more in (128, 64, 32, 16, 8, 4, 2, 1):
         if rows + more <= most and a_warp(rows + more) * warps <= shared:
             rows += more
