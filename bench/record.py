@@ -5,7 +5,7 @@
 
 A line has the commit, the date, the machine, the versions, and the figures: environment steps per second of a rollout of Push,
 updates per second of DDPG and of the learners of PickAndPlace and Slide with the machine's preset, and the seconds of `python
-train.py` from Enter to its first epoch, before and after compilation. It takes some minutes. A busy machine or a working tree
+train.py` from Enter to its first epoch, before and after compilation. It takes ten minutes. A busy machine or a working tree
 with changes is an error, because the line would not describe the commit; with `--anyway` the line has a remark instead.
 
 --draw writes history.md and history.svg next to the file (extra `plot`).
@@ -95,13 +95,13 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
     engine = resolve_engine("auto")
     rates = [throughput.measure("push", engine, run.num_envs, "auto", False, 3)[1] for _ in range(repeats)]
 
-    def updating(spec: Any, updates: int) -> Any:
+    def updating(spec: Any) -> Any:
         made = learners.make(spec.learner, spec.config, learner_bench.SPEC, spec.networks)
-        return learner_bench.Timed(made, spec.config.batch_size, 1, samplers.make("future"), updates)
+        return learner_bench.Timed(made, spec.config.batch_size, 1, samplers.make("future"), 50)
 
-    timed = updating(spec, 200)
+    timed = updating(spec)
     updates = [1 / timed.seconds()[0] for _ in range(repeats)]
-    others = [1 / updating(presets.preset(preset, task), 50).seconds()[0] for task in ("pick_and_place", "slide")]
+    others = [1 / updating(presets.preset(preset, task)).seconds()[0] for task in ("pick_and_place", "slide")]
     medians = (statistics.median(rates), statistics.median(updates), starts[0], statistics.median(starts[1:]), *others)
     setup = {"preset": preset, "engine": engine, "num_envs": run.num_envs, "batch_size": run.batch_size, "repeats": repeats}
     spread = {name: [float(f"{x:.4g}") for x in (min(many), max(many))] for name, many in zip(FIGURES, (rates, updates))}
