@@ -221,7 +221,7 @@ def tuned(task: str, **parts: str) -> RunSpec:
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of an arm, seed 0.
 
-    `paper` is DDPG under the paper's settings; `best` is `tuned`, with `eventful`. In `paper`, priorities choose the whole
+    `paper` is DDPG under the paper's settings, and `best` is `tuned` with `eventful`. In `paper`, priorities choose the whole
     batch, as in their authors' work. In `best` they replace `eventful` for the preset's half of the batch.
     """
     parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
@@ -242,7 +242,7 @@ def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: t
 
 
 def minutes_of_best(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """`estimated_minutes` of runs with the sizes of the learner `best`, whatever they are called."""
+    """`estimated_minutes` of runs with the sizes of `best` for all learners."""
     del learners
     return estimated_minutes(("best",), tasks, arms, seeds)
 

@@ -1,4 +1,4 @@
-"""Environments with Brax's interface: Brax itself, MuJoCo Playground and JaxGCRL. Imports none of them."""
+"""Environments with Brax's interface: Brax itself, MuJoCo Playground and JaxGCRL. None is imported."""
 
 import dataclasses
 import functools
@@ -41,7 +41,7 @@ class EndingState(BraxState):
 
 
 class BraxEnv:
-    """An environment of another library as a goal-conditioned one; see `from_brax`."""
+    """An environment of another library as a goal-conditioned one, from `from_brax`."""
 
     def __init__(
         self, env: Any, parts: tuple[Part, Part, Part], threshold: float, episode_length: int, distance: DistanceFn, ends: bool

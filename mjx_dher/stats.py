@@ -248,8 +248,8 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
 
 
 def _generator(seed: int, repeats: int) -> np.random.Generator:
-    if not isinstance(repeats, int) or repeats < 1:
-        raise ValueError(f"repeats must be an integer, 1 or more; got {repeats!r}")
+    if not repeats >= 1:
+        raise ValueError(f"repeats must be 1 or more; got {repeats!r}")
     return np.random.default_rng(seed)
 
 

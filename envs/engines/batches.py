@@ -20,7 +20,7 @@ _FEW = 64  # most simulations that one thread may step faster than several, whic
 
 
 class Rows:
-    """Simulations in a batch, and rows [nsim, n] of numbers that go into the batch's memory and come out of it.
+    """Simulations in a batch, and rows [nsim, n] of numbers that enter and leave the batch's memory.
 
     Args:
       batch: it must be persistent if some of `derived` are `LATE`.

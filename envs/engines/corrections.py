@@ -1,4 +1,4 @@
-"""What MJX 3.17 leaves out of MuJoCo C's timestep: terms of equality constraints, and details of implicitfast."""
+"""Parts of MuJoCo C's timestep that MJX 3.17 lacks: terms of equality constraints, and details of implicitfast."""
 
 import functools
 
@@ -92,13 +92,13 @@ def equalities_of(model: mujoco.MjModel) -> list[int | _Weld | _Connect]:
 
 
 def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes `mjx.implicit` with what it omits of MuJoCo C's implicitfast.
+    """Computes `mjx.implicit` with the parts of MuJoCo C's implicitfast that it omits.
 
-    An actuator at its force limit adds no damping. The damping that a control scales is that of the clamped control. Free
-    bodies that stand alone are implicit in gyroscopic forces.
+    An actuator at its force limit adds no damping. Damping that a control scales follows the clamped control. Free bodies
+    that stand alone are implicit in gyroscopic forces.
 
     Args:
-      fixed: the model of which `model` is MJX's form.
+      fixed: the model in MuJoCo's form; `model` is MJX's.
       alone: joints of free bodies that stand alone.
     """
     if fixed.actuator_forcelimited.any():

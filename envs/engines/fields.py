@@ -54,7 +54,7 @@ class Layout:
 
     @functools.cached_property
     def places(self) -> dict[str, tuple[slice, tuple[int, ...]]]:
-        """Places in the row, and shapes, by name."""
+        """Places in the row and shapes, for each name."""
         ends = np.cumsum([0, *(math.prod(shape) for _, shape in self.shapes)]).tolist()
         return {name: (slice(*between), shape) for (name, shape), *between in zip(self.shapes, ends, ends[1:])}
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -63,7 +63,7 @@ def train(args: SweepArgs, console: Console) -> tuple[list[RunSpec], list[RunSpe
             claims = Claims(True, report)
             free = [run for run in todo if claims.is_free(run, grid.folder_of(args.out, run))]
             if free:
-                _train(args, storage, ray, task, trials, free, console)
+                _train(args, storage, ray, task, trials, free, report, console)
     return trials, todo
 
 
@@ -74,10 +74,10 @@ def _train(
     task: chunks.Task,
     trials: Sequence[RunSpec],
     todo: Sequence[RunSpec],
+    report: Callable[[str], None],
     console: Console,
 ) -> None:
     """Trains runs that no other process trains, until a signal requests a stop."""
-    report = lambda text: console.print(text, soft_wrap=True)  # noqa: E731
     nodes = [node for node in ray.resources() if task.slots(node)]
     slots = sum(map(task.slots, nodes))
     report(

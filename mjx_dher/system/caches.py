@@ -35,7 +35,7 @@ def keep_compiled_programs() -> None:
 
 
 def check_platform() -> None:
-    """Starts JAX's devices, on at most the usable cores. Raises ValueError if this machine lacks the one in JAX_PLATFORMS."""
+    """Starts JAX's devices, on at most the usable cores. Raises ValueError if JAX_PLATFORMS names one that is missing."""
     import jax
 
     limits.limit_threads()

@@ -69,7 +69,7 @@ def check_sampler(
 ) -> str:
     """Checks the log weights at every step of random episodes.
 
-    They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal in a second call and `jax.vmap`.
+    They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal in a second call and under `jax.vmap`.
     """
     made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, learner)
     episodes, numbers = trial.episodes, trainer.as_arrays(trial.hparams)

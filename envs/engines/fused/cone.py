@@ -18,7 +18,7 @@ _OPEN, _MIDDLE, _STUCK = (wp.constant(piece) for piece in range(3))  # pieces of
 def press_cones(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Sets the weights of contacts, reference accelerations of their rows, and `cone`.
 
-    A contact's weight is that of its first row. The second row has mu in the weight's place.
+    A contact's first row has the contact's weight. The second row has mu in the weight's place.
     """
     nv = dofs.number
     for at in range(thread, _MOST * memory.counts[0], threads):
@@ -151,7 +151,7 @@ def take_cones(memory: Memory, far: float, thread: int, threads: int) -> float:
 
 @wp.func
 def add_cones(memory: Memory, nv: int, stiff: int, thread: int, threads: int):
-    """Adds the forces of contacts to `search`; and with `stiff` 1 their stiffness to `factor`."""
+    """Adds the forces of contacts to `search` and, with `stiff` 1, their stiffness to `factor`."""
     for c in range(memory.counts[0]):
         row, dim = memory.cone[c] & 65535, memory.cone[c] >> 16
         mu, weight = _mu(memory, row, dim), memory.weight[row]

@@ -1,7 +1,7 @@
-"""Contacts of spheres and capsules, with MuJoCo Warp's functions for them, which follow MuJoCo C, and with cylinders.
+"""Contacts of spheres and capsules. MuJoCo Warp's functions, which follow MuJoCo C, compute all except those with cylinders.
 
 The contact with a cylinder is where the signed distance from it is least on the capsule's segment: a convex function, whose
-slope is followed by bisection. Where it is flat, for example on parallel axes, the contact is in the middle. A capsule that
+slope is followed by bisection. If a part is flat, for example on parallel axes, the contact is in its middle. A capsule that
 lies on an end of the cylinder has a contact where it enters the end's circle, and one where it leaves, as in MuJoCo C. C takes
 a polygon for the circle, so its two contacts are up to a twentieth of the radius further inside.
 """
