@@ -1,6 +1,8 @@
 import dataclasses
+import errno
 import re
 import signal
+import tempfile
 
 import pytest
 from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
@@ -69,6 +71,17 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     names = [f"point_mass_{name}.{end}" for name in ("curves", "thresholds", "comparison") for end in ("png", "svg")]
     assert sorted(written) == sorted(["comparison.csv", *names])
     assert min(written[name] for name in names) > 5000
+
+
+def test_a_folder_that_cannot_be_written_to_is_reported_before_anything_compiles(tmp_path, point_mass, capsys, monkeypatch):
+    def read_only(dir):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(tempfile, "mkdtemp", read_only)  # as permissions do not stop root
+    assert cli.main([*COMMAND, "--out", str(tmp_path / "sweep")]) == 2
+    told = capsys.readouterr()
+    assert "cannot be written to (Read-only file system)" in told.err
+    assert "compiling" not in told.out
 
 
 def interrupting(monkeypatch, after, number):
