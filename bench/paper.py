@@ -68,7 +68,7 @@ FIGURES: dict[str, tuple[Sweep, ...]] = {
     "own_cycles": (
         Sweep("own_push", "push", 50, 2, _BOTH, 20, **_NEW),
         Sweep("own_pick_and_place", "pick_and_place", 50, 2, _BOTH, 20, **_NEW),
-        Sweep("own_slide", "slide", 200, 2, _BOTH, 10, **_NEW),
+        Sweep("own_slide", "slide", 100, 2, _BOTH, 10, **_NEW),
         Sweep("own_methods", "push", 50, 2, "--sampler closest epsilon_closest", 10, **_NEW),
     ),
     "own_set": (
