@@ -20,7 +20,7 @@ STYLES = {
     "closest": ("#000000", ":"),
 }
 CLAIMED = {"push": 5, "pick_and_place": 10}  # epochs that `weighted` is sooner than `future` in the paper
-SHOWN = {"push": 50, "pick_and_place": 50, "slide": 200}  # epochs
+SHOWN = {"push": 50, "pick_and_place": 50, "slide": 100}  # epochs
 
 
 @functools.cache
@@ -30,9 +30,8 @@ def data() -> dict[str, Sweeps]:
 
 
 def curves(task: str) -> dict[str, Curves]:
-    """Curves by sampler: with the paper's cycles, on Slide with one cycle per epoch."""
-    main = "slide" if task == "slide" else paper_set.OWN[task]
-    own = {name: found for (sweep, name), found in data()[task].items() if sweep in (main, "own_methods")}
+    """Curves by sampler, with the paper's cycles."""
+    own = {name: found for (sweep, name), found in data()[task].items() if sweep in (paper_set.OWN[task], "own_methods")}
     return {name: own[name] for name in STYLES if name in own}
 
 
@@ -47,8 +46,7 @@ def _panel(axis: Any, task: str) -> None:
         place, level = float(np.median(reach(own["future"], THRESHOLDS[task]))), THRESHOLDS[task]
         axis.annotate("", (place - CLAIMED[task], level), (place, level), arrowprops={"arrowstyle": "->", "color": "#b3261e"})
         axis.plot(place - CLAIMED[task], level, "D", color="#b3261e", markersize=6, label="the paper's gain", zorder=5)
-    cycles = "one cycle per epoch" if task == "slide" else "the paper's cycles"
-    axis.set(title=f"{NAMES[task]}, {len(own['future'].seeds)} seeds, {cycles}", xlabel="epoch")
+    axis.set(title=f"{NAMES[task]}, {len(own['future'].seeds)} seeds, the paper's cycles", xlabel="epoch")
     axis.set(xlim=(0, SHOWN[task]), ylim=(0, 1.02))
     axis.grid(alpha=0.2)
 

@@ -110,7 +110,7 @@ def _panel(ax, lines: list[Line]) -> None:
             ticks.append((y, label))
         is_main = label != before
         color = "#1b62a5" if is_main else "#8fb8de"
-        told = "the paper's cycles (Slide: one an epoch), 95 %" if is_main else "other sweeps"
+        told = "the paper's cycles, 95 %" if is_main else "other sweeps"
         label_of_dot = told if told not in ax.get_legend_handles_labels()[1] else None
         ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if is_main else 1.6, solid_capstyle="butt")
         ax.plot(d.mean, y, "o", color=color, markersize=6 if is_main else 4, label=label_of_dot)
