@@ -29,13 +29,18 @@ class Style(NamedTuple):
 
 def _mlp(x: Array, hidden_sizes: Sequence[int], output_size: int, dtype: DTypeLike, style: Style) -> Array:
     activation = nn.swish if style.residual else nn.relu
+    linear: Any = nn.Dense
+    if style.layer_norm:
+        from mjx_dher import layers  # on demand: most runs do without
+
+        linear = layers.Dense
     skipped: Any = None
     for number, size in enumerate(hidden_sizes):
-        x = nn.Dense(size, dtype=dtype, **_initializers(x, style.fan_in))(x)
-        x = activation(nn.LayerNorm(dtype=dtype)(x) if style.layer_norm else x)
+        x = linear(size, dtype=dtype, **_initializers(x, style.fan_in))(x)
+        x = activation(layers.LayerNorm(dtype)(x) if style.layer_norm else x)
         if style.residual and number % 2 == 0:
             x = skipped = x if skipped is None else x + skipped
-    return nn.Dense(output_size, dtype=jnp.float32, **_initializers(x, style.fan_in))(x)
+    return linear(output_size, dtype=jnp.float32, **_initializers(x, style.fan_in))(x)
 
 
 def _initializers(x: Array, fan_in: bool) -> dict[str, Any]:

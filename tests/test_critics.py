@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import optax
 import pytest
 from configs import LEARNS
 
-from mjx_dher import HParams, learners
+from mjx_dher import HParams, learners, networks
 from mjx_dher.learners import critics
 from mjx_dher.learners.critics import Categorical, Critics
 from mjx_dher.networks import Critic, Style
@@ -159,6 +160,37 @@ def test_layer_norm_normalizes_before_each_relu():
         x = np.maximum(x * np.asarray(layers[f"LayerNorm_{i}"]["scale"]) + np.asarray(layers[f"LayerNorm_{i}"]["bias"]), 0)
     expected = x @ np.asarray(layers["Dense_2"]["kernel"]) + np.asarray(layers["Dense_2"]["bias"])
     np.testing.assert_allclose(network.apply(params, *inputs), expected[:, 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_layers_that_sum_by_products_have_the_gradients_of_flax(dtype):
+    """Of 3 networks side by side, with scales and biases that are not those of the start."""
+
+    class Flax(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            x = nn.LayerNorm(dtype=dtype)(nn.Dense(8, dtype=dtype, kernel_init=nn.initializers.xavier_uniform())(x))
+            return nn.Dense(2, kernel_init=nn.initializers.xavier_uniform())(nn.relu(x))
+
+    class Ours(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            return networks._mlp(x, (8,), 2, jnp.dtype(dtype), Style(layer_norm=True))
+
+    x, target = jax.random.normal(KEY, (3, 5, 16, 4)), jax.random.normal(jax.random.key(1), (3, 5, 16, 2))
+    params = jax.vmap(Ours().init, (None, 0))(KEY, x)
+    theirs = jax.vmap(Flax().init, (None, 0))(KEY, x)
+    assert jax.tree.structure(params) == jax.tree.structure(theirs)
+    params = jax.tree.map(lambda p: p + 0.1 * jax.random.normal(KEY, p.shape), params)
+
+    def gradients(module):
+        loss = lambda p, x, target: jnp.mean((module.apply(p, x) - target) ** 2)  # noqa: E731
+        return jax.vmap(jax.value_and_grad(loss))(params, x, target)
+
+    tolerance = {"float32": 1e-6, "bfloat16": 0.02}[dtype]
+    for own, flax in zip(jax.tree.leaves(gradients(Ours())), jax.tree.leaves(gradients(Flax()))):
+        assert own.dtype == jnp.float32
+        np.testing.assert_allclose(own, flax, atol=tolerance * float(jnp.abs(flax).max()))
 
 
 def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1():
