@@ -21,6 +21,7 @@ from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.observations import Entry, Sensors
 from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.starts import Start
+from mjx_dher.lookup import hint
 from mjx_dher.types import Array, PRNGKey
 from mjx_dher.validation import check_number
 
@@ -66,6 +67,7 @@ class MujocoTask(SimulatedTask):
         """Looks up the declared names in the model, and probes the model."""
         if not callable(self.controls):
             raise ValueError(f"controls is a method of a task; the field is control; got controls = {self.controls!r}")
+        _check_names(type(self))
         declared = self.control if isinstance(self.control, Sequence) else (self.control,)
         self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
         self.action_size = sum(part.size for part in self.parts)
@@ -203,6 +205,18 @@ def _folder(task: type) -> Path:
         return Path(inspect.getfile(owner)).parent
     except (TypeError, OSError):
         return Path()
+
+
+def _check_names(task: type) -> None:
+    """Raises ValueError if a task class has a value under the name of an argument, or nearly that of a field."""
+    fields = [name for name in SimulatedTask.__annotations__ | MujocoTask.__annotations__ if name[0] != "_"]
+    arguments = inspect.signature(SimulatedTask).parameters.keys() - fields
+    for owner in task.__mro__[: task.__mro__.index(MujocoTask)]:
+        for name in vars(owner).keys() - fields - vars(MujocoTask).keys():
+            near = hint(name, fields, cutoff=0.85)
+            if name in arguments or (near and not callable(vars(owner)[name])):
+                kind = "an argument of a task and not a field" if name in arguments else "no field of a task"
+                raise ValueError(f"{owner.__name__}.{name} is {kind}{near}; fields are {', '.join(fields)}")
 
 
 def _checked(field: str, value: Any, kind: type) -> Any:
