@@ -24,16 +24,16 @@ def _summed(x: Array) -> Array:
 
 
 @jax.custom_vjp
-def shifted(x: Array, bias: Array) -> Array:
+def _shifted(x: Array, bias: Array) -> Array:
     """`x` [..., F] plus a float32 `bias` [F], in the dtype of `x`."""
     return x + bias.astype(x.dtype)
 
 
-shifted.defvjp(lambda x, bias: (shifted(x, bias), None), lambda _, gradient: (gradient, _summed(gradient)))
+_shifted.defvjp(lambda x, bias: (_shifted(x, bias), None), lambda _, gradient: (gradient, _summed(gradient)))
 
 
 @jax.custom_vjp
-def scaled(x: Array, scale: Array) -> Array:
+def _scaled(x: Array, scale: Array) -> Array:
     """`x` [..., F] times `scale` [F], both float32."""
     return x * scale
 
@@ -43,7 +43,7 @@ def _backwards(kept: tuple[Array, Array], gradient: Array) -> tuple[Array, Array
     return gradient * scale, _summed(gradient * x)
 
 
-scaled.defvjp(lambda x, scale: (x * scale, (x, scale)), _backwards)
+_scaled.defvjp(lambda x, scale: (x * scale, (x, scale)), _backwards)
 
 
 class Dense(nn.Module):
@@ -58,7 +58,7 @@ class Dense(nn.Module):
     def __call__(self, x: Array) -> Array:
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features), jnp.float32)
         bias = self.param("bias", self.bias_init, (self.features,), jnp.float32)
-        return shifted(x.astype(self.dtype) @ kernel.astype(self.dtype), bias)
+        return _shifted(x.astype(self.dtype) @ kernel.astype(self.dtype), bias)
 
 
 class LayerNorm(nn.Module):
@@ -74,4 +74,4 @@ class LayerNorm(nn.Module):
         mean = x.mean(-1, keepdims=True)
         variance = jnp.maximum(0.0, jnp.square(x).mean(-1, keepdims=True) - jnp.square(mean))
         normal = (x - mean) * jax.lax.rsqrt(variance + _EPSILON)
-        return shifted(scaled(normal, scale), bias).astype(self.dtype)
+        return _shifted(_scaled(normal, scale), bias).astype(self.dtype)
