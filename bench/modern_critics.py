@@ -1,7 +1,7 @@
 """Critics of 2024 and 2025 in the presets `gpu` of Slide (as of 2026-11-25) and Block Z.
 
-    python bench/modern_critics.py --out critics --plan
-    python bench/modern_critics.py --out critics --minutes 9   trains for 9 minutes and reports; run it again to resume
+    python bench/modern_critics.py --out critics --first-seed 10 --plan
+    python bench/modern_critics.py --out critics --first-seed 10 --minutes 9   trains and reports; run it again to resume
     python bench/modern_critics.py --out toy --toy --seeds 2   the same on the point mass, on a CPU
 
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/ablation.md has the plan.
