@@ -13,7 +13,9 @@ import argparse
 import csv
 import dataclasses
 import statistics
+import time
 from pathlib import Path
+from typing import Any
 
 import jax
 from timing import print_table
@@ -42,15 +44,18 @@ def main() -> None:
         if name in HParams._fields:
             hparams = hparams._replace(**{name: float(value)})
         else:
-            config = dataclasses.replace(config, **{name: int(value)})
+            size: Any = int(value)
+            config = dataclasses.replace(config, **{name: size})
     env = envs.make(args.env, engine=args.engine)
     learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
-    parts = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority), "learner": learner}
+    parts: dict[str, Any] = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority)}
     keep_compiled_programs()
     rows, curve, compiled = [], [], []
     for seed in range(args.seeds):
-        first = None
-        for progress in train(env, config, hparams, seed, lambda seconds: seconds and compiled.append(seconds), **parts):
+        first, started = None, time.perf_counter()
+        for progress in train(env, config, hparams, seed, learner=learner, **parts):
+            if progress.epoch == 1:
+                compiled.append(time.perf_counter() - started - progress.wall_seconds)
             success = progress.metrics["success_rate"]
             curve.append((seed, progress.env_steps, progress.updates, round(progress.wall_seconds, 2), success))
             if first is None and success >= args.threshold:
