@@ -181,7 +181,7 @@ SIZES = {
     ("best", "block_rotate_z"): Size({"cycles_per_epoch": 1, "total_steps": 1_536_000}, 49.5 * 1.536 / 4.1),
 }
 COMPILE_SECONDS = 30.0  # per program
-TOY = {
+TOY: dict[str, Any] = {
     "num_envs": 16,
     "cycles_per_epoch": 5,
     "updates_per_cycle": 20,
@@ -224,6 +224,8 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     `paper` is DDPG under the paper's settings, and `best` is `tuned` with `eventful`. In `paper`, priorities choose the whole
     batch, as in their authors' work. In `best` they replace `eventful` for the preset's half of the batch.
     """
+    if not toy and (learner, task) not in SIZES:
+        raise ValueError(f"learner {learner} has no sizes for task {task}; choose with --learners and --tasks")
     parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
     run = presets.preset("paper", task, **parts) if learner == "paper" else tuned(task, **parts)
     # A ring for all transitions: a larger one costs only memory.

@@ -1,8 +1,8 @@
 """Controls of the priority `td_error`: each part alone, a choice at random, more updates, and the fraction with each learner.
 
-    python bench/td_controls.py --out td --first-seed 500 --seeds 20 --plan
-    python bench/td_controls.py --out td --first-seed 500 --seeds 20 --minutes 9   trains for 9 minutes; run it again to resume
-    python bench/td_controls.py --out toy --toy --seeds 2                          the same on the point mass, on a CPU
+    python bench/td_controls.py --learners best --out td --first-seed 500 --seeds 20 --plan
+    python bench/td_controls.py --learners best --out td --first-seed 500 --seeds 20 --minutes 9   run it again to resume
+    python bench/td_controls.py --out toy --toy --seeds 2                                          the point mass, on a CPU
 
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/as_published.md is the plan.
 """

@@ -28,6 +28,8 @@ def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
                 assert own == {spec.program}
     controls = {arm.name: td_controls.spec_of("best", "slide", arm) for arm in td_controls.ARMS}
     assert controls["more_updates"].config.updates_per_cycle == 1.75 * controls["future"].config.updates_per_cycle
+    with refuses("paper", "block_rotate_z"):
+        td_controls.spec_of("paper", "block_rotate_z", td_controls.ARMS[0])
     strict = as_published.next_future("2cm", "push", as_published.METHODS[0])
     assert strict.env_arguments == {"distance_threshold": 0.02}
     cher, ebp = (as_published.EXPERIMENTS[name] for name in ("cher", "ebp"))
