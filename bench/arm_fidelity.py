@@ -5,18 +5,15 @@ Run it in the environment of `bench/peer_envs.py`: python bench/arm_fidelity.py 
 
 import argparse
 import dataclasses
-import sys
 import warnings
-from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import peer_envs
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from bench import peer_envs
 from mjx_dher import envs
 from mjx_dher.envs import arms
 
@@ -72,9 +69,9 @@ def model_differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> list[str]
 
 
 def _inertia(model: mujoco.MjModel, body: int) -> np.ndarray:
-    mat = np.zeros(9)
-    mujoco.mju_quat2Mat(mat, model.body_iquat[body])
-    mat = mat.reshape(3, 3)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, model.body_iquat[body])
+    mat = flat.reshape(3, 3)
     return mat @ np.diag(model.body_inertia[body]) @ mat.T
 
 
@@ -90,7 +87,7 @@ def _pairs(model: mujoco.MjModel) -> list[list[tuple]]:
 
 def play(name: str, theirs, steps: int, episodes: int, engine: str) -> np.ndarray:
     """Root mean square differences [steps + 1, D] of observations under the same actions, from their starts."""
-    ours = envs.make(name, engine=engine)
+    ours: Any = envs.make(name, engine=engine)  # Any: a GoalEnv need not have a first_state
     marker = slice(0, 7) if name == "arm_reach" else slice(7, 14)
     actions = jax.random.uniform(jax.random.key(1), (steps, episodes, ours.action_size), minval=-1.0, maxval=1.0)
     actions = jnp.repeat(actions[::5], 5, axis=0)[:steps]  # held for five steps, so that the arm gets somewhere

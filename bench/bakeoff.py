@@ -205,9 +205,9 @@ def report(args: argparse.Namespace, console: Console) -> int:
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
     console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
-        if own := [row for row in rows if row.task == task]:
+        if its := [row for row in rows if row.task == task]:
             path = args.out / f"{fingerprint.in_a_path(task)}_forest.png"
-            forest(own, path, args.experiment.baseline)
+            forest(its, path, args.experiment.baseline)
             console.print(f"wrote {path}")
     return len(rows)
 

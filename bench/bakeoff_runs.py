@@ -64,11 +64,8 @@ def _run(where: str, row: dict[str, str]) -> Run:
     """The run of a row. Raises FolderError if the row is invalid."""
     try:
         run = Run(
-            *(row[name] for name in ("learner", "task", "arm")),
-            int(row["seed"]),
-            row["name"],
-            int(row["failed"]),
-            *(float(row[name]) for name in ("mean_success", "final", "steps")),
+            *(row["learner"], row["task"], row["arm"], int(row["seed"]), row["name"], int(row["failed"])),
+            *(float(row["mean_success"]), float(row["final"]), float(row["steps"])),
         )
     except (TypeError, ValueError) as error:
         raise FolderError(f"{where}: {error}") from error

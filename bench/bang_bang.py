@@ -104,8 +104,7 @@ def main() -> int:
         count = -(-args.actions // (args.num_envs * env.episode_length))
         results.append(row(env, itertools.islice(rounds(env, args.num_envs, not args.each_action), count)))
     head = ("task", "engine", "actions", "blew up", "object's speed, at most, m/s", "joint's, m/s or rad/s")
-    head += ("deeper than 5 mm", "deepest, mm")
-    print_table(head, [row for row, _ in results])
+    print_table((*head, "deeper than 5 mm", "deepest, mm"), [row for row, _ in results])
     return 0 if all(good for _, good in results) else 1
 
 

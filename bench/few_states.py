@@ -14,6 +14,7 @@ import argparse
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +80,8 @@ def main() -> None:
     parser.add_argument("--timesteps", type=int, nargs="+", default=[1, 10])
     args = parser.parse_args()
     models = {"guide's arm": mujoco.MjModel.from_xml_path(str(ARM))}
-    models |= {f"`{name}`": envs.make(name, engine="native").model for name in ("push", "block_rotate_z")}
+    made: dict[str, Any] = {name: envs.make(name, engine="native") for name in ("push", "block_rotate_z")}
+    models |= {f"`{name}`": env.model for name, env in made.items()}
     rows = []
     for name, model in models.items():
         for timesteps in args.timesteps:

@@ -21,6 +21,7 @@ import csv
 import io
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -106,7 +107,7 @@ def free_slide(engine):
 
     from mjx_dher import envs
 
-    env = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
+    env: Any = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
     state = env.init_state(jnp.array([1.2, 0.75, env.task.object_height, 1, 0, 0, 0]), jnp.ones(3))
     first = state.obs["achieved_goal"]
     velocity = env.model.joint("object").dofadr[0]
@@ -122,7 +123,7 @@ def falls(engine):
 
     from mjx_dher import envs
 
-    env = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
+    env: Any = envs.make("slide", engine=engine, **OPTIONS.get(engine, {}))
 
     def episode(key):
         start, way = jax.random.split(key)
@@ -166,7 +167,7 @@ def report(tasks, engines):
         for engine in engines
     }
     with open(YARDSTICK, encoding="utf-8") as file:
-        original = [row for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
+        original = [tuple(row) for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
     rows = []
     for task in tasks:
         for kind, name in enumerate(KINDS):
@@ -174,7 +175,7 @@ def report(tasks, engines):
             for engine in engines:
                 grip, obj = paths[task, engine]
                 rows.append((task, name, engine, *figures(recorded[task], grip[of], obj[of][:, [0, -1]], of)))
-            rows += [row for row in original if row[:2] == [task, name]]
+            rows += [row for row in original if row[:2] == (task, name)]
     with contextlib.redirect_stdout(io.StringIO()) as text:
         print_table(HEAD, rows)
         if "slide" in tasks and set(ENGINES) <= set(engines):

@@ -34,6 +34,7 @@ import io
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from fidelity import put_into_document, run_by
@@ -157,7 +158,7 @@ def report(tasks, engines, episodes, steps):
         paths = {}
         for engine in engines:
             try:
-                env = envs.make(task, engine=engine, **OPTIONS.get(engine, {}))
+                env: Any = envs.make(task, engine=engine, **OPTIONS.get(engine, {}))
             except ValueError as error:  # jax has no egg
                 print(f"{task}: {error}", file=sys.stderr)
                 continue
@@ -204,11 +205,11 @@ def record(seed=0):
                 if step % KEPT == KEPT - 1:
                     qpos.append(env.data.qpos[:nq].copy())
             episodes.append({"action": action, "qpos": qpos, "qvel": start, "goal": obs["desired_goal"], "reward": reward})
-        arrays = {name: np.array([each[name] for each in episodes]) for name in episodes[0]}
+        arrays: dict[str, Any] = {name: np.array([each[name] for each in episodes]) for name in episodes[0]}
         arrays = {name: x if x.dtype == np.int8 else x.astype(np.float32) for name, x in arrays.items()}
         resets = [(env.reset(seed=int(rng.integers(2**31)))[0], env.data.qpos[JOINTS:nq].copy())[::-1] for _ in range(RESETS)]
-        arrays["starts"] = np.float32([start for start, _ in resets])
-        arrays["goals"] = np.float32([obs["desired_goal"] for _, obs in resets])
+        arrays["starts"] = np.array([start for start, _ in resets], np.float32)
+        arrays["goals"] = np.array([obs["desired_goal"] for _, obs in resets], np.float32)
         path = DATA / f"hand_{task}.npz"
         np.savez_compressed(path, kind=np.arange(EPISODES, dtype=np.int8) % len(KINDS), **arrays)
         print(task, path.stat().st_size, "bytes")

@@ -120,7 +120,7 @@ def kill(kind, nodes, driver, dice):
 
 def kills(rounds, seeds, seed, epochs=12):
     """Kills in turn until `rounds` kills were made. Returns one row per sweep."""
-    dice, rows, done = random.Random(seed), [], 0
+    dice, rows, done = random.Random(seed), list[list[str]](), 0
     flags = [*LONG, epochs * STEPS_PER_EPOCH, "--seeds", seeds]
     with tempfile.TemporaryDirectory() as folder, Nodes(4) as nodes:
         reference = Path(folder) / "reference"

@@ -85,9 +85,9 @@ def body(model, index):
         wrist = (model.dof_damping[dof], model.dof_armature[dof]) != (0.1, 0.001)
         extra = f' damping="{numbers(model.dof_damping[dof])}" armature="{numbers(model.dof_armature[dof])}"' * wrist
         lines.append(f'  <joint name="{own(joint.name)}" axis="{numbers(joint.axis)}" range="{numbers(joint.range)}"{extra}/>')
-    for i in np.flatnonzero(model.geom_bodyid == index):
+    for i in np.flatnonzero(model.geom_bodyid == index).tolist():
         lines += geom(model, i)
-    for i in np.flatnonzero(model.site_bodyid == index):
+    for i in np.flatnonzero(model.site_bodyid == index).tolist():
         if (name := model.site(i).name).startswith(f"{PREFIX}S_"):
             lines.append(f'  <site name="{own(name)}" pos="{numbers(model.site(i).pos)}"/>')
     for child in np.flatnonzero(model.body_parentid == index):
@@ -287,16 +287,16 @@ def compare(name, there):
         largest[field] = np.abs(getattr(here, field) - getattr(there, field)[: here.nv]).max()
     largest["qpos0"] = np.abs(here.qpos0 - there.qpos0[: here.nq]).max()
     tendons_there = [own(there.tendon(i).name) for i in range(there.ntendon)]
-    same = {"actuator": range(here.nu), "pair": range(there.npair)}
+    same = {"actuator": [*range(here.nu)], "pair": [*range(there.npair)]}
     same["tendon"] = [tendons_there.index(here.tendon(i).name) for i in range(here.ntendon)]
     for field in dir(here):
         kind = field.split("_")[0]
         if kind in same and not field.endswith("_user"):
-            a, b = getattr(here, field), getattr(there, field, None)
+            a, b = getattr(here, field), getattr(there, field, np.zeros(0))
             if isinstance(a, np.ndarray) and a.dtype.kind == "f" and np.ndim(b) and np.size(b) and len(b) > max(same[kind]):
                 a = a[hand_pairs(here)] if kind == "pair" else a
                 if a.shape[1:] == b.shape[1:]:
-                    largest[field] = np.abs(a - b[list(same[kind])]).max()
+                    largest[field] = np.abs(a - b[same[kind]]).max()
     print(f"{name}: {len(largest)} quantities,", {field: f"{value:.1e}" for field, value in largest.items() if value > 1e-9})
 
 

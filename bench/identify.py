@@ -17,6 +17,7 @@ import argparse
 import ast
 import warnings
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -194,16 +195,15 @@ def read(tasks):
     np.set_printoptions(precision=7, suppress=True, linewidth=200, threshold=60)
     largest: dict[str, dict[str, float]] = {}
     for task in tasks:
-        env, numbers, here = gym.make(ORIGINALS[task]).unwrapped, task_numbers(task), our_model(task)
+        env: Any = gym.make(ORIGINALS[task]).unwrapped
+        numbers, here = task_numbers(task), our_model(task)
         env.reset(seed=0)
         there, here_data = env.model, settle(here, numbers)
-        jointed = "finger_r" in _joints(here)
-        rows = [*rows_of_start(env, numbers), *rows_of_bodies(there, here, env.data, here_data, jointed)]
+        rows = [*rows_of_start(env, numbers), *rows_of_bodies(there, here, env.data, here_data, "finger_r" in _joints(here))]
         rows += [*rows_of_weld(there, here), *rows_of_contacts(there, here)]
         if env.has_object:
             rows += rows_of_object(there, here)
-        if here.nu:
-            rows += rows_of_actuators(there, here)
+        rows += rows_of_actuators(there, here) if here.nu else []
         print(f"\n{ORIGINALS[task]}: quantity, part, original, here (where it differs)\n")
         for quantity, part, *values in rows:
             a, b = (np.squeeze(np.asarray(value, float)) for value in values)

@@ -35,11 +35,15 @@ def compute_reward(achieved_goal, desired_goal):
 
 def full_ring(num_episodes: int = 20_000, num_steps: int = 50) -> replay.ReplayState:
     """A ring of 10^6 transitions of random numbers, shaped like Push."""
+
+    def shape(*sizes: int) -> Any:
+        return jax.ShapeDtypeStruct(sizes, jnp.float32)
+
     shapes = Episode(
-        observation=jax.ShapeDtypeStruct((num_steps + 1, 25), jnp.float32),
-        achieved_goal=jax.ShapeDtypeStruct((num_steps + 1, 3), jnp.float32),
-        desired_goal=jax.ShapeDtypeStruct((3,), jnp.float32),
-        action=jax.ShapeDtypeStruct((num_steps, 4), jnp.float32),
+        observation=shape(num_steps + 1, 25),
+        achieved_goal=shape(num_steps + 1, 3),
+        desired_goal=shape(3),
+        action=shape(num_steps, 4),
     )
     episodes = jax.tree.map(lambda x: 0.1 * jax.random.normal(jax.random.key(0), (num_episodes, *x.shape)), shapes)
     priority = (jnp.arange(num_episodes) % 3 == 0).astype(jnp.float32)

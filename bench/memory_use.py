@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+from typing import Any
 
 import apart
 
@@ -33,7 +34,7 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
     environment = envs.make(env, engine=engine)
     program = trainer.make_train(environment, config)
     learner = learners.make(spec.learner, config, env_spec(environment), spec.networks)
-    run = train(environment, config, spec.hparams, sampler=samplers.make("weighted"), learner=learner)
+    run: Any = train(environment, config, spec.hparams, sampler=samplers.make("weighted"), learner=learner)
     next(run)
     run.close()
     found = [format_bytes(program.replay_bytes)]

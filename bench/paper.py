@@ -23,7 +23,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -63,7 +63,8 @@ _LINEAR = "--sampler weighted --weight-kernel linear --weight-normalization"
 _SOFTMAX = "--sampler weighted --weight-kernel softmax --weight-normalization"
 _K = "--sampler future --sweep.her-k 1 2 8 16"
 _EVENTFUL = "--sampler future --sweep.priority-fraction 0.5"
-_BOTH, _NEW = "--sampler future weighted", {"first_seed": 20, "own_cycles": True}  # seeds that influenced no choice
+_BOTH = "--sampler future weighted"
+_NEW: dict[str, Any] = {"first_seed": 20, "own_cycles": True}  # seeds that influenced no choice
 FIGURES: dict[str, tuple[Sweep, ...]] = {
     "own_cycles": (
         Sweep("own_push", "push", 50, 2, _BOTH, 20, **_NEW),
@@ -182,7 +183,8 @@ def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: in
 
     The first signal is passed to the running sweeps, which save their progress. Waiting sweeps do not begin.
     """
-    waiting, running, status, number = list(sweeps), {}, 0, None
+    waiting, status, number = list(sweeps), 0, None
+    running: dict[Sweep, subprocess.Popen[bytes]] = {}
 
     def send(number: int) -> None:
         for child in running.values():

@@ -83,7 +83,10 @@ def _jaxgcrl(env, episode_length: int) -> BraxEnv:
 
 def _root() -> Path:
     """Folder of JaxGCRL, which is not imported: its agents need modules that Brax no longer has."""
-    return Path(importlib.util.find_spec("jaxgcrl").submodule_search_locations[0])
+    spec = importlib.util.find_spec("jaxgcrl")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("jaxgcrl is not installed; the first lines of bench/peer_envs.py have the command")
+    return Path(spec.submodule_search_locations[0])
 
 
 def _module(name: str):

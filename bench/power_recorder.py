@@ -52,8 +52,8 @@ def install(root: Path, store: Path) -> None:
             os.link(target, store / "trash" / str(next(numbers)))
         replace(source, target, **kwargs)
 
-    os.fsync, os.replace, os.rename, os.unlink, os.remove, os.rmdir = record, put, put, aside, aside, aside_empty
-    shutil.rmtree = lambda path, *args, **kwargs: (
+    os.fsync, os.replace, os.rename, os.unlink, os.remove, os.rmdir = record, put, put, aside, aside, aside_empty  # type: ignore[assignment]
+    shutil.rmtree = lambda path, *args, **kwargs: (  # type: ignore[assignment]
         aside(path, ignore_errors=True) if Path(path).absolute().is_relative_to(root) else rmtree(path, *args, **kwargs)
     )
     descriptor = os.open(root, os.O_RDONLY)

@@ -73,7 +73,7 @@ def main() -> None:
             jax.block_until_ready(epoch(state))
             seconds = time.perf_counter() - start
         events = list(device_events(folder))
-    spent, count = collections.Counter(), collections.Counter()
+    spent, count = collections.Counter[str](), collections.Counter[str]()
     for name, _, duration in events:
         spent[name] += duration
         count[name] += 1

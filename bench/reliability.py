@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -40,13 +41,13 @@ from mjx_dher.runs.program import loop
 
 ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.
-SHAPES = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_period": 1, "batch_size": 16}
+SHAPES: dict[str, Any] = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_period": 1, "batch_size": 16}
 SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
 BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS, **reliability_hostile.PARTS}
-PARTS = ("kills", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages", "signals")
-PARTS += (*BESIDE,)
+PARTS = ["kills", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages", "signals"]
+PARTS += BESIDE
 
 
 class Failure(Exception):

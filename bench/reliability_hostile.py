@@ -62,7 +62,7 @@ COMMANDS = {
     "report": ("report", "received"),
     "film": ("report", "received", "--video"),
     "export": ("export", "received", "--format", "onnx"),
-    "load": None,  # load_policy
+    "load": (),  # load_policy
     "plot-sweep": ("plot", "swept"),
     "report-sweep": ("report", "swept", "--video"),
     "sweep": ("sweep", *SHAPES, "--total-steps", "80", "--sampler", "future", "--seeds", "2", "--out", "swept"),
@@ -120,7 +120,7 @@ class Case:
 
     def arguments(self):
         """Arguments that would leave the canary, for several callables."""
-        kinds = (
+        kinds: tuple[list[str], ...] = (
             [f"command=touch {self.canary}"],
             [f"args=touch {self.canary}", "shell=true"],
             [f"cmd=touch {self.canary}"],
@@ -226,9 +226,9 @@ def manifest(case):
         path.write_text(content.replace("future", case.rng.choice(PATHS)))
 
 
-CHANGES = (environment, environment, environment, component, component, learner, demonstrations, link, link, folder_link, names)
+CHANGES = [environment, environment, environment, component, component, learner, demonstrations, link, link, folder_link, names]
 BREAKING = (link, folder_link, file)  # their results cannot be edited further
-CHANGES += (text, file, unpickled, manifest)
+CHANGES += [text, file, unpickled, manifest]
 
 
 def in_a_process(place, act, seconds=SECONDS):
@@ -277,7 +277,7 @@ def make_base(base):
 
 def opened(case):
     """Opens the folder with the command of the case."""
-    if COMMANDS[case.command] is None:
+    if not COMMANDS[case.command]:
         import mjx_dher
 
         try:
@@ -310,7 +310,7 @@ def faults_of(case, status):
 def hostile(folder, count=200, seed=0):
     """Makes and opens `count` cases. Returns the action, a summary and the faults."""
     sys.path[:0] = [str(ROOT / "docs" / "examples"), ""]
-    rng, base, ended, faults = random.Random(seed), folder / "base", {}, []
+    rng, base, ended, faults = random.Random(seed), folder / "base", dict[int | None, int](), []
     make_base(base)
     for number in range(count):
         case = Case(folder / f"case-{number:03d}", base, rng)

@@ -85,7 +85,7 @@ def disks(folder):
 GB = 10**9
 CACHE = "anon 200000000\ninactive_file 3000000000\nactive_file 800000000\n"
 V1 = "total_inactive_file 3000000000\ntotal_active_file 800000000\n"
-CONTAINERS = {
+CONTAINERS: dict[str, tuple[str, dict, tuple]] = {
     # /proc/self/cgroup, files of /sys/fs/cgroup, the most memory that is free, the status of a run of Push, the most cores
     "version 2, cache": (
         "0::/\n",

@@ -80,7 +80,8 @@ def send_bytes(port, rng, held):
 
 def values(rng):
     """Any value that a message can have."""
-    odd = [math.nan, math.inf, -1e308, 1e39, 2**63, -1, 0, True, None, "", "x" * 10_000, "[/red]\x1b[2J", b"\0" * 100, {}, []]
+    texts = ["", "x" * 10_000, "[/red]\x1b[2J", b"\0" * 100]
+    odd: list = [math.nan, math.inf, -1e308, 1e39, 2**63, -1, 0, True, None, *texts, {}, []]
     one = rng.choice(odd)
     return rng.choice([one, [one] * rng.choice([1, 3, 4, 1000]), {"value": one}, {"type": one}])
 
@@ -182,7 +183,7 @@ def control_ids(messages):
 
 async def attack_viewer(port, number, seed):
     """Sends hostile messages to a viewer. Returns a line each time its browser stopped receiving."""
-    rng, held, faults = random.Random(seed), [], []
+    rng, held, faults = random.Random(seed), list[socket.socket](), []
     async with Watcher(port) as watcher:
         if not await watcher.sees_more(60):
             return ["a browser sees nothing"]
@@ -228,8 +229,8 @@ def ports_of(processes):
 def started(folder, name, *command, **variables):
     """A command with its output in a file. Stopped as Ctrl-C does."""
     with (folder / f"{name}.log").open("w") as log:
-        command = [sys.executable, "-u", "train.py", *map(str, command)]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log, env={**os.environ, **variables})
+        argv = [sys.executable, "-u", "train.py", *map(str, command)]
+        process = subprocess.Popen(argv, cwd=ROOT, stdout=log, stderr=log, env={**os.environ, **variables})
         try:
             yield process
         finally:
@@ -269,7 +270,7 @@ def view(folder, number, seed):
 
 def attack_ports(folder, name, processes, number, seed):
     """Sends bytes to every port of training programs, which must continue. Returns the number of ports, and faults."""
-    rng, held, faults = random.Random(seed), [], []
+    rng, held, faults = random.Random(seed), list[socket.socket](), []
     ports, lines = ports_of(processes), epochs(folder)
     for port in ports:
         for _ in range(number):

@@ -148,7 +148,8 @@ def sweep_held(folder, right, rng):
 
 def and_once_more(folder, right, processes, rng):
     """The faults of sweeps on one folder, one possibly killed, and of the whole sweep afterwards."""
-    seen, faults = {}, []
+    seen: dict = {}
+    faults = []
     killed = rng.choice((None, *processes))
     kill_at = time.monotonic() + rng.uniform(0, 15)
     while any(process.poll() is None for process in processes):

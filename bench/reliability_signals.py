@@ -19,6 +19,7 @@ import time
 import uuid
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import reliability_pairs
 
@@ -53,6 +54,7 @@ class Trials:
         whole, started = folder / f"{name}-whole", time.monotonic()
         process = self._start(whole)
         if name == "view":
+            assert process.stdout is not None
             process.stdout.readline()
             os.killpg(process.pid, signal.SIGKILL)
         _, err = process.communicate()
@@ -70,7 +72,7 @@ class Trials:
             argv = [*argv, "--out", str(out), "--no-curve"]
         elif self.name != "view":
             argv = [*argv, "--out", str(out)]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
         return subprocess.Popen([sys.executable, "-u", "train.py", *argv], cwd=ROOT, env={**os.environ, "MARK": mark}, **pipes)
 
     def _left(self, out: Path) -> object:

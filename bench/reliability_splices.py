@@ -42,7 +42,7 @@ def make(folder):
     folder.mkdir()
     runs = {}
     flags = [*SHAPES, "--checkpoint-every", "2", "--keep-end", "--no-curve"]
-    others = {"seed": ["--seed", "1"], "sampler": ["--sampler", "final"], "length": ["--total-steps", LONGER]}
+    others: dict[str, list] = {"seed": ["--seed", "1"], "sampler": ["--sampler", "final"], "length": ["--total-steps", LONGER]}
     for name, more in {"mine": [], **others}.items():
         whole, stopped = folder / f"{name}_whole", folder / f"{name}_stopped"
         assert call(*flags, "--total-steps", LENGTH, *more, "--out", whole)[0] == 0
@@ -78,13 +78,7 @@ def foreign(theirs):
                         file, run_folder.checkpoints(copy)[0] / file.relative_to(path)
                     ),
                 )
-    yield (
-        "all checkpoints",
-        lambda copy: (
-            shutil.rmtree(copy / "checkpoints"),
-            shutil.copytree(theirs / "checkpoints", copy / "checkpoints"),
-        ),
-    )
+    yield "all checkpoints", lambda copy: put_checkpoints(copy, theirs)
 
 
 def put_line(copy, number, line):
@@ -100,10 +94,15 @@ def put_checkpoint(copy, path):
     shutil.copytree(path, newest.with_name(path.name))
 
 
+def put_checkpoints(copy, theirs):
+    shutil.rmtree(copy / "checkpoints")
+    shutil.copytree(theirs / "checkpoints", copy / "checkpoints")
+
+
 def outcome_of(command, kind, copy, runs):
     """Status of a command on a copy, and a description of its fault, or an empty text."""
     right, before = runs["right"], everything(copy)
-    more = {"eval": ["--episodes", "4"], "plot": ["--formats", "svg"], "report": [], "resume": ["--no-curve"]}[command]
+    more: list = {"eval": ["--episodes", "4"], "plot": ["--formats", "svg"], "report": [], "resume": ["--no-curve"]}[command]
     if command == "resume" and kind == "whole":
         more += ["--total-steps", LONGER]
     status, text = call(command, copy, *more)

@@ -66,7 +66,7 @@ class Case:
         with tempfile.TemporaryDirectory() as folder:
             with jax.profiler.trace(folder, create_perfetto_trace=False):
                 seconds = next(epochs).epoch_seconds
-            events = {True: [], False: []}
+            events: dict[bool, list] = {True: [], False: []}
             for event in device_events(Path(folder)):
                 events["nccl" in event[0].lower()].append(event)
         self.exchanging, self.working = (busy(own) / 1e6 / seconds for own in events.values())

@@ -58,8 +58,8 @@ class Watch:
         self.clock = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
         self._reference()
 
-    def _on_event(self, name, seconds, **_):
-        self.compilations += name == COMPILATION
+    def _on_event(self, event, duration_secs, **_):
+        self.compilations += event == COMPILATION
 
     def write(self, row):
         now = time.perf_counter()
@@ -81,6 +81,8 @@ class Watch:
         self.begin = time.perf_counter()
 
     def _reference(self):
+        assert self.clock.stdin is not None
+        assert self.clock.stdout is not None
         self.clock.stdin.write("\n")
         self.clock.stdin.flush()
         return float(self.clock.stdout.readline())

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +52,7 @@ def looped(model: mujoco.MjModel, actions: int) -> np.ndarray:
     return qpos
 
 
-def played(model: mujoco.MjModel, engine: str, actions: int, **options: bool) -> tuple[str, np.ndarray]:
+def played(model: mujoco.MjModel, engine: str, actions: int, **options: Any) -> tuple[str, np.ndarray]:
     """The engine, or the path of warp, and its coordinates [actions, ENVS, nq]."""
     made = make_engine(engine, model, SUBSTEPS, **options)
     data, ctrl = inputs(model, actions)

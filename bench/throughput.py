@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
+from typing import Any
 
 import jax
 from timing import machine, median_seconds
@@ -25,8 +26,8 @@ from mjx_dher.rollout import rollout
 
 def measure(task: str, engine: str, num_envs: int, path: str, random: bool, repeats: int) -> tuple[str, float, float]:
     """The engine and its path, environment steps per second, and seconds of the first call, which compiles."""
-    hparams, env = HParams(), envs.make(task, engine=engine, **({"path": path} if engine == "warp" else {}))
-    learner = learners.make("ddpg", Config(), env_spec(env))
+    env: Any = envs.make(task, engine=engine, **({"path": path} if engine == "warp" else {}))
+    hparams, learner = HParams(), learners.make("ddpg", Config(), env_spec(env))
     state = learner.init(jax.random.key(0))
 
     @jax.jit

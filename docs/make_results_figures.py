@@ -234,7 +234,7 @@ def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[
 def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
     """Sweeps with `weighted` and `future` by task: with the paper's cycles, the set's longer ones, and earlier ones."""
     today = paper_set.current(the_set)
-    found = {}
+    found: dict[str, Sweeps] = {}
     for task, sweeps in before.items():
         own = {(OWN, name): curves for (sweep, name), curves in the_set[task].items() if sweep == paper_set.OWN[task]}
         found[task] = own | {(TODAY, name): curves for (_, name), curves in today[task].items()} | dict(sweeps)

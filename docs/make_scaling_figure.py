@@ -13,7 +13,7 @@ from paper_analysis import DOCS, NAMES, table, with_tables
 PAGE, DATA, PICTURE = DOCS / "scaling.md", DOCS / "scaling_runs.csv", DOCS / "images" / "scaling.png"
 SCRIPT = "docs/make_scaling_figure.py"
 ONE = "environments, batch, units | GPUs | more work: env steps/s | of one's | the same: env steps/s | of one's"
-Key = tuple[str, str, str, str, str]  # kind, task, environments, batch, units
+Key = tuple[str, ...]  # kind, task, environments, batch, units
 
 
 def read() -> dict[Key, dict[int, tuple[float, int]]]:

@@ -124,7 +124,8 @@ def with_tables(page: str, script: str, blocks: Mapping[str, str]) -> str:
         begin, end = f"<!-- {name}: {script} -->\n", f"<!-- end of {name} -->"
         if page.count(begin) != 1 or page.count(end) != 1:
             raise ValueError(f"the page has not one place for {name}")
-        page = re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, t=begin + text + "\n" + end: t, page, flags=re.DOTALL)
+        new = (begin + text + "\n" + end).replace("\\", r"\\")
+        page = re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", new, page, flags=re.DOTALL)
     return page
 
 

@@ -115,8 +115,9 @@ def _panel(ax, lines: list[Line]) -> None:
         ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if is_main else 1.6, solid_capstyle="butt")
         ax.plot(d.mean, y, "o", color=color, markersize=6 if is_main else 4, label=label_of_dot)
         if claimed and label != before:
-            told = "the paper, one seed" if "the paper, one seed" not in ax.get_legend_handles_labels()[1] else None
-            ax.plot(claimed, [y] * len(claimed), "D-", color="#b3261e", markersize=6, label=told)
+            told = "the paper, one seed"
+            label_of_dot = told if told not in ax.get_legend_handles_labels()[1] else None
+            ax.plot(claimed, [y] * len(claimed), "D-", color="#b3261e", markersize=6, label=label_of_dot)
         before = label
     ax.axvline(0, color="#1c232b", linewidth=0.8)
     ax.set_yticks([place for place, _ in ticks], [label for _, label in ticks])

@@ -303,7 +303,7 @@ def cycle(static, learner, buffer, key):
     learner = learner._replace(observation_norm=observation_norm, goal_norm=add_moments(learner.goal_norm, goals))
 
     def learn(learner, key):
-        return update(static, learner, draw_batch(static, *buffer, key, settings.batch_size)), None
+        return update(static, learner, draw_batch(static, buffer.episodes, buffer.count, key, settings.batch_size)), None
 
     return jax.lax.scan(learn, learner, jax.random.split(learn_key, settings.updates_per_cycle))[0], buffer
 

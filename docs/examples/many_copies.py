@@ -28,9 +28,9 @@ def main(argv=None):
         return jax.lax.scan(step, states, jax.random.split(key, args.steps))
 
     first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), args.num_envs))
-    play = play.lower(first, jax.random.key(1)).compile()  # so that compiling is not measured
+    compiled = play.lower(first, jax.random.key(1)).compile()  # so that compiling is not measured
     started = time.perf_counter()
-    states, rewards = jax.block_until_ready(play(first, jax.random.key(1)))  # rewards [steps, num_envs]
+    states, rewards = jax.block_until_ready(compiled(first, jax.random.key(1)))  # rewards [steps, num_envs]
     seconds = time.perf_counter() - started
     print(f"{rewards.size:,} steps in {seconds:.2f} s: {rewards.size / seconds:,.0f} a second")
     print(f"observations {states.obs['observation'].shape}, mean reward {rewards.mean():.3f}")

@@ -8,7 +8,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from PIL import Image
+from PIL import GifImagePlugin, Image
 
 HERE = Path(__file__).parent
 PICTURES = {"push": 12, "pick_and_place": 30, "block": 20}  # frames
@@ -22,7 +22,7 @@ def main() -> None:
     figure.text(0.05, 0.68, TEXT, fontsize=25, color="#333333", linespacing=1.4)
     for i, (name, frame) in enumerate(PICTURES.items()):
         axis = figure.add_axes((0.05 + 0.31 * i, 0.06, 0.28, 0.54))
-        with Image.open(HERE.parents[1] / "docs" / "images" / f"{name}.gif") as picture:
+        with GifImagePlugin.GifImageFile(HERE.parents[1] / "docs" / "images" / f"{name}.gif") as picture:
             picture.seek(min(frame, picture.n_frames - 1))
             axis.imshow(picture.convert("RGB"), aspect="equal")
         axis.set_axis_off()

@@ -15,10 +15,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_dher import cli, envs
+from mjx_dher import cli
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.envs import fetch
 from mjx_dher.system.files import FolderError
@@ -35,7 +36,7 @@ LIBRARIES = (
 
 def settings(env: fetch.FetchEnv) -> dict[str, object]:
     """The task's numbers as JSON."""
-    state, model, task = env.init_state(np.zeros(7), np.zeros(3)), env.model, env.task
+    state, model, task = env.init_state(jnp.zeros(7), jnp.zeros(3)), env.model, env.task
     return {
         "qpos": np.asarray(state.physics.qpos, float).tolist(),
         "qvel": np.asarray(state.physics.qvel, float).tolist(),
@@ -78,7 +79,7 @@ def main() -> None:
     if shutil.which("npm") is None:
         raise SystemExit("error: npm is missing; the demo page needs node and npm")
     out.mkdir(parents=True, exist_ok=True)
-    env = envs.make("push", engine="native", num_threads=1)
+    env = fetch.Push(engine="native", num_threads=1)
     mujoco.mj_saveLastXML(str(out / "push.xml"), env.load())
     (out / "push.json").write_text(json.dumps(settings(env), indent=1) + "\n")
     if cli.main(["export", "push", "--format", "onnx", "--out", str(out / "push.onnx"), "--overwrite"]):
