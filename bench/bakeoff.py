@@ -37,7 +37,7 @@ from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
 from mjx_dher.system import files, signals
-from mjx_dher.system.caches import prepare
+from mjx_dher.system.machine import prepare
 
 TOY_TASK = "point_mass:PointMass"
 

@@ -31,7 +31,7 @@ import ray
 from ray.cluster_utils import Cluster
 from timing import print_table
 
-from mjx_dher.system.limits import usable_cores
+from mjx_dher.system.machine import usable_cores
 
 ROOT = Path(__file__).resolve().parent.parent
 STORE = 80 << 20  # bytes of a node's object store

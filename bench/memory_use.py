@@ -25,7 +25,7 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
 
     from mjx_dher import envs, learners, samplers, trainer
     from mjx_dher.runs.program.loop import train
-    from mjx_dher.system.memory import format_bytes
+    from mjx_dher.system.machine import format_bytes
 
     spec = presets.preset(preset, env)
     config = dataclasses.replace(

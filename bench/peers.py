@@ -42,7 +42,7 @@ from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import reading, results, run_folder
 from mjx_dher.stats import wilson_interval
 from mjx_dher.system import subprocesses
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 from mjx_dher.tools import transfer
 from mjx_dher.validation import check_count, check_number
 

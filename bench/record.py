@@ -113,7 +113,7 @@ def record(path: Path, repeats: int, anyway: bool) -> dict[str, Any]:
     from timing import cpu
 
     import mjx_dher
-    from mjx_dher.system.limits import usable_cores
+    from mjx_dher.system.machine import usable_cores
 
     read(path)  # raises for an invalid file, before anything is measured
     remarks = remarks_of(os.getloadavg()[0], usable_cores(), git("status", "--porcelain"))

@@ -108,7 +108,7 @@ CONTAINERS: dict[str, tuple[str, dict, tuple]] = {
     "quota": ("0::/\n", {"cpu.max": "100000 100000"}, (1e15, 0, 1)),
 }
 INSIDE = 'mount --bind "$1" /sys/fs/cgroup && mount --bind "$2" /proc/$$/cgroup && exec "${@:3}"'
-ASK = "from mjx_dher.system import limits; print(limits.free_bytes(), limits.usable_cores())"
+ASK = "from mjx_dher.system import machine; print(machine.free_bytes(), machine.usable_cores())"
 
 
 def containers(folder):

@@ -30,7 +30,7 @@ from mjx_dher import envs, presets
 from mjx_dher.parallel import mesh
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program import program as program_lib
-from mjx_dher.system.caches import prepare
+from mjx_dher.system.machine import prepare
 
 
 class Case:

@@ -31,7 +31,7 @@ from timing import print_table
 
 from mjx_dher import cli, envs, rollout
 from mjx_dher.runs.folder import loggers
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 
 BLOCKS = 10
 REFERENCE_EPISODES = 24  # about 0.1 s on two cores
@@ -74,7 +74,7 @@ class Watch:
                 "seconds": now - self.since,
                 "epoch_seconds": now - self.begin,
                 "reference_seconds": self._reference(),
-                "memory": memory.used_bytes(),
+                "memory": machine.used_bytes(),
                 "compilations": self.compilations,
             }
         )

@@ -24,7 +24,7 @@ from mjx_dher import HParams, envs, learners, presets, priorities, samplers, sta
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.program.loop import train
-from mjx_dher.system.caches import keep_compiled_programs
+from mjx_dher.system.machine import keep_compiled_programs
 
 
 def main() -> None:

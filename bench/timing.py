@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from mjx_dher.system.limits import usable_cores
+from mjx_dher.system.machine import usable_cores
 
 
 def median_seconds(run: Callable[[], Any], repeats: int = 7) -> float:

@@ -127,8 +127,7 @@ def measure(folder: Path, run: RunSpec, episodes: int, seed: int, python: Path) 
     """Plays the policy here, on native, and in the original if `python` has it. Returns both summaries."""
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, load_plain
-    from mjx_dher.system.caches import keep_compiled_programs
-    from mjx_dher.system.limits import usable_cores
+    from mjx_dher.system.machine import keep_compiled_programs, usable_cores
     from mjx_dher.tools import transfer
 
     policy = load_plain(folder, "the package")

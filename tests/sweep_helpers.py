@@ -11,7 +11,7 @@ from mjx_dher import HParams, Options, RunSpec
 from mjx_dher.runs import driver
 from mjx_dher.runs.program import program
 from mjx_dher.sweeps import grid, sweep, tables
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 from probes import PointMass
 
 # An epoch of 240 steps.
@@ -30,7 +30,7 @@ def compile_once():
         choices = str(program.choices_of(specs))
         lanes = min(len(specs), max_lanes or len(specs))
         lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))
-        key = (type(env), specs[0].program, choices, lanes, final_episodes, memory.available_bytes, devices)
+        key = (type(env), specs[0].program, choices, lanes, final_episodes, machine.available_bytes, devices)
         if key not in _compiled:
             lines = []
             _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices), lines)

@@ -15,7 +15,7 @@ from flax import struct
 
 from mjx_dher.contract import env_spec
 from mjx_dher.envs.brax import from_brax
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 from mjx_dher.testing import check_env
 from mjx_dher.tools import transfer
 

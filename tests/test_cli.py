@@ -222,7 +222,7 @@ def test_help_names_every_option(capsys):
 @pytest.mark.parametrize("chosen", [True, False])
 def test_compiled_programs_are_kept_where_the_user_says_or_in_the_cache_folder(tmp_path, chosen):
     code = (
-        "from mjx_dher.system import caches; caches.keep_compiled_programs(); import jax;"
+        "from mjx_dher.system import machine; machine.keep_compiled_programs(); import jax;"
         "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0); jax.jit(lambda x: x + 1)(1.0)"
     )
     clean = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}

@@ -14,7 +14,7 @@ from conftest import ROOT, names
 import mjx_dher
 from mjx_dher import cli, presets
 from mjx_dher.envs import engines
-from mjx_dher.system.limits import usable_cores
+from mjx_dher.system.machine import usable_cores
 from mjx_dher.tools import doctor, render
 
 ON_CPU = jax.default_backend() == "cpu"

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from mjx_dher import spec
-from mjx_dher.system import caches, limits
+from mjx_dher.system import machine
 from mjx_dher.tools import doctor, transfer
 
 GB = 10**9
@@ -77,28 +77,28 @@ def test_memory_and_cores_are_those_of_the_container(name, tmp_path, monkeypatch
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(f"{text}\n")
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
-    assert (limits.free_bytes(tmp_path), limits.usable_cores(tmp_path)) == (free, cores)
+    assert (machine.free_bytes(tmp_path), machine.usable_cores(tmp_path)) == (free, cores)
 
 
 def test_nothing_is_known_without_these_files(tmp_path, monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: None)
-    assert (limits.free_bytes(tmp_path), limits.usable_cores(tmp_path)) == (None, 1)
+    assert (machine.free_bytes(tmp_path), machine.usable_cores(tmp_path)) == (None, 1)
 
 
 @pytest.mark.parametrize(("quotas", "threads"), [([0.5], "1"), ([], None)])
 def test_xla_keeps_to_a_quota(quotas, threads, monkeypatch):
     """It starts a pool of as many threads as it takes the machine to have cores, unless NPROC says otherwise."""
-    monkeypatch.setattr(limits, "_quotas", lambda root: iter(quotas))
+    monkeypatch.setattr(machine, "_quotas", lambda root: iter(quotas))
     monkeypatch.setenv("NPROC", "")
     monkeypatch.delenv("NPROC")
-    caches.check_platform()
+    machine.check_platform()
     assert os.environ.get("NPROC") == threads
 
 
 def test_training_without_compilation_is_refused():
     with jax.disable_jit(), pytest.raises(ValueError, match="JAX_DISABLE_JIT"):
-        caches.prepare()
+        machine.prepare()
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def no_home(monkeypatch):
 def test_without_a_home_folder_programs_are_not_kept(no_home, monkeypatch, capsys):
     config = SimpleNamespace(jax_compilation_cache_dir=None, update=None)
     monkeypatch.setattr(jax, "config", config)
-    caches.keep_compiled_programs()
+    machine.keep_compiled_programs()
     assert config.jax_compilation_cache_dir is None
     assert capsys.readouterr().err.count("\n") == 1
 

@@ -7,14 +7,14 @@ import jax
 import pytest
 from conftest import ROOT
 
-from mjx_dher.system import limits, memory
+from mjx_dher.system import machine
 
-pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="not glibc")
+pytestmark = pytest.mark.skipif(machine._glibc() is None, reason="not glibc")
 
 # Blocks that are freed while a smaller one on top of each stays: a hole each, which the heap cannot give back by itself.
 HOLES = """
 import ctypes
-from mjx_dher.system import limits, memory
+from mjx_dher.system import machine
 c = ctypes.CDLL("libc.so.6")
 c.malloc.restype, c.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
 {before}
@@ -26,11 +26,11 @@ def make_holes(number, size):
         c.malloc(60_000)
     for block in blocks:
         c.free(block)
-start = memory.used_bytes()
+start = machine.used_bytes()
 make_holes(2, {size})
 make_holes(100_000_000 // {size}, {size})
 {after}
-print((memory.used_bytes() - start) / 1e6)
+print((machine.used_bytes() - start) / 1e6)
 """
 
 
@@ -42,12 +42,12 @@ def kept(size, before="", after=""):
 
 def test_blocks_of_some_megabytes_go_back_to_the_system_when_they_are_freed():
     assert kept(5_000_000) > 80
-    assert kept(5_000_000, before="memory.keep_heap_small()") < 10
+    assert kept(5_000_000, before="machine.keep_heap_small()") < 10
 
 
 THREADS = """
 import ctypes, threading
-from mjx_dher.system import limits, memory
+from mjx_dher.system import machine
 c = ctypes.CDLL("libc.so.6")
 {before}
 together = threading.Barrier({threads})
@@ -66,29 +66,29 @@ c.fflush(stdout)
 
 def heaps(before=""):
     """How many heaps threads have that allocate at the same time."""
-    code = THREADS.format(before=before, threads=4 * limits.usable_cores())
+    code = THREADS.format(before=before, threads=4 * machine.usable_cores())
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT).stdout
     return found.count("<heap nr=")
 
 
 def test_there_are_two_heaps_a_core():
     """Not one for all: threads of the compiler would wait for one another."""
-    cores = max(2, limits.usable_cores())
+    cores = max(2, machine.usable_cores())
     assert heaps() > 2 * cores
-    assert heaps(before="memory.keep_heap_small()") == 2 * cores
+    assert heaps(before="machine.keep_heap_small()") == 2 * cores
 
 
 def test_release_gives_back_what_was_freed():
     assert kept(100_000) > 80
-    assert kept(100_000, after="memory.release()") < 20
+    assert kept(100_000, after="machine.release()") < 20
 
 
 def test_each_process_asks_a_device_of_its_own(monkeypatch):
     """Under several processes the first of all devices is the first process's, and tells nobody else its memory."""
     monkeypatch.setattr(jax, "local_devices", lambda: [Gpu()])
     monkeypatch.setattr(jax, "devices", lambda: [Gpu(stats=None), Gpu()])
-    assert memory.available_bytes() == 70
-    assert memory.used_bytes() == 30
+    assert machine.available_bytes() == 70
+    assert machine.used_bytes() == 30
 
 
 class Gpu:

@@ -14,7 +14,7 @@ from mjx_dher import HParams, RunSpec, trainer
 from mjx_dher.context import Context
 from mjx_dher.runs.folder import loggers, run_folder
 from mjx_dher.runs.program import loop
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass
 
@@ -133,7 +133,7 @@ def test_what_was_relabelled_by_hand():
 
 
 def test_memory_in_use_is_known_and_plausible():
-    assert 10**7 < memory.used_bytes() < 10**12
+    assert 10**7 < machine.used_bytes() < 10**12
 
 
 def test_every_metric_is_documented():

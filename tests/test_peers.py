@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import ROOT, refuses
 
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 from mjx_dher.tools import transfer
 
 WORKER = """

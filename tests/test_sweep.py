@@ -18,7 +18,7 @@ from mjx_dher.runs.folder import checkpoint
 from mjx_dher.runs.folder.fingerprint import trial_name
 from mjx_dher.runs.program import loop, program
 from mjx_dher.sweeps import grid, tables
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError
 from probes import PointMass, held
 
@@ -305,7 +305,7 @@ def test_a_metric_with_a_setting_s_name_has_its_own_column(tmp_path):
 def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, monkeypatch):
     """All four rings would fit; four whole programs do not."""
     trials = make_grid(("future",), seeds=range(4))
-    monkeypatch.setattr(memory, "available_bytes", lambda: 250_000)
+    monkeypatch.setattr(machine, "available_bytes", lambda: 250_000)
     told, sizes = [], []
     run(tmp_path, trials, lanes=4, report=told.append, on_epoch=lambda specs, _: sizes.append(len(specs)))
     assert "compiling for 4 parallel runs of 4" in told[0]

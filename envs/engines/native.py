@@ -18,7 +18,7 @@ from mujoco.batch import Batch
 from mjx_dher.envs.engines import Controls, Physics, check_shapes, host_call, variation_of
 from mjx_dher.envs.engines.batches import EXACT, FULL, UNTIMED, Choice, Rows, residue
 from mjx_dher.envs.engines.fields import LATE, STATE, Data, Layout, derived_fields
-from mjx_dher.system.limits import usable_cores
+from mjx_dher.system.machine import usable_cores
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
 

@@ -17,7 +17,7 @@ from mjx_dher.runs.folder.run_folder import Claims
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
-from mjx_dher.system.caches import prepare
+from mjx_dher.system.machine import prepare
 
 SECONDS_WITHOUT_NEWS = 8.0  # after a signal; then the cluster is gone
 

@@ -18,7 +18,7 @@ from mjx_dher.cli.output import PlainConsole
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
-from mjx_dher.system.caches import check_platform, keep_compiled_programs
+from mjx_dher.system.machine import check_platform, keep_compiled_programs
 from mjx_dher.validation import check_count, check_number
 
 
@@ -223,7 +223,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, load_plain
     from mjx_dher.stats import difference_interval
-    from mjx_dher.system.limits import usable_cores
+    from mjx_dher.system.machine import usable_cores
     from mjx_dher.tools import transfer
 
     policy = load_plain(folder, "transfer")

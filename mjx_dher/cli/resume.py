@@ -16,8 +16,8 @@ from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files
-from mjx_dher.system.caches import prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.system.machine import prepare
 from mjx_dher.validation import check_devices
 
 

@@ -98,16 +98,16 @@ def memory_lines(env: Any, specs: Sequence[RunSpec], lanes: int | None, devices:
     import jax
 
     from mjx_dher.runs.program import program
-    from mjx_dher.system import memory
+    from mjx_dher.system import machine
 
     train = program.check_runs(env, specs, lanes, devices)
     leaves = jax.tree.leaves(jax.eval_shape(train.learner.init, jax.random.key(0)))
     learner = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
-    available = memory.available_bytes()
-    free = "unknown" if available is None else memory.format_bytes(available)
+    available = machine.available_bytes()
+    free = "unknown" if available is None else machine.format_bytes(available)
     each = (" a run" if len(specs) > 1 else "") + (" on each device" if train.axis_name else "")
     return [
-        f"memory{each}: replay ring {memory.format_bytes(train.replay_bytes)}, learner {memory.format_bytes(learner)};"
+        f"memory{each}: replay ring {machine.format_bytes(train.replay_bytes)}, learner {machine.format_bytes(learner)};"
         f" the compiled program needs more; {free} is free",
         f"physics {run_folder.engine_name(env)}, learner on {jax.devices()[0].device_kind}",
     ]

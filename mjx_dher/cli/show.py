@@ -18,7 +18,7 @@ from mjx_dher.cli.common import make_env, print_table
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import bundled
 from mjx_dher.spec import RunSpec
-from mjx_dher.system.caches import prepare
+from mjx_dher.system.machine import prepare
 from mjx_dher.validation import check_number
 
 ENGINES = {

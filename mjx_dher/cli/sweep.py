@@ -23,8 +23,8 @@ from mjx_dher.runs.options import Options
 from mjx_dher.spec import Engine, RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
-from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.system.machine import check_platform, prepare
 from mjx_dher.validation import check_count, check_devices, check_number
 
 GRID = ("env", "sampler", "weight_kernel", "weight_normalization", "metric", "priority", "generator", "learner", "networks")

@@ -20,8 +20,8 @@ from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.options import Options
 from mjx_dher.spec import RunSpec, to_texts
 from mjx_dher.system import files, signals
-from mjx_dher.system.caches import check_platform, prepare
 from mjx_dher.system.files import FolderError
+from mjx_dher.system.machine import check_platform, prepare
 from mjx_dher.validation import check_all, check_devices
 
 

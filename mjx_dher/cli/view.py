@@ -20,7 +20,7 @@ from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments
 from mjx_dher.system import subprocesses
-from mjx_dher.system.caches import keep_compiled_programs
+from mjx_dher.system.machine import keep_compiled_programs
 
 PARENT = "MJX_DHER_VIEWER_OF"  # variable with the id of the process that started a viewer and with which it ends
 

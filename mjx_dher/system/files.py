@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_dher.system import memory, signals
+from mjx_dher.system import machine, signals
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
@@ -247,7 +247,7 @@ def lack_of_space(folder: Path, sizes: Sequence[int]) -> str | None:
     block = min(disk.f_frsize or 1, _LARGEST_BLOCK)
     needed, free = sum(-(-size // block) * block for size in sizes), disk.f_bavail * disk.f_frsize
     if needed > free and disk.f_blocks:  # otherwise the file system's size is unknown or unlimited
-        return f"{memory.format_bytes(needed)}, but only {memory.format_bytes(free)} of the disk are free"
+        return f"{machine.format_bytes(needed)}, but only {machine.format_bytes(free)} of the disk are free"
     if disk.f_files and len(sizes) > disk.f_favail:
         return f"{len(sizes)} files, but the disk can have only {disk.f_favail} more"
     return None

@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from typing import Any
 
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 
 with contextlib.redirect_stdout(io.StringIO()):
     import warp as wp

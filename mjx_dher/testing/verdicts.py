@@ -19,7 +19,7 @@ from mjx_dher import components
 from mjx_dher.config import Config
 from mjx_dher.contract import env_spec
 from mjx_dher.spec import RunSpec, custom_components
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 from mjx_dher.system.subprocesses import PACKAGE
 from mjx_dher.testing.components import check_components
 from mjx_dher.types import Env

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher import __version__, presets, spec
-from mjx_dher.system import caches, limits, memory, subprocesses
+from mjx_dher.system import machine, subprocesses
 from mjx_dher.tools import render, transfer
 
 ENGINES = tuple(name for name in spec.ENGINES if name != "auto")
@@ -36,7 +36,7 @@ def examine(seconds: float) -> Report:
     """
     requested = os.environ.get("MUJOCO_GL", "")
     backends = dict.fromkeys([*(render.GL if sys.platform == "linux" else [""]), *([requested] if requested else [])])
-    with ThreadPoolExecutor(min(4, limits.usable_cores())) as pool:
+    with ThreadPoolExecutor(min(4, machine.usable_cores())) as pool:
         asked = {topic: pool.submit(ask, topic, seconds) for topic in ("machine", *ENGINES)}
         drawn = {name or "system": pool.submit(render.try_gl, name, seconds) for name in backends}
     failures = {name: future.result() for name, future in drawn.items()}
@@ -123,11 +123,11 @@ def _examine_machine() -> Iterator[tuple[str, str]]:
 
     def devices() -> str:
         sizes = {device: (device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()}
-        return "; ".join(f"{d.device_kind}{f', {memory.format_bytes(size)}' if size else ''}" for d, size in sizes.items())
+        return "; ".join(f"{d.device_kind}{f', {machine.format_bytes(size)}' if size else ''}" for d, size in sizes.items())
 
-    yield "cores", str(limits.usable_cores())
+    yield "cores", str(machine.usable_cores())
     yield "devices", _guarded(devices)
-    yield "memory", _guarded(lambda: memory.format_bytes(memory.available_bytes() or 0))
+    yield "memory", _guarded(lambda: machine.format_bytes(machine.available_bytes() or 0))
     yield "engine", _guarded(lambda: engines.resolve_engine("auto"))
     yield "preset", _guarded(presets.machine_preset)
 
@@ -177,9 +177,9 @@ def one_line(error: BaseException) -> str:
 
 
 def _cache() -> str:
-    folder = caches.user_cache()
+    folder = machine.user_cache()
     files = [path for path in folder.rglob("*") if path.is_file() and not path.is_symlink()]
-    size = memory.format_bytes(sum(path.stat().st_size for path in files))
+    size = machine.format_bytes(sum(path.stat().st_size for path in files))
     return f"{_brief(folder)}, {size if folder.is_dir() else 'not there'}"
 
 

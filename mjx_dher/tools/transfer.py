@@ -22,7 +22,7 @@ import numpy as np
 from mjx_dher.policy.load import load_policy
 from mjx_dher.runs.folder.reading import read_spec
 from mjx_dher.system import files, subprocesses
-from mjx_dher.system.caches import user_cache
+from mjx_dher.system.machine import user_cache
 
 ORIGINALS = {
     "push": "FetchPush-v4",

@@ -11,7 +11,7 @@ from typing import Any
 from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import METRICS_FILE
-from mjx_dher.system import files, memory
+from mjx_dher.system import files, machine
 from mjx_dher.system.files import FolderError
 
 # The first columns of metrics.csv; the other metrics of an epoch follow.
@@ -180,5 +180,5 @@ def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
         **metrics,
         "steps_per_second": steps / progress.epoch_seconds,
         "updates_per_second": updates / progress.epoch_seconds,
-        "memory_bytes": memory.used_bytes() or math.nan,
+        "memory_bytes": machine.used_bytes() or math.nan,
     }

@@ -15,7 +15,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.contract import check_steps
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.parallel.mesh import ONE, Layout
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 from mjx_dher.trainer import Train, TrainState, as_arrays, is_finite, make_train
 from mjx_dher.types import Array, Env, Metrics, PRNGKey
 
@@ -155,7 +155,7 @@ def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int
     if sizes is not None:
         held = sizes.argument_size_in_bytes + sizes.output_size_in_bytes - sizes.alias_size_in_bytes
         nbytes = held + sizes.temp_size_in_bytes
-    memory.release()
+    machine.release()
 
     def start(key: PRNGKey, hparams: HParams) -> TrainState:
         return compiled_init(*(mesh.to_host(key, as_arrays(hparams)) if layout.devices else (key, as_arrays(hparams))))
@@ -204,19 +204,19 @@ def check_memory(program: Train, config: Config, sharers: int = 1) -> None:
 
     The message has the needed and the free memory and, for the ring, a replay_size that fits.
     """
-    available = memory.available_bytes()
+    available = machine.available_bytes()
     if available is None:
         return
-    free = f"but only {memory.format_bytes(available)} of memory is free"
+    free = f"but only {machine.format_bytes(available)} of memory is free"
     ring = sharers * program.replay_bytes
     if ring > available:
         fitting = int(config.replay_size * available / ring)
-        needed = memory.format_bytes(ring)
+        needed = machine.format_bytes(ring)
         raise ValueError(f"replay_size {config.replay_size} needs {needed}, {free}; at most {fitting} transitions fit")
     shapes = jax.tree.leaves(jax.eval_shape(program.learner.init, jax.random.key(0)))
     nbytes = sharers * sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
     if nbytes > available:
-        raise ValueError(f"hidden_sizes {config.hidden_sizes}: the learner needs {memory.format_bytes(nbytes)}, {free}")
+        raise ValueError(f"hidden_sizes {config.hidden_sizes}: the learner needs {machine.format_bytes(nbytes)}, {free}")
 
 
 def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
@@ -224,11 +224,11 @@ def check_program(compiled: Compiled, config: Config, sharers: int = 1) -> None:
 
     The message has the needed and the free memory and the settings that decide it.
     """
-    available = memory.available_bytes()
+    available = machine.available_bytes()
     nbytes = sharers * compiled.nbytes
     if available is not None and nbytes > available:
         settings = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes")
         raise ValueError(
-            f"an epoch needs {memory.format_bytes(nbytes)}, but only {memory.format_bytes(available)} of memory"
+            f"an epoch needs {machine.format_bytes(nbytes)}, but only {machine.format_bytes(available)} of memory"
             f" is free; it depends on {', '.join(f'{name} {getattr(config, name)}' for name in settings)}"
         )

@@ -26,7 +26,7 @@ from mjx_dher.runs.folder import run_folder
 from mjx_dher.runs.program import loop
 from mjx_dher.runs.program.loop import Compiled
 from mjx_dher.spec import RunSpec
-from mjx_dher.system import memory
+from mjx_dher.system import machine
 from mjx_dher.trainer import Train, TrainState
 from mjx_dher.types import Env, EnvSpec, PRNGKey
 
@@ -128,7 +128,7 @@ def compile_runs(
     """
     spec, choices = specs[0], choices_of(specs)
     train, layout, lanes = _plan(env, specs, max_lanes, devices)  # lanes per device, like the bytes
-    available = memory.available_bytes()
+    available = machine.available_bytes()
     if available is not None:  # the rings must fit before anything is compiled
         available //= layout.sharers
         lanes = max(1, min(lanes, int(available / train.replay_bytes)))
@@ -140,7 +140,7 @@ def compile_runs(
         started = time.perf_counter()
         compiled = loop.compile_program(train, keys, hparams, config_lib.num_updates(spec.config, env.episode_length), layout)
         check_steps(env)
-        seconds, needed = time.perf_counter() - started, memory.format_bytes(compiled.nbytes)
+        seconds, needed = time.perf_counter() - started, machine.format_bytes(compiled.nbytes)
         report(f"{spec.env}: compiled in {seconds:.1f} s; {needed} of memory")
         if available is None or compiled.nbytes <= available or lanes == 1:
             loop.check_program(compiled, spec.config, layout.sharers)
@@ -159,7 +159,7 @@ def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout:
     physics = run_folder.engine_name(env) + (f" ({note})" if note else "")
     return (
         f"{'one run' if len(specs) == 1 else together}; physics {physics}, learner on"
-        f" {number}{jax.devices()[0].device_kind}, replay ring {memory.format_bytes(train.replay_bytes)}"
+        f" {number}{jax.devices()[0].device_kind}, replay ring {machine.format_bytes(train.replay_bytes)}"
     )
 
 
