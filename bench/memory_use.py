@@ -24,7 +24,7 @@ def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
     import jax
 
     from mjx_dher import envs, learners, samplers, trainer
-    from mjx_dher.runs.program.loop import train
+    from mjx_dher.runs.loop import train
     from mjx_dher.system.machine import format_bytes
 
     spec = presets.preset(preset, env)

@@ -36,8 +36,8 @@ import reliability_splices
 from timing import print_table
 
 from mjx_dher import Config, HParams, envs, make_train
+from mjx_dher.runs import loop
 from mjx_dher.runs.folder import checkpoint, restoring, run_folder
-from mjx_dher.runs.program import loop
 
 ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.

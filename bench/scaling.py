@@ -28,8 +28,8 @@ from timing import print_table
 from mjx_dher import config as config_lib
 from mjx_dher import envs, presets
 from mjx_dher.parallel import mesh
-from mjx_dher.runs.program import loop
-from mjx_dher.runs.program import program as program_lib
+from mjx_dher.runs import loop
+from mjx_dher.runs import program as program_lib
 from mjx_dher.system.machine import prepare
 
 

@@ -23,7 +23,7 @@ from timing import print_table
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
-from mjx_dher.runs.program.loop import train
+from mjx_dher.runs.loop import train
 from mjx_dher.system.machine import keep_compiled_programs
 
 

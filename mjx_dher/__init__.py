@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # for type checkers; `_HOME` says the same when the program r
     from mjx_dher.policy.load import load_policy as load_policy
     from mjx_dher.presets import preset as preset
     from mjx_dher.runs.driver import train_runs as train_runs
+    from mjx_dher.runs.loop import train as train
     from mjx_dher.runs.options import Options as Options
-    from mjx_dher.runs.program.loop import train as train
     from mjx_dher.spec import RunSpec as RunSpec
     from mjx_dher.trainer import TrainState as TrainState
     from mjx_dher.trainer import make_train as make_train
@@ -48,7 +48,7 @@ _HOME = {
     "load_policy": "policy.load:load_policy",
     "make_train": "trainer:make_train",
     "preset": "presets:preset",
-    "train": "runs.program.loop:train",
+    "train": "runs.loop:train",
     "train_runs": "runs.driver:train_runs",
 }
 __all__ = [*_HOME]  # noqa: PLE0604

@@ -14,9 +14,8 @@ from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trai
 from mjx_dher.contract import env_spec
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel import split as split_lib
-from mjx_dher.runs import driver
+from mjx_dher.runs import driver, loop
 from mjx_dher.runs.folder import results
-from mjx_dher.runs.program import loop
 from mjx_dher.types import Batch
 from probes import Explodes, PointMass, spec_of
 

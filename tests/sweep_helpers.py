@@ -8,8 +8,7 @@ import pytest
 from configs import SMALL
 
 from mjx_dher import HParams, Options, RunSpec
-from mjx_dher.runs import driver
-from mjx_dher.runs.program import program
+from mjx_dher.runs import driver, program
 from mjx_dher.sweeps import grid, sweep, tables
 from mjx_dher.system import machine
 from probes import PointMass

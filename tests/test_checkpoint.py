@@ -21,9 +21,9 @@ from conftest import ROOT, refuses
 
 from mjx_dher import HParams, RunSpec, cli, trainer
 from mjx_dher.learners import ddpg
+from mjx_dher.runs import loop
 from mjx_dher.runs.folder import checkpoint, fingerprint, reading, restoring, run_folder
 from mjx_dher.runs.folder.checkpoint import CheckpointError
-from mjx_dher.runs.program import loop
 from mjx_dher.system import files
 from mjx_dher.system.files import write_json
 from probes import PointMass

@@ -114,13 +114,13 @@ def test_a_trial_that_ended_since_it_was_listed_is_left_alone(tmp_path, monkeypa
     """Another program trains all four while this one compiles, and has one of them again."""
     trials = make_grid(static=LONGER)
     run(tmp_path / "whole", trials)
-    compile_runs = mjx_dher.runs.program.program.compile_runs
+    compile_runs = mjx_dher.runs.program.compile_runs
 
     def meanwhile(*args):
         shutil.copytree(tmp_path / "whole", tmp_path / "sweep", dirs_exist_ok=True)
         return compile_runs(*args)
 
-    monkeypatch.setattr(mjx_dher.runs.program.program, "compile_runs", meanwhile)
+    monkeypatch.setattr(mjx_dher.runs.program, "compile_runs", meanwhile)
     assert run(tmp_path / "sweep", trials, lanes=2) == []
     before = {path: os.stat(path).st_mtime_ns for path in (tmp_path / "whole").rglob("*.*")}
     assert all(

@@ -18,7 +18,7 @@ from mjx_dher import Options, RunSpec, cli, config, presets
 from mjx_dher.cli import common
 from mjx_dher.cli import sweep as cli_sweep
 from mjx_dher.cli import train as cli_train
-from mjx_dher.runs.program.loop import Progress
+from mjx_dher.runs.loop import Progress
 
 TINY = """
     --num-envs 2 --cycles-per-epoch 1 --updates-per-cycle 2 --target-period 1 --batch-size 16 --total-steps 200

@@ -16,7 +16,7 @@ from mjx_dher import Config, HParams, RunSpec, learners, make_train, networks, t
 from mjx_dher.contract import env_spec
 from mjx_dher.policy import learner_policy
 from mjx_dher.policy.load import check_fits
-from mjx_dher.runs.program.loop import state_template
+from mjx_dher.runs.loop import state_template
 from mjx_dher.types import Batch
 from point_mass import PointMass
 from probes import spec_of

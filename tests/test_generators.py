@@ -16,7 +16,7 @@ from mjx_dher.contrib import generators, goals, metrics
 from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.program.loop import state_template
+from mjx_dher.runs.loop import state_template
 from mjx_dher.samplers import LearnedMetric
 from mjx_dher.testing import ComponentError
 from point_mass import PointMass
@@ -272,7 +272,7 @@ def test_lanes_learn_as_runs_alone_do():
             state, _ = program.epoch(state)
         return state.learner.params
 
-    from mjx_dher.runs.program.program import Lane
+    from mjx_dher.runs.program import Lane
 
     names = list(dict.fromkeys(name for name, _ in kinds)), ["reset", "hgg"]
     together = make_train(

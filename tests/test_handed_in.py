@@ -16,7 +16,7 @@ from mjx_dher.context import Context
 from mjx_dher.learners import RESERVED, ddpg
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import loggers
-from mjx_dher.runs.program.loop import Progress
+from mjx_dher.runs.loop import Progress
 from mjx_dher.samplers import Sampler, future
 from point_mass import PointMass
 from probes import Least, Walk

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from mjx_dher import RunSpec, cli, lookup
 from mjx_dher.cli import FOREIGN_FLAGS, common
-from mjx_dher.runs.program.loop import Progress
+from mjx_dher.runs.loop import Progress
 
 
 def test_a_polyak_that_is_likely_a_tau_is_explained():

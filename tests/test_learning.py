@@ -7,7 +7,7 @@ import pytest
 from mjx_dher import envs, learners, presets, samplers
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
-from mjx_dher.runs.program.loop import train
+from mjx_dher.runs.loop import train
 
 
 @pytest.mark.slow  # tests/test_trainer.py trains the point mass

@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from mjx_dher import Config, HParams, make_train
-from mjx_dher.runs.program import loop
+from mjx_dher.runs import loop
 from probes import PointMass
 
 

@@ -12,8 +12,8 @@ from conftest import refuses
 
 from mjx_dher import HParams, RunSpec, trainer
 from mjx_dher.context import Context
+from mjx_dher.runs import loop
 from mjx_dher.runs.folder import loggers, run_folder
-from mjx_dher.runs.program import loop
 from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass

@@ -14,8 +14,8 @@ from mjx_dher import envs, make_train, priorities, replay, samplers
 from mjx_dher.components import COMPONENTS
 from mjx_dher.contrib import generators
 from mjx_dher.learners import common
-from mjx_dher.runs.program.loop import state_template
-from mjx_dher.runs.program.program import Lane
+from mjx_dher.runs.loop import state_template
+from mjx_dher.runs.program import Lane
 from point_mass import PointMass
 from probes import Explodes
 

@@ -14,7 +14,7 @@ from mjx_dher import HParams, make_train, priorities, replay, testing
 from mjx_dher.context import Context
 from mjx_dher.contrib import priorities as contributed
 from mjx_dher.priorities import Priority
-from mjx_dher.runs.program.program import Lane
+from mjx_dher.runs.program import Lane
 from point_mass import PointMass
 
 ENV = PointMass()

@@ -13,10 +13,9 @@ from sweep_helpers import CONFIG, DEFAULT, LONGER, TIMES, compile_once, cut_shor
 
 import mjx_dher
 from mjx_dher import HParams
-from mjx_dher.runs import driver
+from mjx_dher.runs import driver, loop, program
 from mjx_dher.runs.folder import checkpoint
 from mjx_dher.runs.folder.fingerprint import trial_name
-from mjx_dher.runs.program import loop, program
 from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError

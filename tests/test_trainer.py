@@ -13,7 +13,7 @@ from conftest import refuses
 from mjx_dher import HParams, learners, make_train, relabel, replay, samplers, trainer
 from mjx_dher.contract import env_spec
 from mjx_dher.rollout import rollout
-from mjx_dher.runs.program import loop
+from mjx_dher.runs import loop
 from mjx_dher.system import machine
 from probes import Explodes, PointMass, Walk
 

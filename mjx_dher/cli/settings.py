@@ -97,7 +97,7 @@ def memory_lines(env: Any, specs: Sequence[RunSpec], lanes: int | None, devices:
     """Lines about the memory of runs of one program, without compiling it. Raises ValueError if they cannot be trained."""
     import jax
 
-    from mjx_dher.runs.program import program
+    from mjx_dher.runs import program
     from mjx_dher.system import machine
 
     train = program.check_runs(env, specs, lanes, devices)

@@ -21,7 +21,7 @@ import numpy as np
 from mjx_dher.fleet import chunks
 from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.runs.folder import results, run_folder
-from mjx_dher.runs.program.loop import Progress
+from mjx_dher.runs.loop import Progress
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid, sweep
 from mjx_dher.system import files

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mjx_dher.config import Config
-from mjx_dher.runs.program.loop import Progress
+from mjx_dher.runs.loop import Progress
 from mjx_dher.spec import RunSpec
 
 

@@ -18,16 +18,15 @@ from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.contract import robot_interface
 from mjx_dher.parallel import mesh, processes
-from mjx_dher.runs import diagnostics
+from mjx_dher.runs import diagnostics, loop
+from mjx_dher.runs import program as program_lib
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
 from mjx_dher.runs.folder.loggers import Sink
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED, Claims, Run, named
+from mjx_dher.runs.loop import Progress
 from mjx_dher.runs.options import Options
-from mjx_dher.runs.program import loop
-from mjx_dher.runs.program import program as program_lib
-from mjx_dher.runs.program.loop import Progress
-from mjx_dher.runs.program.program import Program
+from mjx_dher.runs.program import Program
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import files, signals
 from mjx_dher.types import Env

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mjx_dher.parallel import processes
+from mjx_dher.runs import program
 from mjx_dher.runs.driver import Result, train_runs
-from mjx_dher.runs.program import program
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.types import Env

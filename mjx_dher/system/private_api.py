@@ -5,7 +5,7 @@ function, tests/test_private_api.py fails and names it. Libraries are imported o
 
 Two uses of internals stay where they are, because they are not Python names:
 
-- `runs.program.loop.compile_lowered` disables XLA's pass triton-softmax-rewriter (jaxlib 0.10.2; no upstream issue known).
+- `runs.loop.compile_lowered` disables XLA's pass triton-softmax-rewriter (jaxlib 0.10.2; no upstream issue known).
 - envs/engines/fused/threads.py uses `wp::array_t` and `dynamic_smem_base` of Warp's C++ code (warp-lang 1.18.0; no upstream
   issue known).
 """

@@ -11,8 +11,8 @@ import numpy as np
 
 from mjx_dher.components import is_hand
 from mjx_dher.policy import bundled, load
+from mjx_dher.runs import loop, program
 from mjx_dher.runs.folder import reading, restoring, results, run_folder
-from mjx_dher.runs.program import loop, program
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
 from mjx_dher.system.files import FolderError
 from mjx_dher.types import Env

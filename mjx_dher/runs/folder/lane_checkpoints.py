@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from mjx_dher.parallel import processes
 from mjx_dher.runs.folder import checkpoint, fingerprint, loggers, run_folder
-from mjx_dher.runs.program.loop import Progress, Start
+from mjx_dher.runs.loop import Progress, Start
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 from mjx_dher.trainer import TrainState

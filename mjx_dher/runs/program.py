@@ -22,9 +22,9 @@ from mjx_dher.learners import Learner
 from mjx_dher.parallel import mesh, processes, split
 from mjx_dher.parallel.mesh import ONE, Layout
 from mjx_dher.rollout import Outcome
+from mjx_dher.runs import loop
 from mjx_dher.runs.folder import run_folder
-from mjx_dher.runs.program import loop
-from mjx_dher.runs.program.loop import Compiled
+from mjx_dher.runs.loop import Compiled
 from mjx_dher.spec import RunSpec
 from mjx_dher.system import machine
 from mjx_dher.trainer import Train, TrainState

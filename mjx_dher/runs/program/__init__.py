@@ -1,1 +1,0 @@
-"""A compiled training program, and the loop that calls it."""
