@@ -33,8 +33,7 @@ from mjx_dher.cli import sentence
 from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.runs.folder import fingerprint, reading, results
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec, validate
+from mjx_dher.spec import Options, RunSpec, validate
 from mjx_dher.sweeps import comparison, grid, sweep, tables
 from mjx_dher.system import files, signals
 from mjx_dher.system.machine import prepare

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # for type checkers; `_HOME` says the same when the program r
     from mjx_dher.presets import preset as preset
     from mjx_dher.runs.driver import train_runs as train_runs
     from mjx_dher.runs.loop import train as train
-    from mjx_dher.runs.options import Options as Options
+    from mjx_dher.spec import Options as Options
     from mjx_dher.spec import RunSpec as RunSpec
     from mjx_dher.trainer import TrainState as TrainState
     from mjx_dher.trainer import make_train as make_train
@@ -40,7 +40,7 @@ _HOME = {
     **{name: name for name in _MODULES.split()},
     "Config": "config:Config",
     "HParams": "config:HParams",
-    "Options": "runs.options:Options",
+    "Options": "spec:Options",
     "Policy": "policy:Policy",
     "RunSpec": "spec:RunSpec",
     "TrainState": "trainer:TrainState",

@@ -1,4 +1,6 @@
-"""`RunSpec`, the description of a run: names of components, sizes, numbers and a seed. Loads neither JAX nor MuJoCo."""
+"""`RunSpec`, the description of a run: names of components, sizes, numbers and a seed; and `Options` of training, which do not
+affect its result. Loads neither JAX nor MuJoCo.
+"""
 
 import contextlib
 import dataclasses
@@ -14,11 +16,12 @@ from typing_extensions import Doc
 from mjx_dher import validation
 from mjx_dher.components import COMPONENTS, doc
 from mjx_dher.config import Config, HParams
-from mjx_dher.lookup import check_name, is_import_path
+from mjx_dher.lookup import check_name, is_import_path, require_extra
 
 Engine = Literal["auto", "native", "jax", "warp"]
 ENGINES = get_args(Engine)
 Argument = bool | int | float | str  # of an environment's constructor
+LOGS = {"jsonl": None, "tensorboard": "tensorboardX", "wandb": "wandb"}  # logs next to metrics.csv, and their packages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +80,53 @@ class RunSpec:
 
 # Fields that can differ between runs of one compiled program. Priorities can differ within a group.
 _LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "generator", "seed", "hparams")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of training that do not affect the result of a run: last evaluation, checkpoints and logs."""
+
+    final_episodes: int = 500
+    """Episodes of the final evaluation."""
+    checkpoint_every: int = 10
+    """Epochs between checkpoints; 0 disables this. A checkpoint is also written after 2 minutes, then every 10 minutes, and
+    when the run is stopped (Ctrl-C, SIGTERM, SIGHUP)."""
+    keep: int = 2
+    """Newest checkpoints to keep (one for parallel runs). They are deleted when the run has ended."""
+    keep_end: bool = False
+    """Keep the last checkpoint, so that `resume --total-steps` can extend the run. It is as large as the replay ring."""
+    log: tuple[str, ...] = ()
+    """Logs in addition to metrics.csv: jsonl, tensorboard, wandb."""
+    stop_at: float | None = None
+    """Stop a run early at this success rate, averaged over the last three evaluations."""
+
+    def check(self, installed: bool = True) -> None:
+        """Raises ValueError for an invalid option, or for a log whose package is missing, if packages must be `installed`."""
+        validation.check_count("final_episodes", self.final_episodes)
+        validation.check_number("checkpoint_every", self.checkpoint_every, "[0, 1000000]")
+        validation.check_count("keep", self.keep)
+        if not isinstance(self.keep_end, bool):
+            raise ValueError(f"keep_end must be true or false; got {self.keep_end!r}")
+        if not isinstance(self.log, (list, tuple)):
+            raise ValueError(f"log must be names among {', '.join(LOGS)}; got {self.log!r}")
+        for log in self.log:
+            check_name("log", log, LOGS)
+            if installed and (package := LOGS[log]):
+                require_extra(f"log {log}", package, log)
+        if self.stop_at is not None:
+            validation.check_number("stop_at", self.stop_at, "(0, 1]", float)
+
+    def check_many(self) -> None:
+        """Raises ValueError for an option that only a single run supports."""
+        if self.stop_at is not None:
+            raise ValueError("stop_at is only for a single run, because the runs of a sweep are compared epoch by epoch")
+        if self.keep_end:
+            raise ValueError("keep_end is only for a single run: a sweep with another total_steps has other runs")
+
+    def is_reached(self, success_rates: Sequence[float]) -> bool:
+        """Whether a run with these success rates per epoch has reached `stop_at`."""
+        last = success_rates[-3:]
+        return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at
 
 
 def custom_components(spec: RunSpec) -> dict[str, str]:

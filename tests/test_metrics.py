@@ -10,7 +10,7 @@ import pytest
 from configs import SMALL
 from conftest import refuses
 
-from mjx_dher import HParams, RunSpec, trainer
+from mjx_dher import HParams, Options, RunSpec, spec, trainer
 from mjx_dher.context import Context
 from mjx_dher.runs import loop
 from mjx_dher.runs.folder import loggers, run_folder
@@ -111,11 +111,11 @@ def test_wandb_that_cannot_start_is_an_error_with_a_cure(kind, tmp_path, monkeyp
 
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
     with refuses("log", "tensorbord", "tensorboard"):
-        loggers.check_logs(["jsonl", "tensorbord"])
-    monkeypatch.setitem(loggers.EXTRAS, "wandb", "no_such_package")
+        Options(log=("jsonl", "tensorbord")).check()
+    monkeypatch.setitem(spec.LOGS, "wandb", "no_such_package")
     with refuses("log", "wandb", "no_such_package", "[wandb]"):
-        loggers.check_logs(["wandb"])
-    loggers.check_logs(["jsonl"])
+        Options(log=("wandb",)).check()
+    Options(log=("jsonl",)).check()
 
 
 def test_open_sinks_writes_csv_always_and_each_log_once(tmp_path):

@@ -13,8 +13,7 @@ from mjx_dher.cli import common, parse, settings
 from mjx_dher.cli.common import Devices, Physics, Trust, make_env, settle_compiler
 from mjx_dher.cli.train import train_into
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import Options, RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 from mjx_dher.system.machine import prepare

@@ -11,8 +11,7 @@ from mjx_dher import config as config_lib
 from mjx_dher.config import Config
 from mjx_dher.runs.folder import fingerprint, reading, run_folder
 from mjx_dher.runs.folder.fingerprint import text
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import Options, RunSpec
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 

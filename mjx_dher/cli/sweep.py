@@ -19,8 +19,7 @@ from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet.chunks import FleetOptions
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import Engine, RunSpec
+from mjx_dher.spec import Engine, Options, RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
 from mjx_dher.system.files import FolderError

@@ -17,8 +17,7 @@ from mjx_dher.cli.common import VIEW_PORT, Devices, Screen, make_env, settle_com
 from mjx_dher.lookup import check_name
 from mjx_dher.presets import PRESETS, Preset
 from mjx_dher.runs.folder import fingerprint, run_folder
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec, to_texts
+from mjx_dher.spec import Options, RunSpec, to_texts
 from mjx_dher.system import files, signals
 from mjx_dher.system.files import FolderError
 from mjx_dher.system.machine import check_platform, prepare

@@ -14,8 +14,7 @@ from typing import NamedTuple
 from mjx_dher import __version__, import_paths
 from mjx_dher.lookup import require_extra
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec, custom_components
+from mjx_dher.spec import Options, RunSpec, custom_components
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.validation import check_count, host_and_port

@@ -11,8 +11,7 @@ from mjx_dher.fleet import chunks, worker
 from mjx_dher.fleet.chunks import Chunk, Task
 from mjx_dher.fleet.cluster import LostError, Running, Work
 from mjx_dher.fleet.worker import News
-from mjx_dher.runs.options import Options
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import Options, RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system.files import BusyError
 

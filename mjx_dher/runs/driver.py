@@ -25,9 +25,8 @@ from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
 from mjx_dher.runs.folder.loggers import Sink
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED, Claims, Run, named
 from mjx_dher.runs.loop import Progress
-from mjx_dher.runs.options import Options
 from mjx_dher.runs.program import Program
-from mjx_dher.spec import RunSpec
+from mjx_dher.spec import Options, RunSpec
 from mjx_dher.system import files, signals
 from mjx_dher.types import Env
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_dher.lookup import check_name, require_extra
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, machine
@@ -17,7 +16,6 @@ from mjx_dher.system.files import FolderError
 # The first columns of metrics.csv; the other metrics of an epoch follow.
 COUNTS = ("epoch", "env_steps", "updates", "wall_seconds")
 FIRST_COLUMNS = (*COUNTS, "success_rate", "return_mean")
-LOGS = ("jsonl", "tensorboard", "wandb")
 JSON_FILE = "metrics.jsonl"
 DIGEST = "digest"  # the last column of metrics.csv
 
@@ -147,17 +145,6 @@ class WandbSink:
 
 
 Sink = CsvSink | JsonlSink | TensorBoardSink | WandbSink
-EXTRAS = {"tensorboard": "tensorboardX", "wandb": "wandb"}  # extras, and their packages
-
-
-def check_logs(logs: Sequence[str], installed: bool = True) -> None:
-    """Raises ValueError unless all names are in LOGS and their packages are installed, if they must be."""
-    if not isinstance(logs, (list, tuple)):
-        raise ValueError(f"log must be names among {', '.join(LOGS)}; got {logs!r}")
-    for log in logs:
-        check_name("log", log, LOGS)
-        if installed and log in EXTRAS:
-            require_extra(f"log {log}", EXTRAS[log], log)
 
 
 def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0, digest: str = "") -> list[Sink]:
