@@ -18,7 +18,7 @@ from mjx_dher import evaluate
 from mjx_dher import spec as spec_lib
 from mjx_dher.contract import robot_interface
 from mjx_dher.parallel import mesh, processes
-from mjx_dher.runs import diagnostics, loop
+from mjx_dher.runs import loop
 from mjx_dher.runs import program as program_lib
 from mjx_dher.runs.folder import fingerprint, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
@@ -57,6 +57,33 @@ class _Session:
     devices: int
 
 
+@dataclasses.dataclass
+class _Watch:
+    """Failures and warnings of parallel runs."""
+
+    specs: Sequence[RunSpec]
+    folders: Sequence[Path]
+    report: Callable[[str], None]
+    failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane; updated in place
+    warned: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+
+    def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
+        """Records the lanes that failed in an epoch, and reports each kind of warning once."""
+        finite = np.atleast_1d(progress.finite)
+        for lane, (spec, folder, row) in enumerate(zip(self.specs, self.folders, rows)):
+            name = f"{folder.name}: " if len(self.specs) > 1 else ""
+            if lane in self.failed:
+                continue
+            if reason := loggers.failure(row, spec.config, bool(finite[lane])):
+                self.failed[lane] = progress.epoch, reason
+                self.report(f"{name}failed in epoch {progress.epoch}: {reason}")
+                continue
+            for kind, text in loggers.warnings(row, spec.config).items():
+                if (lane, kind) not in self.warned:
+                    self.warned.add((lane, kind))
+                    self.report(f"{name}epoch {progress.epoch}: {text}")
+
+
 def train_runs(
     env: Env,
     specs: Sequence[RunSpec],
@@ -73,7 +100,7 @@ def train_runs(
 ) -> list[Result]:
     """Trains runs that share a program, as many in parallel as possible, each into its own folder.
 
-    A run whose folder has a checkpoint resumes from it. A failed run (`diagnostics.failure`) ends without the others, and its
+    A run whose folder has a checkpoint resumes from it. A failed run (`loggers.failure`) ends without the others, and its
     result has the reason.
 
     Args:
@@ -168,7 +195,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
         files.flush(folder)
     report_once = functools.cache(session.report)
-    watch = diagnostics.Watch(specs, folders, session.report, checkpoints.failed)
+    watch = _Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = zip(ended, specs, folders, runs) if processes.leads() else ()

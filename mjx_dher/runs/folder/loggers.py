@@ -1,13 +1,14 @@
-"""Loggers of a run's metrics: a CSV file, and optionally JSON lines, TensorBoard or Weights & Biases."""
+"""A run's metrics: failures and warnings that they show, and loggers (CSV, JSON lines, TensorBoard, Weights & Biases)."""
 
 import csv
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mjx_dher.config import Config
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, machine
@@ -169,3 +170,34 @@ def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
         "updates_per_second": updates / progress.epoch_seconds,
         "memory_bytes": machine.used_bytes() or math.nan,
     }
+
+
+def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str | None:
+    """Why a run fails after an epoch with these metrics, or None. `finite` tells whether all of the learner's floats are."""
+    if not finite:
+        return "the networks or normalizers have numbers that are not finite (smaller actor_lr and critic_lr may help)"
+    episodes = config.num_envs * config.cycles_per_epoch
+    if metrics["discarded_episodes"] >= episodes:
+        return (
+            f"all {episodes} episodes were discarded, so nothing can be learned: the environment reports `failed`, or an"
+            " observation, a goal, an action or a reward is not finite"
+        )
+    if metrics["bad_success"] > 0:
+        return f"success must be 0 or 1; in {metrics['bad_success']:.3g} of the episodes it is not"
+    if metrics["no_goal_share"] >= 1:
+        return "the sampler offers no hindsight goal for any transition: its weights are all 0, NaN or infinite"
+    return None
+
+
+def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
+    """Warning sentences about an epoch, by metric."""
+    episodes = config.num_envs * config.cycles_per_epoch
+    sentences = {
+        "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment"
+        " reports `failed`, or a number in them is not finite",
+        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range, which"
+        " bounds the learner's targets",
+        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel;"
+        " these keep their own",
+    }
+    return {name: text for name, text in sentences.items() if metrics[name] > 0}
