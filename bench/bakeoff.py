@@ -34,7 +34,7 @@ from mjx_dher.cli.common import Screen, make_env
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.runs.folder import fingerprint, reading, results
 from mjx_dher.spec import Options, RunSpec, validate
-from mjx_dher.sweeps import comparison, grid, sweep, tables
+from mjx_dher.sweeps import comparison, grid, tables
 from mjx_dher.system import files, signals
 from mjx_dher.system.machine import prepare
 
@@ -137,7 +137,7 @@ def _train_group(args: argparse.Namespace, which: tuple[str, str, str], console:
     console.print(f"{folder}, {group}: {len(todo)} runs")
     screen = Screen(console, todo)
     try:
-        sweep.run(
+        grid.train(
             folder,
             todo,
             make_env,

@@ -9,7 +9,7 @@ from configs import SMALL
 
 from mjx_dher import HParams, Options, RunSpec
 from mjx_dher.runs import driver, program
-from mjx_dher.sweeps import grid, sweep, tables
+from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import machine
 from probes import PointMass
 
@@ -55,7 +55,7 @@ def make_grid(samplers=("future", "weighted"), seeds=(0, 1), points=(DEFAULT,), 
 def run(folder, trials, checkpoint_every=0, **options):
     options.setdefault("lanes", 1)
     settings = Options(final_episodes=15, checkpoint_every=checkpoint_every)
-    return sweep.run(folder, trials, lambda spec: PointMass(), options=settings, **options)
+    return grid.train(folder, trials, lambda spec: PointMass(), options=settings, **options)
 
 
 TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")

@@ -13,7 +13,7 @@ from conftest import ROOT, refuses
 import mjx_dher
 from mjx_dher import cli
 from mjx_dher.runs.folder import reading, results
-from mjx_dher.sweeps import grid, sweep, tables
+from mjx_dher.sweeps import grid, tables
 
 sys.path.append(str(ROOT / "tests" / "data"))
 import make_runs_schema_2 as made
@@ -88,7 +88,7 @@ def test_a_sweep_resumes_and_its_tables_read(archive):
     folder = archive / "sweep"
     assert [grid.is_done(folder, spec) for spec in made.SWEEP] == [True, True, False, False]
     lines = []
-    trained = sweep.run(folder, made.SWEEP, made.make_env, options=made.OPTIONS, lanes=2, report=lines.append)
+    trained = grid.train(folder, made.SWEEP, made.make_env, options=made.OPTIONS, lanes=2, report=lines.append)
     assert len(trained) == 2
     assert any("after epoch 2" in line for line in lines)
     trials = tables.read(folder)

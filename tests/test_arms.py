@@ -7,7 +7,7 @@ from conftest import ROOT
 
 from mjx_dher import Options, presets
 from mjx_dher.cli.common import make_env
-from mjx_dher.sweeps import grid, sweep, tables
+from mjx_dher.sweeps import grid, tables
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_arms_learn_to_reach(monkeypatch, tmp_path, group):
         run = presets.preset("cpu", "reach", engine="native", **parts_of("reach", arm))
         specs.append(dataclasses.replace(run, hparams=run.hparams._replace(**arm.numbers)))
     options = Options(final_episodes=100, checkpoint_every=0)
-    sweep.run(tmp_path, specs, make_env, options=options, lanes=len(specs))
+    grid.train(tmp_path, specs, make_env, options=options, lanes=len(specs))
     success = {str(trial["folder"].name): trial["final"].get("success_rate") for trial in tables.read(tmp_path)}
     assert len(success) == len(specs) == len({grid.folder_of(tmp_path, spec) for spec in specs})
     assert min(success.values()) >= 0.95, success

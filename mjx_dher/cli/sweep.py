@@ -269,13 +269,11 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
 
 def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
     """Trains trials until a signal requests a stop."""
-    from mjx_dher.sweeps import sweep
-
     prepare()
     try_components(todo, console)
     screen = Screen(console, todo)
     try:
-        sweep.run(
+        grid.train(
             args.out,
             todo,
             make_env,

@@ -23,7 +23,7 @@ from mjx_dher.fleet.chunks import Chunk
 from mjx_dher.runs.folder import results, run_folder
 from mjx_dher.runs.loop import Progress
 from mjx_dher.spec import RunSpec
-from mjx_dher.sweeps import grid, sweep
+from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
 from mjx_dher.types import Env
@@ -62,7 +62,7 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
         if chunk.storage is not None and not (place / chunks.NAMES_FILE).exists():
             raise ValueError(f"storage must be one folder for all nodes; node {socket.gethostname()} does not see {place}")
         if todo := [spec for spec in chunk.specs if not grid.is_done(place, spec)]:
-            sweep.run(
+            grid.train(
                 place,
                 todo,
                 make_env,

@@ -1,13 +1,22 @@
-"""Grid of a sweep: trials for each environment, sampler, number and seed. Loads neither JAX nor MuJoCo."""
+"""Trials of a sweep: the grid of environments, samplers, numbers and seeds, their folders, and their training in few programs.
+
+A trial is a run folder, named after its settings and their digest. To finish or extend a sweep, train it again: the missing
+trials are trained, and unfinished runs resume from their checkpoint. JAX is loaded only to train.
+"""
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import FolderError
+
+if TYPE_CHECKING:
+    from mjx_dher.runs.driver import Result
+    from mjx_dher.types import Env
 
 CELLS = "cells"
 
@@ -79,3 +88,30 @@ def is_sweep(folders: Sequence[Path]) -> bool:
         if sweep and len(folders) > 1:
             raise FolderError(f"{folder} is a sweep: pass it alone, without other folders")
     return (folders[0] / CELLS).is_dir()
+
+
+def train(
+    folder: Path,
+    specs: Sequence[RunSpec],
+    make_env: Callable[[RunSpec], "Env"],
+    should_stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> list["Result"]:
+    """Trains trials into the folder of a sweep, which is made if necessary. Trials share programs if possible, in any order.
+
+    `make_env` makes the environment of a trial. The options, and errors, are those of `train_runs`. Returns one Result per
+    trained trial, none for those that had ended, that another process trains, or that were waiting at a stop.
+    """
+    from mjx_dher.parallel import processes
+    from mjx_dher.runs import driver, program
+
+    options |= {"should_stop": should_stop, "shared": folder / "unfinished", "sweep": True}
+    trained: list[Result] = []
+    groups = [(make_env(own[0]), own) for own in by_program(specs)]
+    for env, own in groups[1:]:  # before the first ones train, which may take days
+        program.check_runs(env, own, options.get("lanes"), options.get("devices", 1))
+    for env, own in groups:
+        if trained and processes.any_process(should_stop()):
+            break
+        trained += driver.train_runs(env, own, [folder_of(folder, spec) for spec in own], **options)
+    return trained

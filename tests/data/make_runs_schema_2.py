@@ -14,7 +14,7 @@ import numpy as np
 
 import mjx_dher
 from mjx_dher import Config, HParams, Options, RunSpec, cli, envs
-from mjx_dher.sweeps import grid, sweep
+from mjx_dher.sweeps import grid
 
 ARGUMENTS = ("episode_length=10",)
 CONFIG = Config(
@@ -75,8 +75,8 @@ def make_runs(root: Path):
 def make_sweep(root: Path):
     """One pair of runs has ended, and the other pair was stopped after two epochs."""
     folder, seen = root / "sweep", []
-    sweep.run(folder, SWEEP[:2], make_env, options=OPTIONS, lanes=2)
-    sweep.run(
+    grid.train(folder, SWEEP[:2], make_env, options=OPTIONS, lanes=2)
+    grid.train(
         folder,
         SWEEP,
         make_env,
@@ -86,7 +86,7 @@ def make_sweep(root: Path):
         should_stop=lambda: seen[-1] >= 2,
     )
     shutil.copytree(folder, root / "expected" / "sweep")
-    sweep.run(root / "expected" / "sweep", SWEEP, make_env, options=OPTIONS, lanes=2)
+    grid.train(root / "expected" / "sweep", SWEEP, make_env, options=OPTIONS, lanes=2)
 
 
 def main(root: Path):
