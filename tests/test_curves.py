@@ -18,7 +18,7 @@ from mjx_dher.runs.folder import fingerprint, loggers, reading, run_folder
 from mjx_dher.sweeps import grid, report
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
-from mjx_dher.tools import curves, figures, html
+from mjx_dher.tools import curves, figures
 
 SPEC = RunSpec(env="reach", config=Config(eval_episodes=20, total_steps=12_000))
 PNG = b"\x89PNG"
@@ -255,13 +255,13 @@ def test_a_page_about_a_run_that_failed_says_why_without_markup_of_its_own(tmp_p
     assert "&lt;script&gt;" in text
     assert "<script" not in text
     assert curve.status == "failed"
-    assert html.text(spec.env) == "&lt;b&gt;:x"
+    assert report._escaped(spec.env) == "&lt;b&gt;:x"
 
 
 def test_a_film_that_is_too_large_is_left_out_and_named(tmp_path, monkeypatch):
     run = write_run(tmp_path / "run")
     (run / "large.gif").write_bytes(b"12345")
-    monkeypatch.setattr(html, "LARGEST", 4)
+    monkeypatch.setattr(report, "LARGEST", 4)
     told = []
     assert "data:" not in report.of_run(run, told.append)
     assert told == [f"{run / 'large.gif'} is left out because it is larger than 0 MB"]
