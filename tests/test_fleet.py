@@ -14,7 +14,7 @@ from sweep_helpers import CONFIG, compile_once, make_grid, run, table  # noqa: F
 
 from mjx_dher import Options, cli, lookup
 from mjx_dher.cli import fleet
-from mjx_dher.fleet import chunks, driver, worker
+from mjx_dher.fleet import chunks, cluster, worker
 from mjx_dher.fleet.chunks import FleetOptions, Task
 from mjx_dher.fleet.cluster import LostError, Running
 from mjx_dher.runs.folder import results
@@ -109,10 +109,10 @@ def test_the_screen_shows_all_nodes(capsys):
     one = worker.News("c", "node1", CONFIG.total_steps * 1.0, 500.0, {"future": 0.25}, ())
     other = one._replace(chunk="d", host="node2", success={"future": 0.75})
     screen._printed -= 100
-    screen.show(driver.State(1, frozenset("cd"), 2, [one, other]))
+    screen.show(cluster.State(1, frozenset("cd"), 2, [one, other]))
     line = capsys.readouterr().out
     assert "75%  1 of 4 runs have ended; 2 of 2 tasks train on 2 hosts  1,000 steps/s  future 0.50  ETA" in line
-    screen.show(driver.State(4, frozenset(), 2, []))
+    screen.show(cluster.State(4, frozenset(), 2, []))
     assert "100%  4 of 4 runs have ended" in capsys.readouterr().out
 
 
@@ -169,7 +169,7 @@ def test_a_damaged_run_is_rejected_and_nothing_is_lost(trained, tmp_path):
 def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):
     trials = make_grid(("future", "weighted"), (0, 1, 2))
     for chunk in (trials[2:4], trials[4:]):
-        chunks.make(tuple(chunk), OPTIONS, None, CPU, tmp_path, {})
+        chunks.make_folder(chunks.make(tuple(chunk), OPTIONS, None, CPU, tmp_path, {}))
     assert set(chunks.unfinished(tmp_path, trials, trials)) == {tuple(trials[2:4]), tuple(trials[4:])}
     assert chunks.unfinished(tmp_path, trials, trials[:4]) == [tuple(trials[2:4])]
     assert chunks.unfinished(tmp_path, trials, trials[3:4]) == [tuple(trials[2:4])]  # one has ended: both, as they were
@@ -180,7 +180,9 @@ def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):
 
 
 def chunk_of(trials, storage=None, lanes=1):
-    return chunks.make(tuple(trials), OPTIONS, lanes, CPU, storage, chunks.code_of(trials))
+    chunk = chunks.make(tuple(trials), OPTIONS, lanes, CPU, storage, chunks.code_of(trials))
+    chunks.make_folder(chunk)
+    return chunk
 
 
 def make_point_mass(run):
@@ -234,7 +236,7 @@ class Here:
     def resources(self):
         return [{"CPU": 2.0 * self.slots}]
 
-    def submit(self, chunk, task, work):
+    def submit(self, chunk, work):
         self.taken.append(chunk)
         return Running(chunk, work)
 
@@ -258,14 +260,14 @@ class Here:
 
 
 def drive(here, folder, trials, stop=lambda: False, size=2, work=None):
-    """What `driver.run` returns, and the states that it shows."""
+    """What `cluster.train` returns, and the states that it shows."""
     states, storage = [], folder / "storage"
     before = chunks.unfinished(storage, trials, trials)
     left = [trial for trial in trials if not any(trial in chunk for chunk in before)]
     parts = [*before, *chunks.split(left, CPU, here.slots, 1, size)]
     work = work or (lambda chunk, tell: worker.train(chunk, make_point_mass, tell))
-    own = (OPTIONS, 1, CPU, storage, chunks.code_of(trials), work, lambda text: None, states.append, stop)
-    return driver.run(here, driver.Job(folder, parts, *own)), states
+    parts = [chunks.make(part, OPTIONS, 1, CPU, storage, chunks.code_of(trials)) for part in parts]
+    return cluster.train(here, folder, parts, work, lambda text: None, states.append, stop), states
 
 
 def test_every_run_is_there_in_the_end_and_none_twice(tmp_path):

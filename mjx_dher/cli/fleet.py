@@ -9,7 +9,7 @@ from rich.console import Console
 
 from mjx_dher.cli.common import SECONDS_PER_LINE, clock, make_env, settle_compiler, try_components
 from mjx_dher.cli.sweep import SweepArgs, announce, trials_of
-from mjx_dher.fleet import chunks, cluster, driver, worker
+from mjx_dher.fleet import chunks, cluster, worker
 from mjx_dher.fleet.chunks import LOCAL, Chunk, FleetOptions
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.runs.folder import fingerprint, run_folder
@@ -85,19 +85,19 @@ def _train(
     )
     before = chunks.unfinished(storage, trials, todo)
     others = [run for run in todo if not any(run in chunk for chunk in before)]
-    parts = [*before, *chunks.split(others, task, slots, args.lanes, args.fleet.ray_chunk)]
-    screen = _Screen(console, todo)
+    shares = [*before, *chunks.split(others, task, slots, args.lanes, args.fleet.ray_chunk)]
     code = chunks.code_of(todo)
+    parts = [chunks.make(share, args.options, args.lanes, task, storage, code) for share in shares]
+    screen = _Screen(console, todo)
     for run in todo:  # the nodes write the folders
         run_folder.record_names(run)
     with signals.held(report, args.out, SECONDS_WITHOUT_NEWS) as held:
 
-        def show(state: driver.State) -> None:
+        def show(state: cluster.State) -> None:
             held.alive()
             screen.show(state)
 
-        own = (args.options, args.lanes, task, storage, code, train_chunk)
-        lost = driver.run(ray, driver.Job(args.out, parts, *own, report, show, signals.are_asked))
+        lost = cluster.train(ray, args.out, parts, train_chunk, report, show, signals.are_asked)
     if lost:
         tries = cluster.RETRIES + 1
         raise ValueError(f"ray: {len(lost)} tasks were lost {tries} times ({'; '.join(lost[:3])}); run the same command again")
@@ -116,7 +116,7 @@ class _Screen:
         self._news: dict[str, News] = {}  # by chunk
         self._started = self._printed = time.monotonic()
 
-    def show(self, state: driver.State) -> None:
+    def show(self, state: cluster.State) -> None:
         """Prints a line if it is time for one."""
         self._news = {name: one for name, one in self._news.items() if name in state.running}
         self._news |= {one.chunk: one for one in state.news if one.chunk in state.running}
@@ -125,7 +125,7 @@ class _Screen:
             self._console.print(self._line(state, now), soft_wrap=True, highlight=False)
             self._printed = now
 
-    def _line(self, state: driver.State, now: float) -> str:
+    def _line(self, state: cluster.State, now: float) -> str:
         news = self._news.values()
         done = state.ended * self._steps + sum(one.steps for one in news)
         share = min(1.0, done / max(1.0, self._runs * self._steps))

@@ -76,7 +76,7 @@ class Chunk(NamedTuple):
     specs: tuple[RunSpec, ...]
     options: Options
     lanes: int | None  # most parallel runs
-    cores: int | None  # cores to use; None: all
+    task: Task
     storage: Path | None  # the chunk's folder, shared by all nodes
     code: dict[str, str]  # the driver's `code_of`
 
@@ -124,14 +124,17 @@ def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[Ru
 def make(
     specs: tuple[RunSpec, ...], options: Options, lanes: int | None, task: Task, storage: Path | None, code: dict[str, str]
 ) -> Chunk:
-    """Makes a chunk, and its folder in the storage."""
-    names = [fingerprint.trial_name(spec) for spec in specs]
-    own = fingerprint.sha256_of(names)[:16]
-    folder = None if storage is None else storage / own
-    if folder is not None:
-        files.make_folder(folder)
-        files.write(folder / NAMES_FILE, json.dumps(names).encode())
-    return Chunk(own, specs, options, lanes, None if task.gpus else task.cpus, folder, code)
+    """Makes a chunk, whose folder will be in the storage."""
+    own = fingerprint.sha256_of([fingerprint.trial_name(spec) for spec in specs])[:16]
+    return Chunk(own, specs, options, lanes, task, None if storage is None else storage / own, code)
+
+
+def make_folder(chunk: Chunk) -> None:
+    """Makes the folder of a chunk, if it has one, with the names of its runs for `unfinished`."""
+    if chunk.storage is not None:
+        files.make_folder(chunk.storage)
+        names = [fingerprint.trial_name(spec) for spec in chunk.specs]
+        files.write(chunk.storage / NAMES_FILE, json.dumps(names).encode())
 
 
 def code_of(specs: Sequence[RunSpec]) -> dict[str, str]:

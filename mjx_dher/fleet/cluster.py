@@ -1,24 +1,29 @@
-"""A Ray cluster: joins or starts one, and runs chunks as its tasks."""
+"""A Ray cluster: joins or starts one, trains chunks as its tasks, and writes their runs into the sweep's folder."""
 
 import contextlib
 import logging
 import os
 import secrets
+import shutil
 import socket
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mjx_dher.fleet import worker
-from mjx_dher.fleet.chunks import LOCAL, Chunk, Task
+from mjx_dher.fleet import chunks, worker
+from mjx_dher.fleet.chunks import LOCAL, Chunk
 from mjx_dher.fleet.worker import News, Tell
+from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals, subprocesses
+from mjx_dher.system.files import BusyError
 from mjx_dher.validation import host_and_port
 
 RETRIES = 5  # for a chunk whose worker or node was lost
 SECONDS_TO_ANSWER = 20.0  # for the head of a cluster
+SECONDS_TO_WAIT = 0.5  # for a chunk to end, between checks for news
 LONG_PATH = 27  # characters; in longer folders, paths of Ray's sockets exceed the system's limit of 107
 STORE_BYTES = 200 << 20  # object store of a local cluster; the rest goes to disk
 # Files next to custom code that no node needs, as in .gitignore. Each node has its own package.
@@ -143,8 +148,9 @@ class Cluster:
     def resources(self) -> list[dict[str, float]]:
         return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
 
-    def submit(self, chunk: Chunk, task: Task, work: Work) -> Running:
+    def submit(self, chunk: Chunk, work: Work) -> Running:
         """Submits a chunk to Ray, which runs it when a node has room, and again if a worker or node is lost."""
+        task = chunk.task
         options: dict[str, Any] = {"num_cpus": task.cpus, "num_gpus": task.gpus, "max_retries": RETRIES}
         if task.gpus:
             options["max_calls"] = 1  # a process releases a GPU's memory when it ends
@@ -197,6 +203,74 @@ def _run(chunk: Chunk, work: Work, board: Any) -> list[bytes]:
         except ray.exceptions.RayError:  # nobody listens; training continues
             return False
 
-    if chunk.cores is not None:
-        worker.pin(chunk.cores)
+    if not chunk.task.gpus:
+        worker.pin(chunk.task.cpus)
     return work(chunk, tell)
+
+
+class State(NamedTuple):
+    """Progress of the sweep."""
+
+    ended: int  # runs ended since this start
+    running: frozenset[str]  # submitted chunks
+    slots: int  # current number of parallel chunks
+    news: Sequence[News]  # since the last state
+
+
+def train(
+    cluster: Cluster,
+    folder: Path,
+    parts: Sequence[Chunk],
+    work: Work,
+    report: Callable[[str], None],
+    show: Callable[[State], None],
+    should_stop: Callable[[], bool],
+) -> list[str]:
+    """Trains the chunks of a sweep in `folder`. Returns one line per chunk that was lost for good.
+
+    Slightly more chunks than slots are submitted, for clusters that grow on demand. A lost chunk is trained again from its
+    checkpoints in the storage, or without storage from the start. Errors of the training are raised again. Runs that have ended
+    by then are written.
+    """
+    waiting, running, begun = deque(parts), list[Running](), set[str]()
+    lost: list[str] = []
+    ended, stopping = 0, False
+    while running or (waiting and not stopping):
+        slots = sum(map(parts[0].task.slots, cluster.resources()))
+        while waiting and not stopping and len(running) < slots + 2:
+            chunks.make_folder(waiting[0])
+            running.append(cluster.submit(waiting.popleft(), work))
+        for one in cluster.wait(running, SECONDS_TO_WAIT):
+            running.remove(one)
+            try:
+                ended += _deliver(folder, one.chunk, cluster.result(one), report)
+            except LostError as error:
+                lost.append(str(error))
+        news = cluster.look(stopping)
+        begun |= {one.chunk for one in news}
+        for line in (f"{one.host}: {line}" for one in news for line in one.lines):
+            report(line)
+        show(State(ended, frozenset(one.chunk.id for one in running), slots, news))
+        if not stopping and should_stop():
+            stopping = True
+            for one in running:
+                if one.chunk.id not in begun:  # it may be compiling, which need not be awaited
+                    cluster.cancel(one)
+            running = [one for one in running if one.chunk.id in begun]
+    return lost
+
+
+def _deliver(folder: Path, chunk: Chunk, parcels: Sequence[bytes], report: Callable[[str], None]) -> int:
+    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns their number."""
+    written = 0
+    for spec, parcel in zip(chunk.specs, parcels):
+        place = grid.folder_of(folder, spec)
+        try:
+            if parcel:
+                worker.unpack(place, spec, parcel)
+                written += 1
+        except BusyError as error:  # a process without Ray trains it
+            report(f"{place} was not written: {error}")
+    if written == len(chunk.specs) and chunk.storage is not None:
+        shutil.rmtree(chunk.storage, ignore_errors=True)
+    return written
