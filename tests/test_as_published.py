@@ -1,5 +1,7 @@
 """bench/as_published.py, td_controls.py, unseen.py, modern_critics.py and hands.py: the runs that docs/experiments plans."""
 
+import csv
+
 from conftest import ROOT, refuses
 
 from mjx_dher.spec import validate
@@ -55,3 +57,20 @@ def test_the_tuned_k_has_the_largest_mean_success(monkeypatch, tmp_path):
     assert as_published.best_k.__wrapped__("push", "hgg") == 8
     with refuses("hgg", "slide"):
         as_published.best_k.__wrapped__("slide", "hgg")
+
+
+def test_curves_of_both_are_compared_over_the_steps_that_both_have(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import crl_curves
+
+    size = crl_curves.SIZES["arm_reach"]
+    assert (size.updates, size.first, size.total) == (50, 13, 256 * 8 * (13 + 6 * 20))
+    rows = [("ours", "arm_reach", seed, steps, steps / 400 + 0.1 * seed, "") for seed in (0, 1) for steps in (0, 200)]
+    rows += [("theirs", "arm_reach", seed, steps, 0.1 * seed, 1.0) for seed in (0, 1) for steps in (100, 300)]
+    with (tmp_path / "curves.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([crl_curves.COLUMNS, *rows])
+    ours, theirs = crl_curves.report([tmp_path / "curves.csv"]).splitlines()[2:]
+    # From 100 to 200 steps: means 0.375 and 0.475 against 0 and 0.1. Both variances are 0.005, so t has two degrees of freedom.
+    half = 4.302653 * (2 * 0.005 / 2) ** 0.5
+    assert ours == f"| `arm_reach` | ours | 2 | 0.425 | 0.550 | +0.375 | {0.375 - half:+.3f} to {0.375 + half:+.3f} |"
+    assert theirs == "| `arm_reach` | theirs | 2 | 0.050 | 0.050 |  |  |"

@@ -1,0 +1,222 @@
+"""Learning curves of JaxGCRL's own CRL beside the learner `crl`: same tasks, steps, updates, networks and losses.
+
+    git clone https://github.com/MichalBortkiewicz/JaxGCRL /tmp/jaxgcrl
+    pip install --no-deps brax==0.14.2 jaxopt ml_collections tensorboardX jinja2 MarkupSafe
+    python bench/crl_curves.py theirs --jaxgcrl /tmp/jaxgcrl --tasks arm_reach --out theirs.csv
+    python bench/crl_curves.py ours --tasks arm_reach --out ours.csv
+    python bench/crl_curves.py report ours.csv theirs.csv
+
+docs/experiments/crl.md has the plan. Of JaxGCRL, the tasks, the learner and its loop run unchanged. Its evaluator is replaced,
+because it asks for metrics that arm tasks lack. wandb and the part of Brax that was removed are empty modules.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import types
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVS, BATCH, EVALUATED = 256, 512, 100
+COLUMNS = ("who", "task", "seed", "env_steps", "success", "seconds")
+
+
+class Size(NamedTuple):
+    """Lengths of a task's runs. JaxGCRL updates on as many batches as all stored episodes have, after each unroll."""
+
+    length: int  # steps of an episode
+    unroll: int  # steps between updates
+    unrolls: int  # per evaluation
+    evaluations: int = 20
+
+    @property
+    def updates(self) -> int:
+        """Updates after each unroll."""
+        return ENVS * self.length // BATCH
+
+    @property
+    def first(self) -> int:
+        """Unrolls before the first update, with at least one episode."""
+        return -(-(self.length + 1) // self.unroll)
+
+    @property
+    def total(self) -> int:
+        """Environment steps."""
+        return ENVS * self.unroll * (self.first + self.unrolls * self.evaluations)
+
+
+SIZES = {"arm_reach": Size(100, 8, 6), "arm_push_easy": Size(150, 11, 13)}
+
+
+def train_ours(task: str, seeds: range, toy: bool) -> Iterable[tuple]:
+    """Rows of the learner `crl`, with JaxGCRL's numbers."""
+    from mjx_dher.sweeps import comparison, tables
+
+    size = SIZES[task]
+    updates = 1 if toy else round(size.length * size.updates / size.unroll)
+    total = 2 * 2 * size.length if toy else size.total
+    with tempfile.TemporaryDirectory() as out:
+        options = (
+            f"--env {task} --preset gpu --learner crl --networks layer_norm --sampler geometric --hidden-sizes 256 256"
+            " --sweep.priority-fraction 0 --sweep.her-k inf --sweep.random-eps 0 --sweep.actor-lr 3e-4 --sweep.critic-lr 3e-4"
+            " --sweep.gamma 0.99 --sweep.entropy-target -0.5"
+            f" --num-envs {2 if toy else ENVS} --cycles-per-epoch 1 --updates-per-cycle {updates} --batch-size {BATCH}"
+            f" --target-period 1 --total-steps {total} --replay-size {max(total, 2 * BATCH)}"
+            f" --eval-episodes {2 if toy else EVALUATED}"
+            f" --seeds {len(seeds)} --first-seed {seeds[0]} --out {out}/sweep"
+        )
+        subprocess.run([sys.executable, str(ROOT / "train.py"), "sweep", *options.split()], check=True)
+        for groups in comparison.groups(tables.read(Path(out) / "sweep")).values():
+            for group in groups:
+                for seed, success in zip(group.seeds, group.success):
+                    yield from (("ours", task, seed, int(s), float(x), "") for s, x in zip(group.env_steps, success))
+
+
+def train_theirs(folder: Path, task: str, seed: int, toy: bool) -> Iterable[tuple]:
+    """Rows of JaxGCRL's CRL."""
+    empty(folder)
+    import jax
+    from jaxgcrl.agents.crl import crl
+    from jaxgcrl.utils.config import RunConfig
+    from jaxgcrl.utils.env import create_env
+
+    size = Size(2, 2, 1, 2) if toy else SIZES[task]
+    envs, batch, rows, start = (2 if toy else ENVS), (4 if toy else BATCH), [], time.perf_counter()
+    crl.ActorEvaluator = evaluator(EVALUATED if not toy else 2)
+    agent = crl.CRL(
+        batch_size=batch,
+        max_replay_size=size.total // ENVS,
+        min_replay_size=size.first * size.unroll,
+        unroll_length=size.unroll,
+        skip_connections=0,
+        use_relu=True,
+        use_ln=True,
+    )
+
+    def progress(steps: int, metrics: dict[str, Any], *others: Any, **more: Any) -> None:
+        rows.append(("theirs", task, seed, steps, float(metrics["success"]), round(time.perf_counter() - start, 1)))
+        print(*rows[-1], flush=True)
+
+    env = create_env(task, "mjx")
+    env.goal_indices = np.asarray(env.goal_indices)  # JaxGCRL hashes them, which arrays of a newer JAX do not allow in a trace
+    jax.config.update("jax_compilation_cache_dir", str(Path(tempfile.gettempdir(), "crl_curves")))  # seeds share programs
+    with tempfile.TemporaryDirectory() as kept:
+        config = RunConfig(
+            env=task,
+            seed=seed,
+            num_envs=envs,
+            total_env_steps=size.total // ENVS * envs,
+            episode_length=size.length + 1,  # of which each gives `length` transitions with a later goal
+            num_evals=size.evaluations,
+            checkpoint_logdir=kept,  # JaxGCRL's loop needs one
+        )
+        agent.train_fn(config=config, train_env=env, eval_env=env, progress_fn=progress)
+    return rows
+
+
+def empty(folder: Path) -> None:
+    """Makes JaxGCRL importable: modules that are missing and not needed, and the folder that its paths are relative to."""
+    sys.path.insert(0, str(folder))
+    for name in ("brax.v1", "brax.v1.envs", "wandb", "wandb_osh", "wandb_osh.hooks"):
+        module: Any = types.ModuleType(name)
+        module.Env = module.Wrapper = module.State = module.TriggerWandbSyncHook = object
+        sys.modules.setdefault(name, module)
+    sys.modules["brax.v1"].envs = sys.modules["brax.v1.envs"]  # type: ignore[attr-defined]
+    os.chdir(folder / "jaxgcrl")
+
+
+def evaluator(episodes: int) -> type:
+    """A class with the interface of JaxGCRL's evaluator. Success is that of an episode's last state, as in this library."""
+    import jax
+
+    class LastState:
+        def __init__(self, actor_step: Any, eval_env: Any, num_eval_envs: int, episode_length: int, key: jax.Array):
+            def play(training_state: Any, key: jax.Array) -> jax.Array:
+                def step(state: Any, _: None) -> tuple[Any, jax.Array]:
+                    state, _ = actor_step(training_state, eval_env, state, extra_fields=())
+                    return state, state.metrics["success"]
+
+                first = eval_env.reset(jax.random.split(key, episodes))
+                # The last step of the wrapper already belongs to the next episode.
+                return jax.lax.scan(step, first, None, length=episode_length - 1)[1][-1].mean()
+
+            self._play, self._key = jax.jit(play), key
+
+        def run_evaluation(self, training_state: Any, metrics: dict[str, Any]) -> dict[str, Any]:
+            self._key, key = jax.random.split(self._key)
+            return {**metrics, "success": self._play(training_state, key)}
+
+    return LastState
+
+
+def report(paths: list[Path]) -> str:
+    """Table of mean success over the steps that both have, and its difference with Welch's interval."""
+    from scipy import stats
+
+    curves: dict[tuple[str, str], dict[str, list]] = {}
+    for path in paths:
+        for row in csv.DictReader(path.open()):
+            point = (float(row["env_steps"]), float(row["success"]))
+            curves.setdefault((row["task"], row["who"]), {}).setdefault(row["seed"], []).append(point)
+    lines = ["| task | who | seeds | mean success | last | difference | 95 % interval |", "|---|---|---|---|---|---|---|"]
+    for task in dict.fromkeys(task for task, _ in curves):
+        own = {who: [np.array(points) for points in curves[task, who].values()] for who in ("ours", "theirs")}
+        every = [curve for each in own.values() for curve in each]
+        grid = np.linspace(max(curve[0, 0] for curve in every), min(curve[-1, 0] for curve in every), 200)
+        means = {who: np.array([np.interp(grid, *curve.T).mean() for curve in each]) for who, each in own.items()}
+        test = stats.ttest_ind(means["ours"], means["theirs"], equal_var=False)
+        low, high = test.confidence_interval()
+        for who, each in own.items():
+            last = np.mean([curve[-1, 1] for curve in each])
+            cells = (
+                [f"{means['ours'].mean() - means['theirs'].mean():+.3f}", f"{low:+.3f} to {high:+.3f}"]
+                if who == "ours"
+                else ["", ""]
+            )
+            lines.append(
+                " | ".join([f"| `{task}`", who, str(len(each)), f"{means[who].mean():.3f}", f"{last:.3f}", *cells]) + " |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("theirs", "ours", "report"))
+    parser.add_argument("files", nargs="*", type=Path, help="for report: curves that --out wrote")
+    parser.add_argument("--jaxgcrl", type=Path, help="JaxGCRL's checkout")
+    parser.add_argument("--tasks", nargs="+", choices=SIZES, default=list(SIZES))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first-seed", type=int, default=10)
+    parser.add_argument("--out", type=Path, help="file of the curves; rows are added")
+    parser.add_argument("--toy", action="store_true", help="sizes that a CPU trains in minutes")
+    args = parser.parse_args()
+    if args.what == "report":
+        print(report(args.files))
+        return
+    if args.out is None or (args.what == "theirs") != (args.jaxgcrl is not None):
+        parser.error("ours needs --out, theirs --out and --jaxgcrl")
+    seeds, out = range(args.first_seed, args.first_seed + args.seeds), args.out.resolve()
+    for task in args.tasks:
+        parts = (
+            [train_ours(task, seeds, args.toy)]
+            if args.what == "ours"
+            else (train_theirs(args.jaxgcrl.resolve(), task, seed, args.toy) for seed in seeds)
+        )
+        for rows in map(list, parts):
+            head = [] if out.exists() else [COLUMNS]
+            with out.open("a", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows([*head, *rows])
+
+
+if __name__ == "__main__":
+    main()
