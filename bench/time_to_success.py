@@ -44,8 +44,8 @@ def main() -> None:
         if name in HParams._fields:
             hparams = hparams._replace(**{name: float(value)})
         else:
-            size: Any = int(value)
-            config = dataclasses.replace(config, **{name: size})
+            changed: Any = {name: type(getattr(config, name))(value)}
+            config = dataclasses.replace(config, **changed)
     env = envs.make(args.env, engine=args.engine)
     learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
     parts: dict[str, Any] = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority)}
