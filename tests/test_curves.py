@@ -60,7 +60,7 @@ def write_run(folder, spec=SPEC, epochs=12, status="finished", reason="", column
 )
 def test_a_run_is_read_however_it_ended(made, status, tmp_path):
     curve = curves.read_curve(write_run(tmp_path / "run", **made))
-    assert (curve.status, len(curve.rows), curve.reason) == (status, 12, made.get("reason", ""))
+    assert (curve.status, len(curve.rows), curve.result.get("reason", "")) == (status, 12, made.get("reason", ""))
     np.testing.assert_allclose(curve.column("success_rate")[:3], [0.1, 0.2, 0.3])
     assert np.isnan(curve.column("nothing")).all()
     assert "12,000 steps in 24 s" in curves.title(curve)

@@ -13,12 +13,12 @@ from typing import Any
 from mjx_dher import __version__, lookup
 from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.runs.folder.fingerprint import text
+from mjx_dher.runs.folder.results import Record
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import comparison, plotting, tables
 from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
-from mjx_dher.tools.curves import Curve
 
 REPORT = "report.html"
 VIDEOS = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
@@ -60,13 +60,13 @@ def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> s
     return _page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
 
 
-def _facts(curve: Curve) -> str:
+def _facts(curve: Record) -> str:
     """Named numbers of a run in a row."""
     parts = (f"<div>{_element('b', value)}{_escaped(name)}</div>" for name, value in _numbers(curve))
     return '<div class="facts">' + "".join(parts) + "</div>"
 
 
-def _numbers(curve: Curve) -> Iterator[tuple[str, str]]:
+def _numbers(curve: Record) -> Iterator[tuple[str, str]]:
     result, last = curve.result, curve.rows[-1] if curve.rows else {}
     yield "status", curve.status
     if "success_rate" in result:

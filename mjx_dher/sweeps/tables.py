@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_dher.runs.folder import fingerprint, loggers, reading, results, run_folder
+from mjx_dher.runs.folder import fingerprint, loggers, results, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.sweeps.grid import CELLS
 from mjx_dher.system import files
@@ -24,7 +24,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
     Keys: folder, settings, seed, lanes, status, reason, curve and final. The settings include the engine used and `source`, the
     custom source files. The curve has lists by column. The last evaluation, final, is empty if the run failed. Raises
     FolderError if it is not a sweep, no run has ended, a link leads out of the folder, or a trial is invalid
-    (`results.result_problem`).
+    (`results.read`).
     """
     cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
     paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]
@@ -35,13 +35,13 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 
 def _read_trial(path: Path) -> dict[str, Any]:
-    if (problem := results.result_problem(path)) is not None:
-        raise FolderError(f"{problem}; run the sweep's command to train it again, or remove the folder")
-    result, (content, spec) = results.read_result(path), reading.read_run(path)
+    try:
+        _, content, spec, rows, result = results.read(path)
+    except FolderError as error:
+        raise FolderError(f"{error}; run the sweep's command to train it again, or remove the folder") from error
     failed = result["status"] == FAILED
     flags = [f"{name} {value}" for name, value in content.get("jax_flags", {}).items()]
     try:
-        rows = results.read_metrics(path)
         columns = [name for name in (rows[0] if rows else ()) if name != loggers.DIGEST]
         return {
             "folder": path,

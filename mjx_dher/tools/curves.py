@@ -3,20 +3,19 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
+from mjx_dher.runs.folder import fingerprint, results, run_folder
+from mjx_dher.runs.folder.results import Record
 from mjx_dher.runs.folder.run_folder import FAILED
-from mjx_dher.spec import RunSpec
 from mjx_dher.stats import wilson_interval
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import figures
 
 CURVE = "curve"  # stem of the picture of one run
-NOT_ENDED = "not ended"
 # Panels of a run's picture: heading, curves by column, and whether the axis is logarithmic. Empty panels are left out.
 _PANELS = (
     ("mean return", {"return_mean": "evaluation", "train_return_mean": "exploring"}, False),
@@ -25,50 +24,28 @@ _PANELS = (
 )
 
 
-class Curve(NamedTuple):
-    """Learning curve of a run, from its folder."""
-
-    folder: Path
-    spec: RunSpec
-    content: dict[str, Any]  # content of config.json
-    status: str  # finished, failed or not ended
-    reason: str  # why the run failed, or ""
-    rows: list[dict[str, Any]]  # metrics of each epoch
-    result: dict[str, Any]  # content of result.json; empty if the run has not ended
-
-    def column(self, name: str) -> NDArray:
-        """A metric of all epochs, shape [P]; NaN if an epoch lacks it."""
-        return np.array([row.get(name, math.nan) for row in self.rows], float)
-
-
-def read_curve(folder: Path, allow_empty: bool = False) -> Curve:
+def read_curve(folder: Path, allow_empty: bool = False) -> Record:
     """Reads the curve of the run in `folder`, finished or not. Raises FolderError if it is not a run folder, it is damaged, or
     no epoch has ended and `allow_empty` is False.
     """
-    content, spec = reading.read_run(folder)
-    result: dict[str, Any] = {}
-    if results.has_result(folder):
-        if (problem := results.result_problem(folder, with_policy=False)) is not None:
-            raise FolderError(problem)
-        result = results.read_result(folder)
-    rows = results.read_metrics(folder)
-    status = result.get("status", NOT_ENDED)
-    if not rows and not allow_empty:
-        told = f"it failed in its first epoch: {result['reason']}" if status == FAILED else "no epoch of the run has ended"
+    curve = results.read(folder, with_policy=False)
+    if not curve.rows and not allow_empty:
+        failed = curve.status == FAILED
+        told = f"it failed in its first epoch: {curve.result['reason']}" if failed else "no epoch of the run has ended"
         raise FolderError(f"{folder} has no curve: {told}")
-    return Curve(folder, spec, content, status, result.get("reason", ""), rows, result)
+    return curve
 
 
-def title(curve: Curve) -> str:
+def title(curve: Record) -> str:
     """One line about a run: its settings and progress."""
     spec = curve.spec
     parts = [spec.env, *spec.env_kwargs, f"sampler {spec.sampler}", f"learner {spec.learner}", f"seed {spec.seed}"]
     steps = f"{curve.rows[-1]['env_steps']:,} steps in {curve.rows[-1]['wall_seconds']:,.0f} s" if curve.rows else "no epoch"
-    state = f"failed: {curve.reason}" if curve.status == FAILED else curve.status
+    state = f"failed: {curve.result['reason']}" if curve.status == FAILED else curve.status
     return f"{', '.join(parts)}; {curve.content['physics']}; {steps}; {state}"
 
 
-def draw_curve(curve: Curve) -> Any:
+def draw_curve(curve: Record) -> Any:
     """Draws a run over environment steps: success with its 95 % interval (Wilson 1927), returns, values and losses."""
     panels = [
         (label, {name: text for name, text in columns.items() if np.isfinite(curve.column(name)).any()}, log)
@@ -100,7 +77,7 @@ def draw_curve(curve: Curve) -> Any:
     return figure
 
 
-def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
+def _draw_success(axis: Any, curve: Record, steps: NDArray) -> None:
     """Draws the success of evaluation, exploration, final evaluation and resets."""
     rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
     bounds = [wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
@@ -121,13 +98,13 @@ def _draw_success(axis: Any, curve: Curve, steps: NDArray) -> None:
     axis.legend(frameon=False, fontsize=8)
 
 
-def _unit(curves: Sequence[Curve]) -> tuple[float, str]:
+def _unit(curves: Sequence[Record]) -> tuple[float, str]:
     """Unit of environment steps, and the label of their axis."""
     last = max((curve.rows[-1]["env_steps"] for curve in curves if curve.rows), default=0)
     return (1e6, "million environment steps") if last >= 1e6 else (1e3, "thousand environment steps")
 
 
-def labels(curves: Sequence[Curve]) -> list[str]:
+def labels(curves: Sequence[Record]) -> list[str]:
     """Name of each run: the settings in which the runs differ, or else their folders."""
     settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
     varying = [name for name in settings[0] if len({str(each[name]) for each in settings}) > 1 and name != "engine"]
@@ -142,7 +119,7 @@ def _value(name: str, value: Any) -> str:
     return f"{name} {value:g}" if isinstance(value, (int, float)) else str(value)
 
 
-def draw_together(curves: Sequence[Curve]) -> Any:
+def draw_together(curves: Sequence[Record]) -> Any:
     """Draws the success of several runs over environment steps and over seconds."""
     names = labels(curves)
     columns = max(1, min(4, 120 // (6 + max(map(len, names)))))
@@ -159,7 +136,7 @@ def draw_together(curves: Sequence[Curve]) -> Any:
     return figure
 
 
-def curves_table(curves: Sequence[Curve]) -> tuple[list[str], list[list[str]]]:
+def curves_table(curves: Sequence[Record]) -> tuple[list[str], list[list[str]]]:
     """Table of several runs: its head, and cells with settings, progress and success."""
     head = ["run", "differences", "status", "env steps", "seconds", "last evaluation", "final success (95 % interval)"]
     cells = []

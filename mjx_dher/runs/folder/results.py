@@ -2,10 +2,14 @@
 
 import csv
 import itertools
+import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mjx_dher.runs.folder import loggers, reading, run_folder
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED
@@ -103,29 +107,54 @@ def can_go_on(folder: Path, total_steps: int) -> bool:
     return due and bool(run_folder.checkpoints(folder))
 
 
-def result_problem(folder: Path, with_policy: bool = True) -> str | None:
-    """Reason why a run with a result is invalid: files are damaged or belong to other runs. None if it is valid.
+class Record(NamedTuple):
+    """What the folder of a run says."""
 
-    A run can resume without its policy, so the policy may be left out of the check.
+    folder: Path
+    content: dict[str, Any]  # content of config.json
+    spec: RunSpec
+    rows: list[dict[str, Any]]  # metrics of each epoch
+    result: dict[str, Any]  # content of result.json; empty if the run has not ended
+
+    @property
+    def status(self) -> str:
+        """Finished, failed or not ended."""
+        return str(self.result.get("status", "not ended"))
+
+    def column(self, name: str) -> NDArray:
+        """A metric of all epochs, shape [P]; NaN if an epoch lacks it."""
+        return np.array([row.get(name, math.nan) for row in self.rows], float)
+
+
+def read(folder: Path, with_policy: bool = True) -> Record:
+    """Reads the files of a run. Raises FolderError if it is not a run folder, or if files are damaged, belong to other runs or,
+    in an ended run, are incomplete. A run can resume without its policy, so the policy may be left out of the check.
     """
-    try:
-        result = read_result(folder)
-        content, spec = reading.read_run(folder)
-        rows = read_metrics(folder)
+    result = read_result(folder) if has_result(folder) else {}
+    content, spec = reading.read_run(folder)
+    rows = read_metrics(folder)
+    if result:
         if with_policy and result["status"] == FINISHED:
-            if not (folder / run_folder.POLICY_FILE).exists():
-                return f"{folder} has no {run_folder.POLICY_FILE}"
+            path = folder / run_folder.POLICY_FILE
+            if not path.exists():
+                raise FolderError(f"{folder} has no {run_folder.POLICY_FILE}")
             if other := reading.foreign(content, spec, reading.read_policy_settings(folder)):
-                return f"{folder / run_folder.POLICY_FILE} is of a run with other settings: {other}"
+                raise FolderError(f"{path} is of a run with other settings: {other}")
+        epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
+        path = folder / run_folder.METRICS_FILE
+        if len(rows) != epochs:
+            raise FolderError(f"{path} has complete lines of {len(rows)} of {epochs} epochs")
+        if rows and (last := rows[-1].get(loggers.DIGEST)) != content["digest"]:
+            raise FolderError(f"{path} ends with the digest {last}, not {content['digest']}")
+    return Record(folder, content, spec, rows, result)
+
+
+def result_problem(folder: Path, with_policy: bool = True) -> str | None:
+    """Message of the error of `read`, or None if the run's files are valid."""
+    try:
+        read(folder, with_policy)
     except FolderError as error:
         return str(error)
-    epochs = result["epochs"] - (result["status"] == FAILED)  # the epoch that failed has no line
-    if len(rows) != epochs:
-        return f"{folder / run_folder.METRICS_FILE} has complete lines of {len(rows)} of {epochs} epochs"
-    if rows and rows[-1].get(loggers.DIGEST) != content["digest"]:
-        return (
-            f"{folder / run_folder.METRICS_FILE} ends with the digest {rows[-1].get(loggers.DIGEST)}, not {content['digest']}"
-        )
     return None
 
 
