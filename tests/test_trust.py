@@ -17,8 +17,7 @@ from rich.table import Table
 
 import mjx_dher
 from mjx_dher import RunSpec, cli, envs, import_paths, trust
-from mjx_dher.cli import train
-from mjx_dher.cli.output import PlainConsole, printable
+from mjx_dher.cli import PlainConsole, printable, train
 from mjx_dher.components import COMPONENTS
 from mjx_dher.policy import Policy
 from mjx_dher.runs.folder import reading, run_folder

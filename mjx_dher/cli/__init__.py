@@ -1,17 +1,26 @@
-"""The command line: `python train.py COMMAND`. Arguments are checked before JAX or MuJoCo is loaded."""
+"""The command line: `python train.py COMMAND`. Arguments are checked before JAX or MuJoCo is loaded.
+
+Standard output may fail without stopping a command.
+"""
 
 import atexit
 import contextlib
+import errno
 import gc
 import importlib
+import io
+import os
+import re
+import signal
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
 from rich.console import Console
+from rich.text import Text
 
 from mjx_dher import __version__, lookup
-from mjx_dher.cli import output
 from mjx_dher.system import signals
 
 Args = TypeVar("Args")
@@ -63,6 +72,8 @@ _FOREIGN = {
 FOREIGN_FLAGS = {theirs: ours for ours, flags in _FOREIGN.items() for theirs in flags.split()}
 MEMORY = ("num_envs", "batch_size", "hidden_sizes", "replay_size", "eval_episodes", "final_episodes")  # settings that need it
 TRAINING = ("train", "resume", "sweep")  # commands whose output is on disk, not on the screen
+# Characters that control a terminal or reverse its text, except tab and line feed.
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = argv.pop(0) if argv and argv[0] in COMMANDS else "train"
     lookup.current_folder = True  # for --env module:attribute
     trains = name in TRAINING and not {"--dry-run", "--version"} & set(argv)
-    with signals.taken(), output.guarded() as stream:
+    with signals.taken(), _guarded() as stream:
         try:
             ended = _run(name, argv)
         except SystemExit as error:  # from --help, or invalid arguments
@@ -81,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             lookup.trusts_files = False
         stream.flush()
-    return output.status(stream, ended, trains)
+    return _status(stream, ended, trains)
 
 
 def _run(name: str, argv: list[str]) -> int:
@@ -91,14 +102,18 @@ def _run(name: str, argv: list[str]) -> int:
             return 0
         if name == "train" and argv and not argv[0].startswith("-"):
             lookup.check_name("command", argv[0], COMMANDS)
-        return run(name, argv, output.PlainConsole(soft_wrap=True))
+        return run(name, argv, PlainConsole(soft_wrap=True))
     except Exception as error:
         if (reason := sentence(error)) is None:
             raise  # a bug, whose traceback is needed
-        with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
-            for line in reason.splitlines():
-                print(f"error: {output.printable(line)}", file=sys.stderr)
+        _print_error(reason)
         return 2
+
+
+def _print_error(reason: str) -> None:
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # stderr is gone
+        for line in reason.splitlines():
+            print(f"error: {printable(line)}", file=sys.stderr)
 
 
 def sentence(error: Exception) -> str | None:
@@ -142,3 +157,94 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
     args = tyro.cli(kind, prog=prog, args=argv, **options)
     lookup.trusts_files = getattr(args, "trust", False)
     return args
+
+
+def printable(text: str) -> str:
+    """Text with escaped control characters, and escaped bytes of file names that are not valid UTF-8."""
+    return _CONTROL.sub(lambda match: repr(match[0])[1:-1], lookup.escaped(text))
+
+
+class PlainConsole(Console):
+    """A console that prints text without markup and with escaped control characters."""
+
+    def __init__(self, **options: Any):
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
+
+class _Guarded:
+    """A text stream that drops text that cannot be written, and keeps the first error."""
+
+    def __init__(self, stream: Any):
+        self.error: OSError | None = None
+        self._closed = stream is None  # closed before this program started
+        self._stream = open(os.devnull, "w", encoding="utf-8") if self._closed else stream  # noqa: SIM115
+
+    def write(self, text: str) -> int:
+        self._attempt("write", text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._attempt("flush")
+
+    def _attempt(self, method: str, *args: Any) -> None:
+        if self.error is not None:
+            return
+        try:
+            if self._closed and args:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            getattr(self._stream, method)(*args)
+        except OSError as error:
+            self.error = error
+            # Otherwise the interpreter would report an error when it flushes the rest.
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _open_closed() -> None:
+    """Opens closed standard streams on /dev/null.
+
+    Otherwise the next opened file would get the number of a standard stream, and output of C libraries would go into it.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number
+
+
+@contextlib.contextmanager
+def _guarded() -> Iterator[_Guarded]:
+    """Guards sys.stdout. Characters that it cannot encode are escaped, and control characters in warnings too."""
+    _open_closed()
+    before, form = sys.stdout, warnings.formatwarning
+    if isinstance(before, io.TextIOWrapper):
+        before.reconfigure(errors="backslashreplace")
+    stream = _Guarded(before)
+    sys.stdout = stream
+    warnings.formatwarning = lambda *about, **options: printable(form(*about, **options))
+    try:
+        yield stream
+    finally:
+        stream.flush()
+        sys.stdout, warnings.formatwarning = before, form
+
+
+def _status(stream: _Guarded, ended: int, trains: bool) -> int:
+    """Exit status of a command that ended with `ended`. Reports lost output.
+
+    A command that trains has still done its work. For others lost output is an error or, if the reader has gone (`| head`),
+    the status of SIGPIPE.
+    """
+    if stream.error is None:
+        return ended
+    gone = isinstance(stream.error, BrokenPipeError)
+    if not gone or trains:
+        lost = "later output is lost" if trains else "the output is incomplete"
+        _print_error(f"cannot print ({stream.error.strerror}); {lost}")
+    return ended if trains or ended else (128 + signal.SIGPIPE if gone else 2)

@@ -16,7 +16,7 @@ from rich.table import Column, Table
 from typing_extensions import Doc
 
 from mjx_dher import __version__, envs
-from mjx_dher.cli.output import PlainConsole
+from mjx_dher.cli import PlainConsole
 from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import ENGINES, RunSpec, custom_components

@@ -12,9 +12,8 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup
-from mjx_dher.cli import common, parse
+from mjx_dher.cli import PlainConsole, common, parse
 from mjx_dher.cli.common import EnvKwargs, Physics, Trust
-from mjx_dher.cli.output import PlainConsole
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import RunSpec, to_arguments, to_texts
