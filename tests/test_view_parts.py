@@ -53,28 +53,27 @@ def of_package(name):
 @pytest.mark.parametrize("name", ["push", "pick_and_place", "slide", "reach"])
 def test_what_can_be_seen_of_a_task_is_drawn(name):
     model = envs.make(name, engine="native").model
-    drawn = {shape.name for shape in scene.shapes(model)}
+    drawn = {model.geom(i).name or f"geom_{i}" for i in scene.visible(model)}
     visible = {model.geom(i).name or f"geom_{i}" for i in range(model.ngeom) if model.geom_rgba[i, 3] > 0}
     assert drawn == visible
     assert {"floor", "table"} <= drawn
     assert ("object" in drawn) == (name != "reach")
-    assert not any("stand_in" in shape for shape in drawn)
+    assert not any("stand_in" in name for name in drawn)
 
 
-def test_shapes_lie_where_mujoco_has_them():
-    """A shape's place in its body's frame, moved with the body, is MuJoCo's own place of the geom."""
+def test_geoms_lie_where_mujoco_has_them():
+    """A geom's place in its body's frame, moved with the body, is MuJoCo's own place of the geom."""
     env = envs.make("slide", engine="native")
     qpos = np.asarray(env.reset(jax.random.key(0)).physics.qpos, float)
     positions, orientations = scene.Poses(env.model).at(qpos)
     data = mujoco.MjData(env.model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(env.model, data)
-    assert len(scene.shapes(env.model)) > 10
-    for shape in scene.shapes(env.model):
-        turned = np.zeros(3)
-        mujoco.mju_rotVecQuat(turned, shape.pos, orientations[shape.body])
-        index = next(i for i in range(env.model.ngeom) if (env.model.geom(i).name or f"geom_{i}") == shape.name)
-        np.testing.assert_allclose(positions[shape.body] + turned, data.geom_xpos[index], atol=1e-12)
+    assert len(scene.visible(env.model)) > 10
+    for geom in scene.visible(env.model):
+        turned, body = np.zeros(3), env.model.geom_bodyid[geom]
+        mujoco.mju_rotVecQuat(turned, env.model.geom_pos[geom], orientations[body])
+        np.testing.assert_allclose(positions[body] + turned, data.geom_xpos[geom], atol=1e-12)
 
 
 def test_every_kind_of_geom_is_drawn():
@@ -141,7 +140,7 @@ def test_a_geom_that_cannot_be_drawn_is_named():
     xml = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
         <worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>"""
     with refuses("mjGEOM_HFIELD"):
-        scene.shapes(mujoco.MjModel.from_xml_string(xml))
+        scene.visible(mujoco.MjModel.from_xml_string(xml))
 
 
 # Critics

@@ -1,48 +1,26 @@
 """A MuJoCo model as a viser scene, with nodes that move with its bodies."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjx_dher.tools.render import geom_rgba, ghost_rgba
 
-_FLOOR = (0.80, 0.82, 0.85)  # colour of a plane
+_FLOOR = (0.80, 0.82, 0.85)  # colour of a plane with a material
 _TYPES = mujoco.mjtGeom
+_ROUND = (_TYPES.mjGEOM_SPHERE, _TYPES.mjGEOM_CAPSULE, _TYPES.mjGEOM_ELLIPSOID, _TYPES.mjGEOM_CYLINDER)
+_KINDS = {int(kind) for kind in (*_ROUND, _TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
 
 
-class Shape(NamedTuple):
-    """A visible geom, in its body's frame."""
-
-    name: str
-    body: int
-    kind: int  # mujoco.mjtGeom
-    size: np.ndarray  # [3] as in MuJoCo
-    rgba: np.ndarray  # [4] in [0, 1]
-    pos: np.ndarray  # [3] m
-    quat: np.ndarray  # [4] w, x, y, z
-    mesh: int  # index of its mesh, or -1
-
-
-def shapes(model: Any) -> list[Shape]:
-    """Visible geoms of a compiled model, in its order. Raises ValueError if a geom type is not supported."""
-    known = {int(kind) for kind in (_TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_SPHERE, _TYPES.mjGEOM_CAPSULE, _TYPES.mjGEOM_ELLIPSOID)}
-    known |= {int(kind) for kind in (_TYPES.mjGEOM_CYLINDER, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
-    seen = []
-    for index in range(model.ngeom):
-        rgba, kind = geom_rgba(model, index), int(model.geom_type[index])
-        material = int(model.geom_matid[index])
-        if rgba[3] == 0 or model.geom_group[index] > 2:  # groups that MuJoCo's viewer hides
-            continue
-        if kind not in known:
+def visible(model: Any) -> list[int]:
+    """Visible geoms of a compiled model. Raises ValueError if one has a type that is not supported."""
+    # MuJoCo's viewer hides the groups above 2, too.
+    geoms = [geom for geom in range(model.ngeom) if geom_rgba(model, geom)[3] > 0 and model.geom_group[geom] <= 2]
+    for kind in model.geom_type[geoms]:
+        if kind not in _KINDS:
             raise ValueError(f"the viewer does not draw geoms of kind {_TYPES(kind).name}")
-        if kind == int(_TYPES.mjGEOM_PLANE) and material >= 0:
-            rgba = np.array([*_FLOOR, 1.0])
-        name = model.geom(index).name or f"geom_{index}"
-        look = model.geom_size[index].copy(), rgba.copy()
-        place = model.geom_pos[index].copy(), model.geom_quat[index].copy()
-        seen.append(Shape(name, int(model.geom_bodyid[index]), kind, *look, *place, int(model.geom_dataid[index])))
-    return seen
+    return geoms
 
 
 class Poses:
@@ -76,22 +54,23 @@ def add(scene: Any, model: Any, ghosts: Any = None) -> dict[int, Any]:
     """
     nodes: dict[int, Any] = {}
     folder = "/bodies" if ghosts is None else "/ghosts"
-    chosen = shapes(model)
-    if ghosts is not None:
-        chosen = [shape._replace(rgba=ghost_rgba(shape.rgba)) for shape in chosen if shape.body in ghosts]
-    for shape in chosen:
-        if shape.body not in nodes:
-            nodes[shape.body] = scene.add_frame(f"{folder}/{shape.body}", show_axes=False)
-        name = shape.name.replace("/", "|")  # a slash would put it into another geom's frame
-        _add_shape(scene, model, shape, f"{folder}/{shape.body}/{name}")
+    for geom in visible(model):
+        body, rgba = int(model.geom_bodyid[geom]), geom_rgba(model, geom)
+        if ghosts is not None and body not in ghosts:
+            continue
+        if body not in nodes:
+            nodes[body] = scene.add_frame(f"{folder}/{body}", show_axes=False)
+        name = (model.geom(geom).name or f"geom_{geom}").replace("/", "|")  # a slash would put it into another geom's frame
+        _add_geom(scene, model, geom, rgba if ghosts is None else ghost_rgba(rgba), f"{folder}/{body}/{name}")
     return nodes
 
 
-def _add_shape(scene: Any, model: Any, shape: Shape, name: str) -> None:
-    rgb = tuple(round(255 * float(x)) for x in shape.rgba[:3])
-    x, y, z = map(float, shape.size)
-    if shape.kind == int(_TYPES.mjGEOM_PLANE):
+def _add_geom(scene: Any, model: Any, geom: int, rgba: np.ndarray, name: str) -> None:
+    kind, (x, y, z) = model.geom_type[geom], map(float, model.geom_size[geom])
+    place = {"position": model.geom_pos[geom].copy(), "wxyz": model.geom_quat[geom].copy()}
+    if kind == _TYPES.mjGEOM_PLANE:
         wide, deep = (2 * side if side > 0 else 20.0 for side in (x, y))  # 0 means infinite
+        rgb = _to_bytes(_FLOOR if model.geom_matid[geom] >= 0 else rgba)
         scene.add_grid(
             name,
             wide,
@@ -103,38 +82,40 @@ def _add_shape(scene: Any, model: Any, shape: Shape, name: str) -> None:
             plane_color=rgb,
             plane_opacity=1.0,
             shadow_opacity=0.3,
-            position=shape.pos,
-            wxyz=shape.quat,
+            **place,
         )
         return
-    look: dict[str, Any] = {"color": rgb, "position": shape.pos, "wxyz": shape.quat}
-    look["opacity"] = None if shape.rgba[3] >= 1 else float(shape.rgba[3])
-    if shape.kind == int(_TYPES.mjGEOM_BOX):
+    look: dict[str, Any] = {"color": _to_bytes(rgba), "opacity": None if rgba[3] >= 1 else float(rgba[3]), **place}
+    if kind == _TYPES.mjGEOM_BOX:
         scene.add_box(name, dimensions=(2 * x, 2 * y, 2 * z), **look)
-    elif shape.kind == int(_TYPES.mjGEOM_CYLINDER):
+    elif kind == _TYPES.mjGEOM_CYLINDER:
         scene.add_cylinder(name, radius=x, height=2 * y, radial_segments=48, **look)
-    elif shape.kind == int(_TYPES.mjGEOM_SPHERE):
+    elif kind == _TYPES.mjGEOM_SPHERE:
         scene.add_icosphere(name, radius=x, subdivisions=3, **look)
     else:
-        vertices, faces = _mesh(model, shape)
-        scene.add_mesh_simple(name, vertices, faces, **look)
+        scene.add_mesh_simple(name, *_mesh(model, geom), **look)
 
 
-def _mesh(model: Any, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+def _mesh(model: Any, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] in m and triangles [F, 3] of a capsule, an ellipsoid or a mesh."""
     import trimesh
 
-    if shape.kind == int(_TYPES.mjGEOM_CAPSULE):
-        mesh = trimesh.creation.capsule(height=2 * float(shape.size[1]), radius=float(shape.size[0]), count=[24, 24])
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == _TYPES.mjGEOM_CAPSULE:
+        mesh = trimesh.creation.capsule(height=2 * float(size[1]), radius=float(size[0]), count=[24, 24])
         middle = np.mean(mesh.bounds, axis=0)  # the origin of a capsule depends on trimesh's version
         return np.asarray(mesh.vertices - middle, np.float32), np.asarray(mesh.faces, np.uint32)
-    if shape.kind == int(_TYPES.mjGEOM_ELLIPSOID):
+    if kind == _TYPES.mjGEOM_ELLIPSOID:
         mesh = trimesh.creation.icosphere(subdivisions=3)
-        return np.asarray(mesh.vertices * shape.size, np.float32), np.asarray(mesh.faces, np.uint32)
-    number = shape.mesh
+        return np.asarray(mesh.vertices * size, np.float32), np.asarray(mesh.faces, np.uint32)
+    number = model.geom_dataid[geom]
     start, count = int(model.mesh_vertadr[number]), int(model.mesh_vertnum[number])
     first, faces = int(model.mesh_faceadr[number]), int(model.mesh_facenum[number])
     return model.mesh_vert[start : start + count].copy(), model.mesh_face[first : first + faces].astype(np.uint32)
+
+
+def _to_bytes(rgba: Any) -> tuple[int, ...]:
+    return tuple(round(255 * float(x)) for x in rgba[:3])
 
 
 def _shade(rgb: tuple[int, ...], factor: float) -> tuple[int, ...]:
