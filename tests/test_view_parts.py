@@ -148,10 +148,10 @@ def test_a_geom_that_cannot_be_drawn_is_named():
 
 def test_a_critic_is_in_a_checkpoint(stopped):
     folder, run = stopped
-    loaded = sources.load_critic(folder, run, reach())
-    assert loaded.epoch == 1
+    value, epoch = sources.load_critic(folder, run, reach())
+    assert epoch == 1
     obs = {"observation": np.zeros(10, np.float32), "achieved_goal": np.zeros(3), "desired_goal": np.ones(3, np.float32)}
-    assert loaded.value(obs, np.zeros(4, np.float32)) != loaded.value(obs, np.ones(4, np.float32))
+    assert value(obs, np.zeros(4, np.float32)) != value(obs, np.ones(4, np.float32))
     with refuses("checkpoint", error=FolderError):
         sources.load_critic(bundled.FOLDER / "reach", dataclasses.replace(run), reach())
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -138,23 +138,15 @@ class Cast:
             return
         self._critic_seen = newest
         try:
-            loaded = load_critic(folder, run, self._env)
+            self.value, epoch = load_critic(folder, run, self._env)
+            self.critic = f"Critic of epoch {epoch}."
         except (ValueError, OSError) as error:
             self.critic = f"No critic: {error}."
-        else:
-            self.value, self.critic = loaded.value, f"Critic of epoch {loaded.epoch}."
 
 
-class Critic(NamedTuple):
-    """Value function of a run's critic, and its age."""
-
-    value: Callable[[Mapping[str, Any], Any], float]  # observation of one state, action [A] -> expected return
-    epoch: int  # epochs that had ended
-
-
-def load_critic(folder: Path, run: RunSpec, env: Env) -> Critic:
-    """Critic in the newest checkpoint of a run that was trained alone. A finished run has none, because its checkpoints are
-    deleted. Raises FolderError if no checkpoint is usable, or the run's learner has no `value`.
+def load_critic(folder: Path, run: RunSpec, env: Env) -> tuple[Value, int]:
+    """Critic in the newest checkpoint of a run that was trained alone, and the epochs that had ended. A finished run has none,
+    because its checkpoints are deleted. Raises FolderError if no checkpoint is usable, or the run's learner has no `value`.
     """
     run = dataclasses.replace(run, demonstrations=None)  # the checkpoint's ring holds them
     train = program.make_loop(env, run, program.choices_of([run]))
@@ -171,7 +163,7 @@ def load_critic(folder: Path, run: RunSpec, env: Env) -> Critic:
     def expect(obs: Mapping[str, Any], action: Any) -> float:
         return float(np.asarray(value(state, dict(obs), jnp.asarray(action))))
 
-    return Critic(expect, restored.epoch)
+    return expect, restored.epoch
 
 
 def _random(action_size: int) -> Callable[[Mapping[str, np.ndarray]], np.ndarray]:
