@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mjx_dher import stats
 from mjx_dher.components import COMPONENTS, reads
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
@@ -46,13 +47,13 @@ def groups(trials: list[dict[str, Any]]) -> dict[str, list[Group]]:
 
 def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
     settings = [trial["settings"] for trial in trials]
-    varying = [name for name in settings[0] if name not in ("sampler", "env") and len({str(s[name]) for s in settings}) > 1]
+    varying = [name for name in fingerprint.varying(settings) if name != "sampler"]
     by_setting: dict[str, tuple[dict[str, Any], list[dict[str, Any]]]] = {}
     for trial, setting in zip(trials, settings):
         own = {name: setting[name] for name in varying if reads(setting, name)}
         by_setting.setdefault(str((setting["sampler"], own)), (own, []))[1].append(trial)
     order = {name: number for number, name in enumerate(COMPONENTS["sampler"])}
-    labels = [_label(alike[0], own, _format) for own, alike in by_setting.values()]
+    labels = [_label(alike[0], own, fingerprint.named) for own, alike in by_setting.values()]
     exact = [_label(alike[0], own, lambda name, value: f"{name} {value!r}") for own, alike in by_setting.values()]
     labels = [label if labels.count(label) == 1 else digits for label, digits in zip(labels, exact)]
     result = [_group(env, label, own, _once_a_seed(alike)) for label, (own, alike) in zip(labels, by_setting.values())]
@@ -66,14 +67,6 @@ def _groups_of(env: str, trials: list[dict[str, Any]]) -> list[Group]:
 def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any], str]) -> str:
     told = (form(name, value) for name, value in own.items() if (name, value) != ("source", ""))
     return ", ".join([trial["settings"]["sampler"], *told])
-
-
-def _format(name: str, value: Any) -> str:
-    if isinstance(value, str):
-        return value or f"{name} unknown"
-    if name == "env_kwargs":
-        return " ".join(value) or "env_kwargs none"
-    return f"{name} {value:g}" if isinstance(value, (int, float)) else f"{name} {value}"
 
 
 def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -128,7 +128,7 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
 
 
 def _runs(trials: Sequence[dict[str, Any]]) -> str:
-    varying = _varying(trials)
+    varying = fingerprint.varying([trial["settings"] for trial in trials])
     head = ["run", *varying, "seed", "status", "success", "at the reset", "seconds", "reason"]
     rows = []
     for trial in trials:
@@ -139,13 +139,8 @@ def _runs(trials: Sequence[dict[str, Any]]) -> str:
     return _table(head, rows)
 
 
-def _varying(trials: Sequence[dict[str, Any]]) -> list[str]:
-    settings = [trial["settings"] for trial in trials]
-    return [name for name in settings[0] if len({str(each.get(name)) for each in settings}) > 1]
-
-
 def _shared_settings(trials: Sequence[dict[str, Any]]) -> Iterable[str]:
-    varying, first = _varying(trials), trials[0]["settings"]
+    varying, first = fingerprint.varying([trial["settings"] for trial in trials]), trials[0]["settings"]
     if varying:
         yield _element("p", f"Runs differ in {', '.join(varying)}.")
     rows = [(name, text(value)) for name, value in first.items() if name not in varying]

@@ -107,16 +107,10 @@ def _unit(curves: Sequence[Record]) -> tuple[float, str]:
 def labels(curves: Sequence[Record]) -> list[str]:
     """Name of each run: the settings in which the runs differ, or else their folders."""
     settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
-    varying = [name for name in settings[0] if len({str(each[name]) for each in settings}) > 1 and name != "engine"]
-    told = [", ".join(_value(name, each[name]) for name in varying) for each in settings]
+    varying = [name for name in fingerprint.varying(settings) if name != "engine"]
+    told = [", ".join(fingerprint.named(name, each[name]) for name in varying) for each in settings]
     apart = [text if text and told.count(text) == 1 else f"{text}: {c.folder}".lstrip(": ") for text, c in zip(told, curves)]
     return [f"{text} ({c.status})" if c.status != run_folder.FINISHED else text for text, c in zip(apart, curves)]
-
-
-def _value(name: str, value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"{name} {' '.join(map(str, value)) or 'none'}"
-    return f"{name} {value:g}" if isinstance(value, (int, float)) else str(value)
 
 
 def draw_together(curves: Sequence[Record]) -> Any:

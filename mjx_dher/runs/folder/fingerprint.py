@@ -74,6 +74,16 @@ def text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def named(name: str, value: Any) -> str:
+    """A setting in the name of a run: a component's name alone, or a value with the setting's name."""
+    return value if value and isinstance(value, str) else f"{name} {text(value) or 'unknown'}"
+
+
+def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of settings in which runs differ."""
+    return [name for name in settings[0] if len({str(each.get(name)) for each in settings}) > 1]
+
+
 def sources(spec: RunSpec) -> dict[str, str]:
     """Names and digests of the files of custom components and demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
