@@ -180,7 +180,8 @@ def repeats(data: Mapping[str, Sweeps]) -> str:
 def pooled(differences: Sequence[Difference]) -> tuple[float, float, float]:
     """Random-effects mean of the differences, and its 95 % interval.
 
-    Source: DerSimonian & Laird (1986) for the spread between sweeps, Hartung & Knapp (2001) for the interval.
+    Source: DerSimonian & Laird (1986) for the spread between sweeps, Knapp & Hartung (2003) for the interval. It is no narrower
+    than the spread of the seeds alone allows: sweeps that agree by luck would make it too short.
     """
     means = np.array([d.mean for d in differences])
     within = np.array([d.each.var(ddof=1) / len(d.each) for d in differences])
@@ -190,8 +191,8 @@ def pooled(differences: Sequence[Difference]) -> tuple[float, float, float]:
     between = max(0.0, excess / (weights.sum() - (weights**2).sum() / weights.sum()))
     weights = 1 / (within + between)
     mean = float(np.average(means, weights=weights))
-    variance = float(weights @ (means - mean) ** 2) / ((len(means) - 1) * weights.sum())
-    half = float(t.ppf(0.975, len(means) - 1)) * math.sqrt(variance)
+    scale = max(1.0, float(weights @ (means - mean) ** 2) / (len(means) - 1))
+    half = float(t.ppf(0.975, len(means) - 1)) * math.sqrt(scale / weights.sum())
     return mean, mean - half, mean + half
 
 

@@ -256,6 +256,83 @@ def test_the_gain_of_td_error_with_fresh_seeds_and_over_all_sweeps(first_seed, p
         assert first_seed == 0 or shown in readme
 
 
+def areas(curves, epochs):
+    """Mean success by seed, by the trapezoidal rule."""
+    return {seed: np.trapezoid(curve[:epochs]) / (min(epochs, len(curve)) - 1) for seed, curve in curves.items()}
+
+
+def test_slide_s_pooled_loss_over_all_epochs_and_over_the_first_hundred(committed):
+    """The sweeps differ by no more than their seeds make them, so 1 / variance is their weight."""
+    sweeps = [({name: committed["slide", sweep, name] for name in ("weighted", "future")}) for sweep in ("own_slide", "slide")]
+    for sweep in ("samplers", "fast", "hopper"):
+        older = paper_analysis.load()["slide"]
+        sweeps.append({name: dict(enumerate(older[sweep, name].success)) for name in ("weighted", "future")})
+    results, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/results.md", "README.md"))
+    for epochs in (200, 100):
+        gains = [
+            np.array([areas(own["weighted"], epochs)[s] - x for s, x in areas(own["future"], epochs).items()]) for own in sweeps
+        ]
+        means, weights = np.array([x.mean() for x in gains]), np.array([len(x) / x.var(ddof=1) for x in gains])
+        mean, half = np.average(means, weights=weights), scipy.stats.t.ppf(0.975, 4) / weights.sum() ** 0.5
+        assert weights @ (means - mean) ** 2 < 4
+        if epochs == 200:
+            assert f"{-mean:.3f} ({-mean - half:.3f} to {-mean + half:.3f})" in readme
+            assert f"| Slide | 5 | 50 | {mean:+.3f} | {mean - half:+.3f} to {mean + half:+.3f} |" in results
+        else:
+            assert f"{mean:.3f} ({mean - half:.3f} to {mean + half:+.3f})" in results
+
+
+def test_what_the_pages_say_of_slide_s_late_epochs(committed):
+    results, plan = (
+        " ".join((ROOT / "docs" / n).read_text().split()) for n in ("results.md", "experiments/paper_own_cycles.md")
+    )
+    worst, shares = [], []
+    for sweep in ("own_slide", "slide"):
+        late = {
+            name: np.array([np.mean(x[-20:]) for x in committed["slide", sweep, name].values()])
+            for name in ("weighted", "future")
+        }
+        assert late["future"].min() > 0.55
+        gains = late["weighted"] - late["future"]
+        assert gains.argmin() == late["weighted"].argmin()
+        worst.append(late["weighted"].min())
+        shares.append(gains.min() / gains.sum())
+    assert f"averages {worst[0]:.3f}, and {worst[1]:.3f} with one cycle per epoch" in results
+    assert f"They cause {shares[0]:.2f} and {shares[1]:.2f} of the late difference" in results
+    own, long = (np.mean(list(committed["slide", sweep, "future"].values()), axis=0) for sweep in ("own_slide", "slide"))
+    tens = [x[i : i + 10].mean() for x, i in ((long, 30), (long, 90), (long, 190), (own, 30), (own, 90))]
+    assert "from {:.3f} in epochs 31 to 40 to {:.3f} in 91 to 100, and to {:.3f} in the last ten".format(*tens[:3]) in plan
+    assert "With the paper's cycles it rises from {:.3f} to {:.3f}".format(*tens[3:]) in plan
+
+
+def paired(file, task, arm, base):
+    """Mean gain in mean success and its interval, from a file of runs."""
+    runs = {}
+    with (ROOT / "docs" / file).open() as rows:
+        for row in csv.DictReader(rows):
+            if row["task"] == task:
+                runs.setdefault(row["arm"], {})[row["seed"]] = float(row["mean_success"])
+    gains = np.array([x - runs[base][seed] for seed, x in runs[arm].items()])
+    return gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
+
+
+def test_what_the_pages_say_of_hands_and_of_contrastive_rl():
+    crl, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/experiments/crl.md", "README.md"))
+    hands = " ".join((ROOT / "docs" / "experiments" / "preset_hands.md").read_text().split())
+    assert "k 1 gains {:.3f} ({:.3f} to {:.3f})".format(*paired("hands_runs.csv", "block_rotate_z", "k1", "future")) in readme
+    k8, k16 = (paired("hands_runs.csv", "hand_reach", arm, "future")[0] for arm in ("k8", "k16"))
+    assert f"k 8 and 16 gain {k8:.3f} and {k16:.3f}" in hands
+    assert f"ends at {paired('hands_runs.csv', 'block_rotate_z', 'td_error', 'future')[2]:.3f}" in hands
+    zero = 0
+    for task in ("push", "pick_and_place", "arm_push_easy", "slide", "arm_push_hard"):
+        for learner in ("sac", "tqc"):
+            mean, low, high = paired("crl_runs.csv", task, f"{learner}_final", f"{learner}_k4")
+            zero += low < 0 < high
+            small, large = sorted((abs(low), abs(high)))
+            assert low < 0 < high or f"{abs(mean):.3f} ({small:.3f} to {large:.3f})" in crl.replace("95 % interval ", "")
+    assert (zero, "The other five intervals contain 0" in crl) == (5, True)
+
+
 def test_the_benchmarks_say_the_same_of_the_presets():
     text = (ROOT / "bench" / "README.md").read_text()
     for task in ("push", "pick_and_place", "slide"):

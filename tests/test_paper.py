@@ -177,6 +177,12 @@ def test_the_pooled_estimate_by_hand():
     assert make_results_figures.pooled(sweeps) == pytest.approx((0.2, 0.2 - 1.2706, 0.2 + 1.2706), abs=1e-3)
 
 
+def test_sweeps_that_agree_by_luck_have_no_shorter_interval():
+    """Two equal means with variances of 0.01: 12.706 times the root of 0.01 / 2. The spread of the means alone would give 0."""
+    sweeps = [paper_analysis.Difference(0.1 + np.array([-0.1, 0.1]), 0.1, 0.0, 0.0, 1.0)] * 2
+    assert make_results_figures.pooled(sweeps) == pytest.approx((0.1, 0.1 - 0.8985, 0.1 + 0.8985), abs=1e-3)
+
+
 def test_sweeps_of_other_precision_are_weighed_by_both_variances():
     """Means 0 and 0.3, variances 0.01 and 0.03: Q is 2.25, the variance between 0.025, the weights 1/0.035 and 1/0.055."""
     sweeps = [
