@@ -52,13 +52,13 @@ def make_batch(size=64):
     )
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("td3", "csac", "redq", "tqc", "dtqc", "crl")]
+SLOW = [pytest.param(name, "mlp", marks=pytest.mark.slow) for name in ("td3", "sac", "csac", "redq", "tqc", "dtqc", "crl")]
 
 
-@pytest.mark.parametrize("name", ["ddpg", "sac", *SLOW])
-def test_the_gradient_of_a_batch_is_that_of_its_parts(name):
+@pytest.mark.parametrize(("name", "networks"), [("ddpg", "mlp"), ("sac", "layer_norm"), *SLOW])
+def test_the_gradient_of_a_batch_is_that_of_its_parts(name, networks):
     """By Adam's moments after one update, a tenth and a thousandth of the gradient and its square."""
-    learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SPEC)
+    learner = learners.make(name, dataclasses.replace(CONFIG, learner_dtype="float32"), SPEC, networks)
     state = learner.init(jax.random.key(0))
 
     def update(axis_name, state, batch):

@@ -10,7 +10,7 @@ import optax
 import pytest
 from configs import LEARNS
 
-from mjx_dher import HParams, learners, networks
+from mjx_dher import HParams, layers, learners, networks
 from mjx_dher.learners import critics
 from mjx_dher.learners.critics import Categorical, Critics
 from mjx_dher.networks import Critic, Style
@@ -191,6 +191,22 @@ def test_layers_that_sum_by_products_have_the_gradients_of_flax(dtype):
     for own, flax in zip(jax.tree.leaves(gradients(Ours())), jax.tree.leaves(gradients(Flax()))):
         assert own.dtype == jnp.float32
         np.testing.assert_allclose(own, flax, atol=tolerance * float(jnp.abs(flax).max()))
+
+
+@pytest.mark.parametrize("shape", [(4,), (6, 4), (2, 3, 4), (0, 4)])
+def test_layers_have_the_second_derivatives_of_flax(shape):
+    """Of a penalty on the gradient by the input, for inputs with any leading axes and for an empty batch."""
+    own = layers.Dense(5, jnp.float32, nn.initializers.xavier_uniform()), layers.LayerNorm(jnp.float32)
+    flax = nn.Dense(5), nn.LayerNorm()
+    x = jax.random.normal(KEY, shape)
+    params = own[0].init(KEY, x), jax.tree.map(lambda p: p + 0.3, own[1].init(KEY, jnp.zeros((*shape[:-1], 5))))
+
+    def penalty(params, modules):
+        output = lambda x: modules[1].apply(params[1], modules[0].apply(params[0], x))  # noqa: E731
+        return jnp.sum(jax.grad(lambda x: jnp.sum(jnp.tanh(output(x))))(x) ** 2)
+
+    for a, b in zip(*(jax.tree.leaves(jax.grad(penalty)(params, modules)) for modules in (own, flax))):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * float(jnp.abs(b).max()))
 
 
 def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1():
