@@ -56,7 +56,7 @@ def train(args: SweepArgs, console: Console) -> tuple[list[RunSpec], list[RunSpe
             try:
                 files.make_folder(storage)
             except OSError as error:
-                raise ValueError(f"storage: {storage} cannot be written to ({error.strerror})") from error
+                raise ValueError(f"storage: {storage.parent} cannot be written to ({error.strerror})") from error
         files.make_folder(args.out / grid.CELLS)
         with files.lock(args.out):
             todo = announce(args, trials, console)
