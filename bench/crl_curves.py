@@ -6,8 +6,8 @@
     python bench/crl_curves.py ours --tasks arm_reach --out ours.csv
     python bench/crl_curves.py report ours.csv theirs.csv
 
-docs/experiments/crl.md has the plan. Of JaxGCRL, the tasks, the learner and its loop run unchanged. Its evaluator is replaced,
-because it asks for metrics that arm tasks lack. wandb and the part of Brax that was removed are empty modules.
+docs/experiments/crl.md has the plan. JaxGCRL's tasks, learner and loop run unchanged. Its evaluator is replaced, because it
+needs metrics that arm tasks lack. wandb and the removed part of Brax are empty modules.
 """
 
 from __future__ import annotations
@@ -26,13 +26,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_dher.cli.settings import check_writable
+from mjx_dher.system.files import FolderError
+
 ROOT = Path(__file__).resolve().parents[1]
 ENVS, BATCH, EVALUATED = 256, 512, 100
 COLUMNS = ("who", "task", "seed", "env_steps", "success", "seconds")
 
 
 class Size(NamedTuple):
-    """Lengths of a task's runs. JaxGCRL updates on as many batches as all stored episodes have, after each unroll."""
+    """Lengths of a task's runs. After each unroll, JaxGCRL updates on the batches of one stored episode per environment."""
 
     length: int  # steps of an episode
     unroll: int  # steps between updates
@@ -84,7 +87,7 @@ def train_ours(task: str, seeds: range, toy: bool) -> Iterable[tuple]:
 
 def train_theirs(folder: Path, task: str, seed: int, toy: bool) -> Iterable[tuple]:
     """Rows of JaxGCRL's CRL."""
-    empty(folder)
+    make_importable(folder)
     import jax
     from jaxgcrl.agents.crl import crl
     from jaxgcrl.utils.config import RunConfig
@@ -124,8 +127,8 @@ def train_theirs(folder: Path, task: str, seed: int, toy: bool) -> Iterable[tupl
     return rows
 
 
-def empty(folder: Path) -> None:
-    """Makes JaxGCRL importable: modules that are missing and not needed, and the folder that its paths are relative to."""
+def make_importable(folder: Path) -> None:
+    """Adds empty modules for the missing ones, and enters the folder that JaxGCRL's paths start from."""
     sys.path.insert(0, str(folder))
     for name in ("brax.v1", "brax.v1.envs", "wandb", "wandb_osh", "wandb_osh.hooks"):
         module: Any = types.ModuleType(name)
@@ -136,7 +139,7 @@ def empty(folder: Path) -> None:
 
 
 def evaluator(episodes: int) -> type:
-    """A class with the interface of JaxGCRL's evaluator. Success is that of an episode's last state, as in this library."""
+    """A class with the interface of JaxGCRL's evaluator. Success is taken from an episode's last state."""
     import jax
 
     class LastState:
@@ -159,13 +162,21 @@ def evaluator(episodes: int) -> type:
     return LastState
 
 
+def _rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a file of curves, none if it does not exist."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def report(paths: list[Path]) -> str:
     """Table of mean success over the steps that both have, and its difference with Welch's interval."""
     from scipy import stats
 
     curves: dict[tuple[str, str], dict[str, list]] = {}
     for path in paths:
-        for row in csv.DictReader(path.open()):
+        for row in _rows(path):
             point = (float(row["env_steps"]), float(row["success"]))
             curves.setdefault((row["task"], row["who"]), {}).setdefault(row["seed"], []).append(point)
     lines = ["| task | who | seeds | mean success | last | difference | 95 % interval |", "|---|---|---|---|---|---|---|"]
@@ -201,11 +212,23 @@ def main() -> None:
     parser.add_argument("--toy", action="store_true", help="sizes that a CPU trains in minutes")
     args = parser.parse_args()
     if args.what == "report":
+        whos = {row["who"] for path in args.files for row in _rows(path)}
+        if whos != {"ours", "theirs"}:
+            parser.error(f"report needs files with curves of ours and theirs; got {', '.join(map(str, args.files)) or 'none'}")
         print(report(args.files))
         return
     if args.out is None or (args.what == "theirs") != (args.jaxgcrl is not None):
         parser.error("ours needs --out, theirs --out and --jaxgcrl")
+    if args.seeds < 1 or args.first_seed < 0:
+        parser.error(f"--seeds is 1 or more, and --first-seed 0 or more; got {args.seeds} and {args.first_seed}")
     seeds, out = range(args.first_seed, args.first_seed + args.seeds), args.out.resolve()
+    try:
+        check_writable(out.parent)
+    except FolderError as error:
+        parser.error(str(error))
+    known = {(row["who"], row["task"], int(row["seed"])) for row in _rows(out)}
+    if twice := known & {(args.what, task, seed) for task in args.tasks for seed in seeds}:
+        parser.error(f"{out} already has {', '.join(map(str, sorted(twice)))}; choose other seeds, tasks or another file")
     for task in args.tasks:
         parts = (
             [train_ours(task, seeds, args.toy)]

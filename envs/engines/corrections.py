@@ -98,7 +98,7 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
     that stand alone are implicit in gyroscopic forces.
 
     Args:
-      fixed: the model in MuJoCo's form; `model` is MJX's.
+      fixed: MuJoCo's form of the model.
       alone: joints of free bodies that stand alone.
     """
     if fixed.actuator_forcelimited.any():
