@@ -1,4 +1,4 @@
-"""Learning curves of JaxGCRL's own CRL beside the learner `crl`: same tasks, steps, updates, networks and losses.
+"""Learning curves of JaxGCRL's own CRL next to the learner `crl`: same tasks, steps, updates, networks and losses.
 
     git clone https://github.com/MichalBortkiewicz/JaxGCRL /tmp/jaxgcrl
     pip install --no-deps brax==0.14.2 jaxopt ml_collections tensorboardX jinja2 MarkupSafe
