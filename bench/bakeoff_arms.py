@@ -168,6 +168,8 @@ class Size:
 
 # The fast sweeps of docs/results.md, cut when `future` has learned: 7.0, 16.1 and 39.9 s per run of 50, 50 and 200 epochs.
 _FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
+# The preset until 2026-11-27, which the plans name.
+_HAND = {"cycles_per_epoch": 1, "updates_per_cycle": 1000, "learner_dtype": "float32"}
 # From five parallel runs in bench/README.md: 4.4, 11.8 and 40.2 s per run of 1.54, 1.02 and 8.19 million steps. The hand:
 # four runs of 4.1 million steps took 198 s, and five of `hand_reach` 55 s (docs/experiments/preset_hands.md).
 SIZES = {
@@ -178,7 +180,7 @@ SIZES = {
     ("best", "pick_and_place"): Size({"total_steps": 640_000}, 11.8 * 0.64 / 1.024),
     ("best", "slide"): Size({"cycles_per_epoch": 1, "total_steps": 1_740_800}, 40.2 * 1.741 / 8.192),
     ("best", "hand_reach"): Size({"total_steps": 1_024_000}, 11.0),
-    ("best", "block_rotate_z"): Size({"cycles_per_epoch": 1, "total_steps": 1_536_000}, 49.5 * 1.536 / 4.1),
+    ("best", "block_rotate_z"): Size({**_HAND, "total_steps": 1_536_000}, 49.5 * 1.536 / 4.1),
 }
 COMPILE_SECONDS = 30.0  # per program
 TOY: dict[str, Any] = {

@@ -16,10 +16,11 @@ import bakeoff
 from bakeoff_arms import COMPILE_SECONDS, TOY, Arm, Experiment
 
 from mjx_dher import presets
-from mjx_dher.presets import is_hand
+from mjx_dher.components import robot
 from mjx_dher.spec import RunSpec
 
-TASKS = ("reach", "push", "pick_and_place", "slide", "hand_reach", "block_rotate_z", "block_rotate_xyz", "egg_rotate")
+HANDS = ("hand_reach", "block_rotate_z", "block_rotate_parallel", "block_rotate_xyz", "egg_rotate")
+TASKS = ("reach", "push", "pick_and_place", "slide", *HANDS)
 # Seconds of one run among those that train together, from docs/experiments/presets.md and preset_hands.md.
 SECONDS = {
     ("cpu", "reach"): 20.0,
@@ -29,14 +30,17 @@ SECONDS = {
     ("gpu", "push"): 4.4,
     ("gpu", "pick_and_place"): 7.8,
     ("gpu", "slide"): 107.0,
-    ("gpu", "block_rotate_z"): 50.0,
+    ("gpu", "block_rotate_z"): 26.0,
+    ("gpu", "block_rotate_parallel"): 55.0,
+    ("gpu", "block_rotate_xyz"): 56.0,
+    ("gpu", "egg_rotate"): 73.0,
 }
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of a preset, seed 0, with README's sampler on the Fetch tasks."""
     del arm
-    run = presets.preset(learner, task, **({} if is_hand(task) else {"sampler": "weighted"}))
+    run = presets.preset(learner, task, **({} if robot(task) == "hand" else {"sampler": "weighted"}))
     return dataclasses.replace(run, config=dataclasses.replace(run.config, **TOY, n_step=1)) if toy else run
 
 

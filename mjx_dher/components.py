@@ -191,9 +191,10 @@ def load(field: str, value: Any, *parameters: str) -> Any:
     return check_function(field, value, parameters) if parameters else value
 
 
-def is_hand(env: Any) -> bool:
-    """Whether an environment is one of the built-in Shadow-hand tasks, by its name."""
-    return isinstance(env, str) and env in COMPONENTS["env"] and COMPONENTS["env"][env].path.startswith("mjx_dher.envs.hand:")
+def robot(env: Any) -> str:
+    """Module of a built-in environment, by its name: `fetch`, `hand` or `arms`. Empty for any other environment."""
+    built_in = COMPONENTS["env"].get(env) if isinstance(env, str) else None
+    return built_in.path.partition(":")[0].rpartition(".")[2] if built_in else ""
 
 
 def doc(field: str, text: str) -> Doc:

@@ -5,7 +5,7 @@ import importlib.util
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
-from mjx_dher.components import is_hand
+from mjx_dher.components import robot
 from mjx_dher.config import Config, HParams
 from mjx_dher.lookup import check_name
 from mjx_dher.spec import RunSpec
@@ -42,7 +42,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
       ValueError: there is no such preset.
     """
     check_name("preset", name, PRESETS)
-    best = _LEARNERS.get((name, env), _HANDS.get(name, _DDPG) if is_hand(env) else _DDPG)
+    best = _LEARNERS.get((name, env)) or _ROBOTS.get((name, robot(env)), _DDPG)
     if learner == "crl":
         best = _CRL
     elif learner not in (None, best.learner):
@@ -80,7 +80,7 @@ def _cpu(env: str) -> Settings:
         return _with(base, total_steps=1_000_000, noise_std=0.2, lr_end=0.05)
     if env == "slide":
         return _with(base, total_steps=1_500_000, replay_size=1_500_000, gamma=0.97, noise_std=0.2, lr_end=0.05)
-    if is_hand(env):
+    if robot(env) == "hand":
         return _with(base, cycles_per_epoch=8, total_steps=2_000_000, replay_size=2_000_000, gamma=0.98)
     return base
 
@@ -130,9 +130,17 @@ def _entropy(env: str, **changes: Any) -> Settings:
 
 
 def _gpu_hand(env: str) -> Settings:
-    total_steps = 3_000_000 if env == "block_rotate_z" else 8_000_000
-    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, total_steps=total_steps, replay_size=4_000_000)
-    return _with(base, hidden_sizes=(512, 512, 512), renewals=5, gamma=0.98, her_k=4.0, lr_end=0.05)
+    total_steps = {"block_rotate_z": 2_000_000, "block": 8_000_000, "egg": 8_000_000, "pen": 8_000_000}.get(env, 4_000_000)
+    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=2000, total_steps=total_steps)
+    base = _with(base, replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16")
+    return _with(base, renewals=5, gamma=0.98, her_k=4.0, lr_end=0.05)
+
+
+def _gpu_arm(env: str) -> Settings:
+    steps = {"arm_reach": 500_000, "arm_push_hard": 6_144_000}.get(env, 3_072_000)
+    config = Config(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
+    config = dataclasses.replace(config, hidden_sizes=(256, 256), total_steps=steps, replay_size=steps)
+    return config, HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
 
 
 def _gpu_hand_reach(env: str) -> Settings:
@@ -181,9 +189,10 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
-_HANDS = {
-    "cpu": _Best("tqc", "layer_norm", None),  # not tuned; hand_reach has other settings
-    "gpu": _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
+_ROBOTS = {  # by preset and module of the task
+    ("cpu", "hand"): _Best("tqc", "layer_norm", None),  # not tuned; hand_reach has other settings
+    ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
+    ("gpu", "arms"): _Best("sac", "layer_norm", _gpu_arm, {"sampler": "final"}),
 }
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
 _LEARNERS = {

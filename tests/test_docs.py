@@ -105,7 +105,7 @@ def ours(words):
     return words[1:] if is_one else None
 
 
-OURS = {" ".join(arguments): name for name, words in COMMANDS if (arguments := ours(words)) is not None}
+OURS = {shlex.join(arguments): name for name, words in COMMANDS if (arguments := ours(words)) is not None}
 
 
 class Parsed(BaseException):

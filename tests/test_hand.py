@@ -8,12 +8,12 @@ from conftest import ROOT, refuses
 from scipy.spatial.transform import Rotation
 
 from mjx_dher import envs, presets
-from mjx_dher.components import is_hand
+from mjx_dher.components import robot
 from mjx_dher.envs import hand
 from mjx_dher.tools import transfer
 from mjx_dher.viewer import sources
 
-HANDS = [name for name in envs.list_envs() if is_hand(name)]
+HANDS = [name for name in envs.list_envs() if robot(name) == "hand"]
 
 
 @pytest.fixture(scope="module")

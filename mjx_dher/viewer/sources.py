@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.components import is_hand
+from mjx_dher.components import robot
 from mjx_dher.policy import bundled, load
 from mjx_dher.runs import loop, program
 from mjx_dher.runs.folder import reading, restoring, results, run_folder
@@ -43,7 +43,7 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
     whose observations and goals have the same sizes.
     """
     run = reading.read_spec(folder)
-    if env not in (None, run.env) and is_hand(env) and is_hand(run.env):
+    if env not in (None, run.env) and "hand" == robot(env) == robot(run.env):
         raise ValueError(f"{label} is a policy of {run.env} and cannot be played in {env}, which looks alike")
     if not (folder / run_folder.POLICY_FILE).is_file():
         raise FolderError(f"{folder / run_folder.POLICY_FILE} is missing: no epoch of the run has ended yet")
