@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_dher import envs, presets, spec
-from mjx_dher.components import robot
+from mjx_dher import envs
 from mjx_dher.envs import arms
 from mjx_dher.envs.robot import RobotLoop
 
@@ -108,14 +107,3 @@ def test_a_robots_loop_takes_the_force(push):
     np.testing.assert_allclose(observations[-1], state.obs["observation"], atol=1e-6)
     expected = push.controls(state.physics, jnp.tanh(state.obs["observation"][:5]))
     np.testing.assert_allclose(sent.ctrl, expected.ctrl, atol=1e-5)
-
-
-def test_presets_know_the_robot_by_its_built_in_name():
-    known = {"push": "fetch", "pen": "hand", "arm_grasp": "arms", "arm_of_mine": "", "mine:ArmGrasp": "", 3: ""}
-    assert {env: robot(env) for env in known} == known
-    for env in (name for name in envs.list_envs() if robot(name) == "arms"):
-        run = presets.preset("gpu", env)
-        spec.validate(run)
-        assert (run.learner, run.sampler, run.config.replay_size) == ("sac", "final", run.config.total_steps)
-        assert presets.preset("gpu", env, learner="tqc").hparams == presets.preset("gpu", "push", learner="tqc").hparams
-        assert presets.preset("gpu", env, sampler="future").sampler == "future"

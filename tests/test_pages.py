@@ -170,33 +170,6 @@ def test_the_table_of_presets_is_that_of_the_file():
     assert tasks == {"push", "pick_and_place", "slide", "reach"}
 
 
-def test_tables_of_hands_and_arms_are_those_of_the_file():
-    """Success on `native` and its median, on the presets' pages and beside others' on docs/field.md."""
-    pages = ROOT / "docs" / "experiments"
-    text = (pages / "preset_hands.md").read_text().split("## Results")[1]
-    text += (pages / "preset_gpu.md").read_text().split("## The arm tasks")[1]
-    field = [cells(line) for line in (ROOT / "docs" / "field.md").read_text().splitlines() if line.startswith("|")]
-    (hands, arms) = (row for row in field if row[0].strip() == "mjx-dher, preset `gpu`" and len(row) in (8, 5))
-    beside = " ".join(hands + arms)
-    with (ROOT / "docs" / "preset_success.csv").open() as file:
-        robots = {row["task"] for row in csv.DictReader(file) if row["preset"] == "gpu"} - {"push", "pick_and_place", "slide"}
-    assert len(robots) == 8
-    for task in robots:
-        rates, steps = published(task, "gpu")
-        (row,) = (cells(line) for line in text.splitlines() if line.startswith(f"| `{task}` |") and f"{int(*steps):,}" in line)
-        assert ", ".join(rates) in [cell.strip() for cell in row], task
-        median = f"{np.median([float(rate) for rate in rates]):.3f}"
-        assert median in [cell.strip() for cell in row], task
-        assert median in beside, task
-
-
-def test_curves_of_jaxgcrls_own_code_are_those_of_the_file(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "bench")
-    import crl_curves
-
-    assert crl_curves.report([ROOT / "docs" / "crl_curves.csv"]) in (ROOT / "docs" / "experiments" / "crl.md").read_text()
-
-
 def test_the_table_of_unseen_seeds_is_of_the_file():
     finals = {}
     with (ROOT / "docs" / "unseen_runs.csv").open() as file:
