@@ -135,7 +135,7 @@ def names_page(names: list[tuple[Path, ast.stmt, str]]) -> str:
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             text = (ast.get_docstring(node) or "").split("\n\n")[0].replace("\n", " ")
-            text = re.split(r"(?<=\.)\s", text)[0]
+            text = re.split(r"(?<=\.)(?<!al\.)\s", text)[0]
         else:
             value = ast.unparse(node).split(" = ", 1)[-1]
             text = f"`{value if len(value) <= MAX_VALUE else value[:MAX_VALUE] + '...'}`"

@@ -42,7 +42,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
       ValueError: there is no such preset.
     """
     check_name("preset", name, PRESETS)
-    best = _LEARNERS.get((name, env)) or _ROBOTS.get((name, robot(env)), _DDPG)
+    best = _LEARNERS.get((name, env)) or _LEARNERS.get((name, robot(env)), _DDPG)
     if learner == "crl":
         best = _CRL
     elif learner not in (None, best.learner):
@@ -130,10 +130,14 @@ def _entropy(env: str, **changes: Any) -> Settings:
 
 
 def _gpu_hand(env: str) -> Settings:
-    total_steps = {"block_rotate_z": 2_000_000, "block": 8_000_000, "egg": 8_000_000, "pen": 8_000_000}.get(env, 4_000_000)
-    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=2000, total_steps=total_steps)
-    base = _with(base, replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16")
-    return _with(base, renewals=5, gamma=0.98, her_k=4.0, lr_end=0.05)
+    steps = {"block_rotate_z": 2_000_000, "block": 8_000_000, "egg": 8_000_000, "pen": 8_000_000}.get(env, 4_000_000)
+    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=2000, total_steps=steps, renewals=5, her_k=4.0)
+    return _with(base, replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16", gamma=0.98, lr_end=0.05)
+
+
+def _cpu_hand(env: str) -> Settings:
+    base = _small(_gpu_hand(env), num_envs=64, cycles_per_epoch=16, updates_per_cycle=250, policy_delay=2, critic_lr=2e-3)
+    return _with(base, total_steps=1_024_000, replay_size=1_024_000, learner_dtype="float32")
 
 
 def _gpu_arm(env: str) -> Settings:
@@ -141,6 +145,11 @@ def _gpu_arm(env: str) -> Settings:
     config = Config(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
     config = dataclasses.replace(config, hidden_sizes=(256, 256), total_steps=steps, replay_size=steps)
     return config, HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
+
+
+def _cpu_arm(env: str) -> Settings:
+    base, steps = _gpu_arm(env), _gpu_arm(env)[0].total_steps // 2
+    return _with(base, num_envs=64, cycles_per_epoch=8, updates_per_cycle=250, total_steps=steps, replay_size=steps)
 
 
 def _gpu_hand_reach(env: str) -> Settings:
@@ -151,8 +160,8 @@ def _gpu_hand_reach(env: str) -> Settings:
 
 
 def _cpu_hand_reach(env: str) -> Settings:
-    base = _with(_gpu_hand_reach(env), num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
-    return _with(base, total_steps=480_000, replay_size=480_000)
+    base, steps = _gpu_hand_reach(env), 480_000
+    return _with(base, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80, total_steps=steps, replay_size=steps)
 
 
 def _gpu_slide(env: str) -> Settings:
@@ -162,12 +171,7 @@ def _gpu_slide(env: str) -> Settings:
 
 def _cpu_slide(env: str) -> Settings:
     base = _small(_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5, cycles_per_epoch=2)
-    base = _with(base, total_steps=1_280_000, replay_size=1_280_000, critic_lr=3e-3)
-    return _with(base, noise_std=0.1, random_eps=0.2, her_k=4.0)
-
-
-def _cpu_push(env: str) -> Settings:
-    return _small(_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000, critic_lr=2e-3)
+    return _with(base, total_steps=1_280_000, replay_size=1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
 def _cpu_pick_and_place(env: str) -> Settings:
@@ -189,15 +193,16 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
-_ROBOTS = {  # by preset and module of the task
-    ("cpu", "hand"): _Best("tqc", "layer_norm", None),  # not tuned; hand_reach has other settings
-    ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
-    ("gpu", "arms"): _Best("sac", "layer_norm", _gpu_arm, {"sampler": "final"}),
-}
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
-_LEARNERS = {
+_LEARNERS = {  # by preset, and environment or robot
+    ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
+    ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
+    ("cpu", "arms"): _Best("sac", "layer_norm", _cpu_arm, {"sampler": "final"}),
+    ("gpu", "arms"): _Best("sac", "layer_norm", _gpu_arm, {"sampler": "final"}),
     ("cpu", "hand_reach"): _Best("ddpg", "mlp", _cpu_hand_reach),
-    ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
+    ("cpu", "push"): _Best(
+        "td3", "mlp", lambda env: _small(_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000, critic_lr=2e-3)
+    ),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),

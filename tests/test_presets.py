@@ -14,9 +14,10 @@ def test_presets_know_the_robot_by_its_built_in_name():
     known = {"push": "fetch", "pen": "hand", "arm_grasp": "arms", "arm_of_mine": "", "mine:ArmGrasp": "", 3: ""}
     assert {env: robot(env) for env in known} == known
     for env in (name for name in envs.list_envs() if robot(name) == "arms"):
-        run = presets.preset("gpu", env)
-        spec.validate(run)
-        assert (run.learner, run.sampler, run.config.replay_size) == ("sac", "final", run.config.total_steps)
+        for name in ("cpu", "gpu"):
+            run = presets.preset(name, env)
+            spec.validate(run)
+            assert (run.learner, run.sampler, run.config.replay_size) == ("sac", "final", run.config.total_steps)
         assert presets.preset("gpu", env, learner="tqc").hparams == presets.preset("gpu", "push", learner="tqc").hparams
         assert presets.preset("gpu", env, sampler="future").sampler == "future"
 
