@@ -137,7 +137,7 @@ def _gpu_hand(env: str) -> Settings:
 
 def _cpu_hand(env: str) -> Settings:
     base = _small(_gpu_hand(env), num_envs=64, cycles_per_epoch=16, updates_per_cycle=250, policy_delay=2, critic_lr=2e-3)
-    return _with(base, total_steps=1_024_000, replay_size=1_024_000, learner_dtype="float32")
+    return _with(base, total_steps=1_024_000, replay_size=1_024_000)
 
 
 def _gpu_arm(env: str) -> Settings:
