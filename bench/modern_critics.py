@@ -1,4 +1,4 @@
-"""Critics of 2024 and 2025 in the presets `gpu` of Slide (as of 2026-11-25) and Block Z.
+"""Critics of 2024 and 2025 in the presets `gpu` of Slide (as of 2026-11-25) and Block Z (2026-11-26).
 
     python bench/modern_critics.py --out critics --first-seed 10 --plan
     python bench/modern_critics.py --out critics --first-seed 10 --minutes 9   trains and reports; run it again to resume

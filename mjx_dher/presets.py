@@ -141,7 +141,7 @@ def _cpu_hand(env: str) -> Settings:
 
 
 def _gpu_arm(env: str) -> Settings:
-    steps = {"arm_reach": 500_000, "arm_push_hard": 6_144_000}.get(env, 3_072_000)
+    steps = {"arm_reach": 512_000, "arm_push_hard": 6_144_000}.get(env, 3_072_000)
     config = Config(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
     config = dataclasses.replace(config, hidden_sizes=(256, 256), total_steps=steps, replay_size=steps)
     return config, HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
