@@ -47,8 +47,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
         best = _CRL
     elif learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
-    setup = best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name]
-    config, hparams = setup(env)
+    config, hparams = (best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name])(env)
     if best is _CRL:
         hparams = hparams._replace(action_l2=0.0, random_eps=0.1)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
@@ -67,6 +66,11 @@ def _with(settings: Settings, **changes: Any) -> Settings:
     return dataclasses.replace(config, **changes), hparams._replace(**numbers)
 
 
+def _kept(settings: Settings, steps: int, **changes: Any) -> Settings:
+    """The settings with `steps` environment steps, all of which the ring keeps, and other `changes`."""
+    return _with(settings, total_steps=steps, replay_size=steps, **changes)
+
+
 def _small(settings: Settings, **changes: Any) -> Settings:
     """The settings with one critic, two layers, no target noise, and other `changes`."""
     return _with(settings, num_critics=1, hidden_sizes=(256, 256), target_noise=0.0, **changes)
@@ -79,9 +83,9 @@ def _cpu(env: str) -> Settings:
     if env == "pick_and_place":
         return _with(base, total_steps=1_000_000, noise_std=0.2, lr_end=0.05)
     if env == "slide":
-        return _with(base, total_steps=1_500_000, replay_size=1_500_000, gamma=0.97, noise_std=0.2, lr_end=0.05)
+        return _kept(base, 1_500_000, gamma=0.97, noise_std=0.2, lr_end=0.05)
     if robot(env) == "hand":
-        return _with(base, cycles_per_epoch=8, total_steps=2_000_000, replay_size=2_000_000, gamma=0.98)
+        return _kept(base, 2_000_000, cycles_per_epoch=8, gamma=0.98)
     return base
 
 
@@ -137,19 +141,19 @@ def _gpu_hand(env: str) -> Settings:
 
 def _cpu_hand(env: str) -> Settings:
     base = _small(_gpu_hand(env), num_envs=64, cycles_per_epoch=16, updates_per_cycle=250, policy_delay=2, critic_lr=2e-3)
-    return _with(base, total_steps=1_024_000, replay_size=1_024_000)
+    return _kept(base, 1_024_000)
 
 
 def _gpu_arm(env: str) -> Settings:
-    steps = {"arm_reach": 512_000, "arm_push_hard": 6_144_000}.get(env, 3_072_000)
     config = Config(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
-    config = dataclasses.replace(config, hidden_sizes=(256, 256), total_steps=steps, replay_size=steps)
-    return config, HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
+    numbers = HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
+    steps = {"arm_reach": 512_000, "arm_push_hard": 6_144_000}
+    return _kept((config, numbers), steps.get(env, 3_072_000), hidden_sizes=(256, 256))
 
 
 def _cpu_arm(env: str) -> Settings:
-    base, steps = _gpu_arm(env), _gpu_arm(env)[0].total_steps // 2
-    return _with(base, num_envs=64, cycles_per_epoch=8, updates_per_cycle=250, total_steps=steps, replay_size=steps)
+    base = _gpu_arm(env)
+    return _kept(base, base[0].total_steps // 2, num_envs=64, cycles_per_epoch=8, updates_per_cycle=250)
 
 
 def _gpu_hand_reach(env: str) -> Settings:
@@ -160,8 +164,7 @@ def _gpu_hand_reach(env: str) -> Settings:
 
 
 def _cpu_hand_reach(env: str) -> Settings:
-    base, steps = _gpu_hand_reach(env), 480_000
-    return _with(base, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80, total_steps=steps, replay_size=steps)
+    return _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
 
 
 def _gpu_slide(env: str) -> Settings:
@@ -171,12 +174,12 @@ def _gpu_slide(env: str) -> Settings:
 
 def _cpu_slide(env: str) -> Settings:
     base = _small(_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5, cycles_per_epoch=2)
-    return _with(base, total_steps=1_280_000, replay_size=1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
+    return _kept(base, 1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
 def _cpu_pick_and_place(env: str) -> Settings:
     # One cycle per epoch: on two cores it takes some ten seconds.
-    return _small(_entropy(env), cycles_per_epoch=1, total_steps=1_024_000, replay_size=1_024_000, policy_delay=2)
+    return _kept(_small(_entropy(env), cycles_per_epoch=1, policy_delay=2), 1_024_000)
 
 
 def _gpu_pick_and_place(env: str) -> Settings:
@@ -209,9 +212,7 @@ _LEARNERS = {  # by preset, and environment or robot
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", lambda env: _with(_frugal(env), noise_std=0.6)),
-    ("frugal", "pick_and_place"): _Best(
-        "tqc", "layer_norm", lambda env: _entropy(env, num_envs=64, total_steps=500_000, replay_size=500_000)
-    ),
+    ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 500_000, num_envs=64)),
     ("frugal", "slide"): _Best(
         "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}
     ),

@@ -26,8 +26,8 @@ def test_tables_of_hands_and_arms_are_those_of_the_file():
     """Success on `native` and its median, on the presets' pages and beside others' on docs/field.md."""
     found: dict[str, list[dict[str, str]]] = {}
     with (ROOT / "docs" / "preset_success.csv").open() as file:
-        for row in csv.DictReader(file):
-            found.setdefault(row["task"], []).append(row) if robot(row["task"]) != "fetch" else None
+        for row in (row for row in csv.DictReader(file) if robot(row["task"]) != "fetch"):
+            found.setdefault(row["task"], []).append(row)
     assert len(found) == 8
     pages = ROOT / "docs" / "experiments"
     text = (pages / "preset_hands.md").read_text().split("## Results")[1]
