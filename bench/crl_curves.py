@@ -4,7 +4,8 @@
     pip install --no-deps brax==0.14.2 jaxopt ml_collections tensorboardX jinja2 MarkupSafe
     python bench/crl_curves.py theirs --jaxgcrl /tmp/jaxgcrl --tasks arm_reach --out theirs.csv
     python bench/crl_curves.py ours --tasks arm_reach --out ours.csv
-    python bench/crl_curves.py report ours.csv theirs.csv
+    python bench/crl_curves.py matched --tasks arm_reach --out matched.csv   with four of JaxGCRL's details
+    python bench/crl_curves.py report ours.csv theirs.csv matched.csv
 
 docs/experiments/crl.md has the plan. JaxGCRL's tasks, learner and loop run unchanged. Its evaluator is replaced, because it
 needs metrics that arm tasks lack. wandb and the removed part of Brax are empty modules.
@@ -15,7 +16,6 @@ from __future__ import annotations
 import argparse
 import csv
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,8 +29,8 @@ import numpy as np
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.system.files import FolderError
 
-ROOT = Path(__file__).resolve().parents[1]
 ENVS, BATCH, EVALUATED = 256, 512, 100
+WHO = ("ours", "matched", "theirs")
 COLUMNS = ("who", "task", "seed", "env_steps", "success", "seconds")
 
 
@@ -61,8 +61,37 @@ class Size(NamedTuple):
 SIZES = {"arm_reach": Size(100, 8, 6), "arm_push_easy": Size(150, 11, 13)}
 
 
-def train_ours(task: str, seeds: range, toy: bool) -> Iterable[tuple]:
+def match_jaxgcrl() -> None:
+    """Gives the learner `crl` of this process JaxGCRL's inputs, first weights, standard deviations and loss of alpha."""
+    import flax.linen as nn
+    import jax
+    import jax.numpy as jnp
+
+    from mjx_dher import networks, normalizer
+    from mjx_dher.learners import gaussian
+
+    def moments(network: Any, params: Any, observation: Any, goal: Any) -> tuple[Any, Any]:
+        mean, raw = network.apply(params["network"], observation, goal)
+        return mean, -5.0 + 3.5 * (jnp.tanh(raw) + 1.0)
+
+    def loss(
+        self: Any, network: Any, params: Any, observation: Any, goal: Any, judge: Any, normal: Any, hparams: Any
+    ) -> tuple[Any, dict]:
+        action, log_prob = gaussian.sample_action(network, params, observation, goal, normal)
+        alpha, surplus = gaussian._alpha(params, hparams), jnp.mean(log_prob) + hparams.entropy_target * action.shape[-1]
+        policy_loss = jnp.mean(jax.lax.stop_gradient(alpha) * log_prob - judge(action))
+        return policy_loss - alpha * jax.lax.stop_gradient(surplus), {"entropy_weight": alpha, "entropy": -jnp.mean(log_prob)}
+
+    first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
+    replaced: Any = (normalizer, "normalize"), (networks, "_initializers"), (gaussian, "_moments"), (gaussian.Gaussian, "loss")
+    for (owner, name), new in zip(replaced, (lambda state, values, *others: values, lambda *others: first, moments, loss)):
+        assert hasattr(owner, name), name
+        setattr(owner, name, new)
+
+
+def train_ours(who: str, task: str, seeds: range, toy: bool) -> Iterable[tuple]:
     """Rows of the learner `crl`, with JaxGCRL's numbers."""
+    from mjx_dher.__main__ import main as command
     from mjx_dher.sweeps import comparison, tables
 
     size = SIZES[task]
@@ -78,11 +107,13 @@ def train_ours(task: str, seeds: range, toy: bool) -> Iterable[tuple]:
             f" --eval-episodes {2 if toy else EVALUATED}"
             f" --seeds {len(seeds)} --first-seed {seeds[0]} --out {out}/sweep"
         )
-        subprocess.run([sys.executable, str(ROOT / "train.py"), "sweep", *options.split()], check=True)
+        sys.argv = ["train.py", "sweep", *options.split()]
+        if status := command():
+            raise SystemExit(status)
         for groups in comparison.groups(tables.read(Path(out) / "sweep")).values():
             for group in groups:
                 for seed, success in zip(group.seeds, group.success):
-                    yield from (("ours", task, seed, int(s), float(x), "") for s, x in zip(group.env_steps, success))
+                    yield from ((who, task, seed, int(s), float(x), "") for s, x in zip(group.env_steps, success))
 
 
 def train_theirs(folder: Path, task: str, seed: int, toy: bool) -> Iterable[tuple]:
@@ -171,7 +202,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def report(paths: list[Path]) -> str:
-    """Table of mean success over the steps that both have, and its difference with Welch's interval."""
+    """Table of mean success over the steps that all have, and the difference to JaxGCRL's with Welch's interval."""
     from scipy import stats
 
     curves: dict[tuple[str, str], dict[str, list]] = {}
@@ -181,19 +212,15 @@ def report(paths: list[Path]) -> str:
             curves.setdefault((row["task"], row["who"]), {}).setdefault(row["seed"], []).append(point)
     lines = ["| task | who | seeds | mean success | last | difference | 95 % interval |", "|---|---|---|---|---|---|---|"]
     for task in dict.fromkeys(task for task, _ in curves):
-        own = {who: [np.array(points) for points in curves[task, who].values()] for who in ("ours", "theirs")}
+        own = {who: [np.array(points) for points in curves[task, who].values()] for who in WHO if (task, who) in curves}
         every = [curve for each in own.values() for curve in each]
         grid = np.linspace(max(curve[0, 0] for curve in every), min(curve[-1, 0] for curve in every), 200)
         means = {who: np.array([np.interp(grid, *curve.T).mean() for curve in each]) for who, each in own.items()}
-        test = stats.ttest_ind(means["ours"], means["theirs"], equal_var=False)
-        low, high = test.confidence_interval()
         for who, each in own.items():
-            last = np.mean([curve[-1, 1] for curve in each])
-            cells = (
-                [f"{means['ours'].mean() - means['theirs'].mean():+.3f}", f"{low:+.3f} to {high:+.3f}"]
-                if who == "ours"
-                else ["", ""]
-            )
+            last, cells = np.mean([curve[-1, 1] for curve in each]), ["", ""]
+            if who != "theirs":
+                low, high = stats.ttest_ind(means[who], means["theirs"], equal_var=False).confidence_interval()
+                cells = [f"{means[who].mean() - means['theirs'].mean():+.3f}", f"{low:+.3f} to {high:+.3f}"]
             lines.append(
                 " | ".join([f"| `{task}`", who, str(len(each)), f"{means[who].mean():.3f}", f"{last:.3f}", *cells]) + " |"
             )
@@ -202,7 +229,7 @@ def report(paths: list[Path]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("theirs", "ours", "report"))
+    parser.add_argument("what", choices=(*WHO, "report"))
     parser.add_argument("files", nargs="*", type=Path, help="for report: curves that --out wrote")
     parser.add_argument("--jaxgcrl", type=Path, help="JaxGCRL's checkout")
     parser.add_argument("--tasks", nargs="+", choices=SIZES, default=list(SIZES))
@@ -213,12 +240,14 @@ def main() -> None:
     args = parser.parse_args()
     if args.what == "report":
         whos = {row["who"] for path in args.files for row in _rows(path)}
-        if whos != {"ours", "theirs"}:
-            parser.error(f"report needs files with curves of ours and theirs; got {', '.join(map(str, args.files)) or 'none'}")
+        if "theirs" not in whos or len(whos) == 1:
+            parser.error(
+                f"report needs files with curves of theirs, and of ours or matched; got {', '.join(map(str, args.files)) or 'none'}"
+            )
         print(report(args.files))
         return
     if args.out is None or (args.what == "theirs") != (args.jaxgcrl is not None):
-        parser.error("ours needs --out, theirs --out and --jaxgcrl")
+        parser.error("ours and matched need --out, theirs --out and --jaxgcrl")
     if args.seeds < 1 or args.first_seed < 0:
         parser.error(f"--seeds is 1 or more, and --first-seed 0 or more; got {args.seeds} and {args.first_seed}")
     seeds, out = range(args.first_seed, args.first_seed + args.seeds), args.out.resolve()
@@ -229,11 +258,13 @@ def main() -> None:
     known = {(row["who"], row["task"], int(row["seed"])) for row in _rows(out)}
     if twice := known & {(args.what, task, seed) for task in args.tasks for seed in seeds}:
         parser.error(f"{out} already has {', '.join(map(str, sorted(twice)))}; choose other seeds, tasks or another file")
+    if args.what == "matched":
+        match_jaxgcrl()
     for task in args.tasks:
         parts = (
-            [train_ours(task, seeds, args.toy)]
-            if args.what == "ours"
-            else (train_theirs(args.jaxgcrl.resolve(), task, seed, args.toy) for seed in seeds)
+            (train_theirs(args.jaxgcrl.resolve(), task, seed, args.toy) for seed in seeds)
+            if args.what == "theirs"
+            else [train_ours(args.what, task, seeds, args.toy)]
         )
         for rows in map(list, parts):
             head = [] if out.exists() else [COLUMNS]
