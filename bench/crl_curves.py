@@ -241,9 +241,8 @@ def main() -> None:
     if args.what == "report":
         whos = {row["who"] for path in args.files for row in _rows(path)}
         if "theirs" not in whos or len(whos) == 1:
-            parser.error(
-                f"report needs files with curves of theirs, and of ours or matched; got {', '.join(map(str, args.files)) or 'none'}"
-            )
+            given = ", ".join(map(str, args.files)) or "none"
+            parser.error(f"report needs files with curves of theirs, and of ours or matched; got {given}")
         print(report(args.files))
         return
     if args.out is None or (args.what == "theirs") != (args.jaxgcrl is not None):
