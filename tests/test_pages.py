@@ -334,8 +334,8 @@ def test_what_the_pages_say_of_hands_and_of_contrastive_rl():
 
 
 def test_the_table_of_modern_critics_is_that_of_the_runs():
-    table = [cells(line) for line in (ROOT / "docs" / "experiments" / "ablation.md").read_text().splitlines() if line[:3] == "| `"]
-    shown = {row[0].strip(" `"): [cell.strip() for cell in row[2:]] for row in table}
+    lines = (ROOT / "docs" / "experiments" / "ablation.md").read_text().splitlines()
+    shown = {row[0].strip(" `"): [cell.strip() for cell in row[2:]] for row in map(cells, lines) if len(row) == 4}
     for arm in ("mlp", "residual", "unit_norm", "categorical", "categorical_unit_norm", "resets"):
         found = [paired("modern_critics_runs.csv", task, arm, "preset") for task in ("slide", "block_rotate_z")]
         assert shown[arm] == ["{:+.3f} ({:+.3f} to {:+.3f})".format(*numbers) for numbers in found]
