@@ -305,42 +305,6 @@ def test_what_the_pages_say_of_slide_s_late_epochs(committed):
     assert "With the paper's cycles it rises from {:.3f} to {:.3f}".format(*tens[3:]) in plan
 
 
-def paired(file, task, arm, base):
-    """Mean gain in mean success and its interval, from a file of runs."""
-    runs = {}
-    with (ROOT / "docs" / file).open() as rows:
-        for row in csv.DictReader(rows):
-            if row["task"] == task:
-                runs.setdefault(row["arm"], {})[row["seed"]] = float(row["mean_success"])
-    gains = np.array([x - runs[base][seed] for seed, x in runs[arm].items()])
-    return gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
-
-
-def test_what_the_pages_say_of_hands_and_of_contrastive_rl():
-    crl, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/experiments/crl.md", "README.md"))
-    hands = " ".join((ROOT / "docs" / "experiments" / "preset_hands.md").read_text().split())
-    assert "k 1 gains {:.3f} ({:.3f} to {:.3f})".format(*paired("hands_runs.csv", "block_rotate_z", "k1", "future")) in readme
-    k8, k16 = (paired("hands_runs.csv", "hand_reach", arm, "future")[0] for arm in ("k8", "k16"))
-    assert f"k 8 and 16 gain {k8:.3f} and {k16:.3f}" in hands
-    assert f"ends at {paired('hands_runs.csv', 'block_rotate_z', 'td_error', 'future')[2]:.3f}" in hands
-    zero = 0
-    for task in ("push", "pick_and_place", "arm_push_easy", "slide", "arm_push_hard", "arm_grasp", "block_rotate_z"):
-        for learner in ("sac", "tqc"):
-            mean, low, high = paired("crl_runs.csv", task, f"{learner}_final", f"{learner}_k4")
-            zero += low < 0 < high
-            small, large = sorted((abs(low), abs(high)))
-            assert low < 0 < high or f"{abs(mean):.3f} ({small:.3f} to {large:.3f})" in crl.replace("95 % interval ", "")
-    assert (zero, "The other six intervals contain 0" in crl) == (6, True)
-
-
-def test_the_table_of_modern_critics_is_that_of_the_runs():
-    lines = (ROOT / "docs" / "experiments" / "ablation.md").read_text().splitlines()
-    shown = {row[0].strip(" `"): [cell.strip() for cell in row[2:]] for row in map(cells, lines) if len(row) == 4}
-    for arm in ("mlp", "residual", "unit_norm", "categorical", "categorical_unit_norm", "resets"):
-        found = [paired("modern_critics_runs.csv", task, arm, "preset") for task in ("slide", "block_rotate_z")]
-        assert shown[arm] == ["{:+.3f} ({:+.3f} to {:+.3f})".format(*numbers) for numbers in found]
-
-
 def test_the_benchmarks_say_the_same_of_the_presets():
     text = (ROOT / "bench" / "README.md").read_text()
     for task in ("push", "pick_and_place", "slide"):
