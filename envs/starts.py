@@ -34,7 +34,9 @@ class Start:
         self.keyframe, self.ranges, self.settle = keyframe, dict(ranges or {}), settle
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        """Copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
+        """Copy for `model`. Raises ValueError for a name that the model lacks, invalid bounds, or a keyframe with a joint more
+        than 0.001 rad or m outside its range.
+        """
         bound = copy.copy(self)
         check_number("settle of start", self.settle, "[0, 1000]")
         data = mujoco.MjData(model)
@@ -51,6 +53,11 @@ class Start:
                 raise ValueError(f"start: {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
             bound.drawn.append(drawn)
             data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
+        for name, (at, _, low, high) in places.items() if self.keyframe is not None else ():
+            # Keyframes have rounded numbers, such as 1.5708, and joints that rest against a stop.
+            if len(low) == 1 and not low[0] - 1e-3 <= (value := data.qpos[at]) <= high[0] + 1e-3:
+                limits = f"{low[0]:g} to {high[0]:g}"
+                raise ValueError(f"start: keyframe {self.keyframe!r} has joint {name!r} at {value:g}; its range is {limits}")
         given = data.ctrl.any() or data.act.any()
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
             compute(model, data)  # the actuators' lengths

@@ -1,5 +1,6 @@
 """Tasks from models with unusual parts: welds with an offset, filtered and tendon servos, unlimited slides, odd names."""
 
+import contextlib
 import re
 
 import jax
@@ -110,6 +111,14 @@ WELDED = """
   <equality><weld {}/></equality>
 </mujoco>"""
 PLACE = task.Position("body:hand", (0, 0, 0.2), (0.2, 0.2, 0.6))
+
+
+@pytest.mark.parametrize("at", [-2.01, 2.0005])
+def test_a_keyframe_outside_a_joint_s_range_is_rejected(at):
+    model = arm(POSITION).replace("</mujoco>", f'<keyframe><key name="bent" qpos="{at}"/></keyframe></mujoco>')
+    with refuses("bent", "'j'", "-2.01", "-2 to 2") if at < -2 else contextlib.nullcontext():
+        make(model, start=task.Start("bent"))
+    make(model, start=task.Start("bent", ranges={"j": (0, 1)}))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.2])
