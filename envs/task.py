@@ -132,6 +132,10 @@ class MujocoTask(SimulatedTask):
         """Draws the physics of a start."""
         rest: Physics = jax.tree.map(jnp.asarray, self._rest)
         physics, hold = self.start.held(dataclasses.replace(rest, qpos=self.start.draw(key), sensors=None))
+        drawn = {each.qpos for each in self.start.drawn}
+        for part in self.parts:  # the mocap target of a body that was drawn is at the body
+            if isinstance(part, Mocap) and any(joint.qpos in drawn for joint in part.place.joints):
+                hold = part.apply(physics, jnp.zeros(part.size, jnp.float32), hold)
         return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, hold), physics)
 
     def sample_goal(self, key: PRNGKey) -> Array:

@@ -149,6 +149,15 @@ def test_a_mocap_target_is_relative_to_the_welded_body(weld, turn):
     np.testing.assert_allclose(moved[[0, 2]], 0.0, atol=0.06 if turn else 0.02)  # without a fixed orientation it can turn
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.2])
+def test_a_mocap_target_follows_a_drawn_start_while_it_settles(turn):
+    declared = {"goal": PLACE, "control": task.Mocap("target", 0.05, turn), "observations": ("body:hand",)}
+    start = task.Start(ranges={"hand": ((0, 0, 0.2), (0.2, 0.2, 0.6))}, settle=20)
+    env = make(WELDED.format('body1="target" body2="hand"'), start=start, **declared)
+    key = jax.random.key(3)
+    np.testing.assert_allclose(jax.jit(env.start_physics)(key).qpos, env.start.draw(key), atol=1e-3)
+
+
 @pytest.mark.parametrize("weld", ['site1="at" site2="grip"', 'body1="target" body2="hand" active="false"'])
 def test_a_mocap_body_needs_an_active_weld_of_bodies(weld):
     model = WELDED.format(weld).replace('euler="0 0 90"/>', 'euler="0 0 90"><site name="at"/></body>')
