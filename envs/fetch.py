@@ -134,7 +134,7 @@ class FetchEnv(SimulatedTask):
           desired_goal: goal [3] in m.
 
         Raises:
-          ValueError: an array has another shape.
+          ValueError: an array has another shape, or a quaternion has no length, outside `jit`.
         """
         physics: Physics = jax.tree.map(jnp.asarray, self._rest)
         if object_qpos is not None:

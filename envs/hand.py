@@ -193,7 +193,7 @@ class HandTask(MujocoTask):
           qvel: [24] rad/s, followed by an object's [6] velocity. Default: at rest.
 
         Raises:
-          ValueError: an array has another shape, or the goal's quaternion has no length.
+          ValueError: an array has another shape, or a quaternion has no length, outside `jit`.
         """
         start: Physics = jax.tree.map(jnp.asarray, self._rest)
         moving = jnp.zeros_like(start.qvel) if qvel is None else jnp.asarray(qvel, jnp.float32)

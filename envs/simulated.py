@@ -122,20 +122,21 @@ class SimulatedTask(GoalEnv):
         return dataclasses.replace(physics, factors=draw(self._ranges, key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`."""
+        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`.
+        Outside `jit`, raises ValueError if a free or ball joint has a quaternion without length.
+        """
         check_shape("desired_goal", desired_goal, (self.goal_size,))
+        if not isinstance(physics.qpos, jax.core.Tracer):
+            kinds, starts = self.model.jnt_type, self.model.jnt_qposadr
+            for at in (starts + 3 * (kinds == 0))[kinds < 2]:  # kind 0 is a free joint, 1 a ball joint
+                if not np.linalg.norm(quat := np.asarray(physics.qpos[at : at + 4])):
+                    raise ValueError(f"qpos[{at}:{at + 4}] must be a quaternion of a length above 0; got {quat}")
         physics = self._sensed(physics)
         sound = self.is_sound(physics)
         physics = self._or_rest(physics, sound)
         obs = self.observe_goal(physics, jnp.asarray(desired_goal, jnp.float32))
-        return State(
-            physics=physics,
-            obs=obs,
-            reward=jnp.zeros((), jnp.float32),
-            success=jnp.where(sound, self._success(obs["achieved_goal"], obs["desired_goal"]), 0.0),
-            step=jnp.zeros((), jnp.int32),
-            failed=~sound,
-        )
+        success = jnp.where(sound, self._success(obs["achieved_goal"], obs["desired_goal"]), 0.0)
+        return State(physics=physics, obs=obs, reward=jnp.float32(0), success=success, step=jnp.int32(0), failed=~sound)
 
     def with_goal(self, state: State, goal: Array) -> State:
         """State with another desired goal [G]."""
@@ -172,8 +173,7 @@ class SimulatedTask(GoalEnv):
         at, dof, *_ = self._object
         qpos = state.physics.qpos.at[at : at + 7].set(jnp.asarray(self._rest.qpos[at : at + 7]).at[:3].set(position))
         qvel = state.physics.qvel.at[dof : dof + 6].set(0.0)
-        physics = dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel))
-        physics = self._sensed(physics)
+        physics = self._sensed(dataclasses.replace(state.physics, qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel)))
         obs = self.observe_goal(self.observed(physics), state.obs["desired_goal"])
         return self.with_goal(dataclasses.replace(state, physics=physics, obs=obs), obs["desired_goal"])
 

@@ -230,6 +230,15 @@ def test_a_robots_loop_rejects_a_quaternion_without_length():
         loop(np.zeros(7), np.zeros(6), np.zeros(3))
 
 
+@pytest.mark.parametrize("joint", ["freejoint", 'joint type="ball"'])
+def test_a_first_state_needs_quaternions_with_a_length(joint):
+    env = make(arm(POSITION, more=BALL.replace("freejoint", joint)))
+    physics = jax.tree.map(jnp.asarray, env.start.physics)
+    for length in (1e-30, 0.0):  # the square of the first is 0, too
+        with refuses("qpos", "quaternion"):
+            env.first_state(physics.replace(qpos=physics.qpos.at[-4:].set(length)), jnp.zeros(1))
+
+
 @pytest.mark.parametrize(
     ("model", "declared", "parts"),
     [
