@@ -50,9 +50,10 @@ def episode_seed(np_random: np.random.Generator) -> int:
 
 
 class _GoalApi:
-    """Goal methods of gymnasium-robotics' environments, for single and vectorized ones."""
+    """Goal methods of gymnasium-robotics' environments and the current state, for single and vectorized ones."""
 
     _compiled: Programs
+    _state: Any = None  # with leading [N] if vectorized; None until `reset`, and again after an error
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """Rewards float32 [...] of goals [..., G]. Ignores `info`. Raises ValueError if the last axis of the goals is not G, or
@@ -91,6 +92,17 @@ class _GoalApi:
         achieved, desired = np.broadcast_arrays(achieved, desired)
         return achieved, desired
 
+    def _moved(self, program: Any, *arguments: Any) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
+        """Takes the state that a program returns. Copies its observation, reward (float64) and info to writable arrays."""
+        self._state = None
+        state = program(*arguments)
+        obs = {key: _copied(value) for key, value in state.obs.items()}
+        failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
+        info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
+        reward = np.array(state.reward, np.float64)
+        self._state = state
+        return obs, reward, info
+
 
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
     """A single environment. `gymnasium.make` wraps it in a `TimeLimit` of `max_episode_steps`.
@@ -115,7 +127,6 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         self.metadata = {**self.metadata, "render_fps": self._compiled.fps}
         self.render_mode = render_mode
         self.observation_space, self.action_space = _spaces(self._compiled.spec)
-        self._state: Any = None
         self._painter: Painter | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -128,8 +139,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
         (seed,) = _check_reset(options, seed, 1)
         super().reset(seed=seed)
         self._compiled.check()
-        self._state = self._compiled.reset(episode_seed(self.np_random))
-        obs, _, info = _to_numpy(self._state)
+        obs, _, info = self._moved(self._compiled.reset, episode_seed(self.np_random))
         return obs, {key: value.item() for key, value in info.items()}
 
     def step(self, action: np.ndarray) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
@@ -141,10 +151,9 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 
         Raises:
           ValueError: `action` does not have shape [A], or is not finite.
-          gymnasium.error.ResetNeeded: `reset` has not been called.
+          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has raised another error since.
         """
-        self._state = self._compiled.step(self._state, _checked(action, self.action_space, self._state))
-        obs, reward, info = _to_numpy(self._state)
+        obs, reward, info = self._moved(self._compiled.step, self._state, _checked(action, self.action_space, self._state))
         terminated, truncated = (bool(flag) for flag in self._compiled.ended(self._state))
         return obs, reward.item(), terminated, truncated, {key: value.item() for key, value in info.items()}
 
@@ -220,7 +229,6 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._np_random, self._np_random_seed = zip(*(seeding.np_random() for _ in range(num_envs)))
-        self._states: Any = None
         self._steps = np.zeros(num_envs, int)  # number of steps in each episode
         self._ended = np.zeros(num_envs, bool)
 
@@ -239,7 +247,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         streams = zip(_check_reset(options, seed, self.num_envs), zip(self._np_random, self._np_random_seed))
         self._compiled.check()
         self._np_random, self._np_random_seed = zip(*(old if one is None else seeding.np_random(one) for one, old in streams))
-        obs, _, infos = self._restart()
+        obs, _, infos = self._moved(self._restart)
         return obs, infos
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -247,23 +255,13 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
 
         Raises:
           ValueError: `actions` does not have shape [N, A] or is not finite, or `GoalEnv.check` found a fault.
-          gymnasium.error.ResetNeeded: `reset` has not been called.
+          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has raised another error since.
         """
-        actions = _checked(actions, self.action_space, self._states)
+        actions = _checked(actions, self.action_space, self._state)
         restarted = self._ended
-        if restarted.any():
-            self._compiled.check()
-        if restarted.all():
-            obs, rewards, infos = self._restart()
-        else:
-            self._states = self._compiled.step_all(self._states, actions)
-            self._steps += 1
-            if restarted.any():
-                self._states = self._compiled.restart(self._states, self._seeds(restarted), restarted)
-                self._steps[restarted] = 0
-            obs, rewards, infos = self._results()
+        obs, rewards, infos = self._moved(self._advance, self._state, actions)
         rewards = np.where(restarted, 0.0, rewards)
-        terminated, done = (np.asarray(flag) & ~restarted for flag in self._compiled.ended(self._states))
+        terminated, done = (np.asarray(flag) & ~restarted for flag in self._compiled.ended(self._state))
         truncated = (done | (self._steps == self.max_episode_steps)) & ~terminated
         self._ended = terminated | truncated
         return obs, rewards, terminated, truncated, infos
@@ -273,13 +271,24 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         drawn = (episode_seed(random) if one else 0 for random, one in zip(self._np_random, which))
         return np.fromiter(drawn, np.int32, self.num_envs)
 
-    def _restart(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
-        self._states = self._compiled.reset_all(self._seeds(np.ones(self.num_envs, bool)))
-        self._steps, self._ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
-        return self._results()
+    def _advance(self, states: "State", actions: np.ndarray) -> "State":
+        if self._ended.any():
+            self._compiled.check()
+        if self._ended.all():
+            return self._restart()
+        states = self._compiled.step_all(states, actions)
+        self._steps += 1
+        if self._ended.any():
+            states = self._compiled.restart(states, self._seeds(self._ended), self._ended)
+            self._steps[self._ended] = 0
+        return states
 
-    def _results(self) -> tuple[Obs, np.ndarray, dict[str, Any]]:
-        obs, rewards, infos = _to_numpy(self._states)
+    def _restart(self) -> "State":
+        self._steps, self._ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
+        return self._compiled.reset_all(self._seeds(np.ones(self.num_envs, bool)))
+
+    def _moved(self, program: Any, *arguments: Any) -> tuple[Obs, np.ndarray, dict[str, Any]]:
+        obs, rewards, infos = super()._moved(program, *arguments)
         return obs, rewards, infos | {f"_{key}": np.ones(self.num_envs, bool) for key in infos}
 
 
@@ -299,14 +308,6 @@ def _space(observation: Any) -> Any:
     dtype = np.dtype(observation.dtype)
     low, high = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     return gymnasium.spaces.Box(low, high, observation.shape, dtype)
-
-
-def _to_numpy(state: "State") -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
-    """Copies observation, reward (float64) and info of one state or a batch to writable arrays."""
-    obs = {key: _copied(value) for key, value in state.obs.items()}
-    failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
-    info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
-    return obs, np.array(state.reward, np.float64), info
 
 
 def _copied(tree: Any) -> Any:

@@ -1,6 +1,7 @@
 """The gymnasium views as other programs use them: made in numbers, copied, and of environments of one's own."""
 
 import copy
+import dataclasses
 import pickle
 import re
 import warnings
@@ -107,6 +108,25 @@ def test_the_loop_of_the_page_on_policies_reaches_the_goal(capsys):
     (loop,) = [block for block in blocks if "gymnasium.make" in block]
     exec(compile(loop, "policies.md", "exec"), {"mjx_dher": mjx_dher})
     assert capsys.readouterr().out == "1.0\n"
+
+
+@pytest.mark.parametrize("make", [mjx_dher.gym.GymEnv, mjx_dher.gym.GymVectorEnv])
+def test_after_a_step_that_raised_only_a_reset_helps(make):
+    def broken(state, action):
+        raise RuntimeError("lost")
+
+    env = make("point_mass:PointMass")
+    env.reset(seed=0)
+    action, working = env.action_space.sample(), env._compiled
+    env._compiled = dataclasses.replace(working, step=broken, step_all=broken)
+    with pytest.raises(RuntimeError, match="lost"):
+        env.step(action)
+    env._compiled = working
+    for _ in range(2):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(action)
+    env.reset()
+    env.step(action)
 
 
 def test_the_environment_says_how_long_a_step_takes():
