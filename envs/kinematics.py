@@ -34,10 +34,12 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", each once.
 
     They are in the order of the patterns, and for one pattern in the columns' order. A pattern without "*" and "?" counts in
-    the first column that has the name. Raises ValueError if no name matches a pattern. The message lists the names.
+    the first column that has the name. `patterns` may be one name that has spaces. Raises ValueError if no name matches a
+    pattern. The message lists the names.
     """
     chosen: dict[int, None] = {}
-    for pattern in str(patterns).split() or [""]:
+    given = str(patterns)
+    for pattern in [given] if any(given in names for names in columns) else given.split() or [""]:
         matches = [{i for i, name in enumerate(names) if name and _fits(name, pattern)} for names in columns]
         plain = not set(pattern) & set("*?")  # then a name of the first column comes before an equal one of the second
         fitting = next(filter(None, matches), set()) if plain else set().union(*matches)

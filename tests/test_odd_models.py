@@ -196,6 +196,21 @@ def test_names_may_have_brackets_and_colons():
     assert env.observation_size == 10
 
 
+def test_names_may_have_spaces():
+    model = arm(POSITION.replace("servo", "my servo"), sensors='<jointpos name="my p" joint="j"/>').replace('"j"', '"my j"')
+    env = make(
+        model,
+        control=task.JointDelta("my j"),
+        goal=task.Joints("my j"),
+        observations=("qpos:my j", "qvel:my?j *", "sensor:my p"),
+        varied={"gain:my servo": (0.5, 2)},
+    )
+    assert (env.parts[0].moved, env.goal.moved, env.observation_size) == (["my servo"], ["my j"], 3)
+    for name in ("your j", "my k"):
+        with refuses("my servo", "my j", name.split()[0]):
+            make(model, control=task.JointDelta(name), goal=task.Joints("my j"))
+
+
 def test_an_actuator_s_name_comes_before_a_joint_s():
     other = '<body pos="0 1 0"><joint name="k" axis="0 0 1" damping="1"/><geom size=".1"/></body>'
     model = arm('<motor name="k" joint="j" ctrlrange="-1 1"/><motor name="m" joint="k" ctrlrange="-1 1"/>', more=other)
