@@ -4,7 +4,7 @@
     pip install --no-deps brax==0.14.2 jaxopt ml_collections tensorboardX jinja2 MarkupSafe
     python bench/crl_curves.py theirs --jaxgcrl /tmp/jaxgcrl --tasks arm_reach --out theirs.csv
     python bench/crl_curves.py ours --tasks arm_reach --out ours.csv
-    python bench/crl_curves.py matched --tasks arm_reach --out matched.csv   with four of JaxGCRL's details
+    python bench/crl_curves.py matched --tasks arm_reach --out matched.csv   with five of JaxGCRL's details
     python bench/crl_curves.py report ours.csv theirs.csv matched.csv
 
 docs/experiments/crl.md has the plan. JaxGCRL's tasks, learner and loop run unchanged. Its evaluator is replaced, because it
@@ -62,12 +62,12 @@ SIZES = {"arm_reach": Size(100, 8, 6), "arm_push_easy": Size(150, 11, 13)}
 
 
 def match_jaxgcrl() -> None:
-    """Gives the learner `crl` of this process JaxGCRL's inputs, first weights, standard deviations and loss of alpha."""
+    """Gives the learner `crl` of this process JaxGCRL's inputs, first weights, standard deviations, loss of alpha and goals."""
     import flax.linen as nn
     import jax
     import jax.numpy as jnp
 
-    from mjx_dher import networks, normalizer
+    from mjx_dher import networks, normalizer, samplers
     from mjx_dher.learners import gaussian
 
     def moments(network: Any, params: Any, observation: Any, goal: Any) -> tuple[Any, Any]:
@@ -82,9 +82,22 @@ def match_jaxgcrl() -> None:
         policy_loss = jnp.mean(jax.lax.stop_gradient(alpha) * log_prob - judge(action))
         return policy_loss - alpha * jax.lax.stop_gradient(surplus), {"entropy_weight": alpha, "entropy": -jnp.mean(log_prob)}
 
+    def within_a_window(achieved: Any, desired: Any, step: Any, hparams: Any, length: Any = None) -> Any:
+        """`geometric`, but an episode ends with a window, at each of its later steps with equal probability."""
+        later, ends = jnp.arange(len(achieved)) - step, jnp.arange(1, len(achieved))[:, None] - step
+        is_in = (later > 0) & ((later <= ends) | (ends <= 0))  # [T, T+1]; a window that ended before has no effect
+        weights = jnp.where(is_in, hparams.gamma**later, 0.0)
+        return jnp.log(jnp.mean(weights / jnp.maximum(weights.sum(axis=1, keepdims=True), 1e-30), axis=0))
+
     first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
-    replaced: Any = (normalizer, "normalize"), (networks, "_initializers"), (gaussian, "_moments"), (gaussian.Gaussian, "loss")
-    for (owner, name), new in zip(replaced, (lambda state, values, *others: values, lambda *others: first, moments, loss)):
+    replaced: Any = {
+        (normalizer, "normalize"): lambda state, values, *others: values,
+        (networks, "_initializers"): lambda *others: first,
+        (gaussian, "_moments"): moments,
+        (gaussian.Gaussian, "loss"): loss,
+        (samplers, "geometric"): within_a_window,
+    }
+    for (owner, name), new in replaced.items():
         assert hasattr(owner, name), name
         setattr(owner, name, new)
 
