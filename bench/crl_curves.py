@@ -84,10 +84,11 @@ def match_jaxgcrl() -> None:
 
     def within_a_window(achieved: Any, desired: Any, step: Any, hparams: Any, length: Any = None) -> Any:
         """`geometric`, but an episode ends with a window, at each of its later steps with equal probability."""
-        later, ends = jnp.arange(len(achieved)) - step, jnp.arange(1, len(achieved))[:, None] - step
-        is_in = (later > 0) & ((later <= ends) | (ends <= 0))  # [T, T+1]; a window that ended before has no effect
-        weights = jnp.where(is_in, hparams.gamma**later, 0.0)
-        return jnp.log(jnp.mean(weights / jnp.maximum(weights.sum(axis=1, keepdims=True), 1e-30), axis=0))
+        later = jnp.arange(len(achieved)) - step
+        weights = jnp.where(later > 0, hparams.gamma**later, 0.0)
+        totals = jnp.maximum(jnp.cumsum(weights), 1e-30)  # of a window that ends in each step
+        shares = jnp.cumsum(jnp.where(later > 0, 1.0 / totals, 0.0)[::-1])[::-1]  # of the windows that end there or later
+        return jnp.log(weights * (shares + step / totals[-1]))  # `step` windows ended before, and have no effect
 
     first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
     replaced: Any = {

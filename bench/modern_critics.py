@@ -2,7 +2,7 @@
 
     python bench/modern_critics.py --out critics --first-seed 10 --plan
     python bench/modern_critics.py --out critics --first-seed 10 --minutes 9   trains and reports; run it again to resume
-    python bench/modern_critics.py --out critics --first-seed 10 --runs docs/modern_critics_runs.csv   the others
+    python bench/modern_critics.py --out critics --first-seed 10 --runs docs/modern_critics_runs.csv   only runs not in it
     python bench/modern_critics.py --out toy --toy --seeds 2   the same on the point mass, on a CPU
 
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/ablation.md has the plan.
