@@ -225,13 +225,13 @@ def report(paths: list[Path]) -> str:
             point = (float(row["env_steps"]), float(row["success"]))
             curves.setdefault((row["task"], row["who"]), {}).setdefault(row["seed"], []).append(point)
     lines = ["| task | who | seeds | mean success | last | difference | 95 % interval |", "|---|---|---|---|---|---|---|"]
-    for task in dict.fromkeys(task for task, _ in curves):
+    for task in dict.fromkeys(task for task, who in curves if who == "theirs"):
         own = {who: [np.array(points) for points in curves[task, who].values()] for who in WHO if (task, who) in curves}
         every = [curve for each in own.values() for curve in each]
         grid = np.linspace(max(curve[0, 0] for curve in every), min(curve[-1, 0] for curve in every), 200)
         means = {who: np.array([np.interp(grid, *curve.T).mean() for curve in each]) for who, each in own.items()}
         for who, each in own.items():
-            last, cells = np.mean([curve[-1, 1] for curve in each]), ["", ""]
+            last, cells = np.mean([np.interp(grid[-1], *curve.T) for curve in each]), ["", ""]
             if who != "theirs":
                 low, high = stats.ttest_ind(means[who], means["theirs"], equal_var=False).confidence_interval()
                 cells = [f"{means[who].mean() - means['theirs'].mean():+.3f}", f"{low:+.3f} to {high:+.3f}"]
