@@ -119,12 +119,12 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
 
 def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
     """Mean height [S] of curves [S, P] over points x [P], by the trapezoidal rule. Raises ValueError if x is not [P], has fewer
-    than two points or does not increase, or `curves` is not [S, P].
+    than two points, is not finite or does not increase, or `curves` is not [S, P].
     """
     x, curves = _curves(x, curves)
-    if len(x) < 2 or (np.diff(x) <= 0).any():
-        raise ValueError(f"x must have at least two points, in increasing order; got {x}")
-    return np.trapezoid(curves, x, axis=1) / (x[-1] - x[0])
+    if len(x) < 2 or not (np.diff(x) > 0).all() or np.isinf(x[-1] - x[0]):
+        raise ValueError(f"x must have at least two finite points, in increasing order; got {x}")
+    return np.trapezoid(curves, (x - x[0]) / (x[-1] - x[0]), axis=1)
 
 
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
@@ -200,7 +200,7 @@ def holm(p_values: Sequence[float], tests: int | None = None) -> list[float]:
     tests = len(p_values) if tests is None else tests
     if not all(0 <= p <= 1 for p in p_values):
         raise ValueError(f"p-values must lie in [0, 1]; got {list(p_values)}")
-    if tests < len(p_values):
+    if not tests >= len(p_values):
         raise ValueError(f"there are {len(p_values)} p-values, which is more than {tests} tests")
     adjusted, least = [0.0] * len(p_values), 0.0
     for rank, index in enumerate(sorted(range(len(p_values)), key=lambda i: p_values[i])):
@@ -228,8 +228,8 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
     values = np.asarray(differences, float)
     if values.ndim != 2 or np.isinf(values).any() or (np.isfinite(values).sum(axis=1) < 2).any():
         raise ValueError(f"differences must be [M, S], finite or NaN, with at least two seeds each; got {values}")
-    number, values = np.isfinite(values).sum(axis=1), np.nan_to_num(values)
-    seeds = values.shape[1]
+    number, seeds, values = np.isfinite(values).sum(axis=1), values.shape[1], np.nan_to_num(values)
+    values = np.ldexp(values, -np.frexp(np.abs(values).max(1, initial=0, keepdims=True))[1])  # so that squares are floats
     if 2**seeds <= repeats:
         signs = 1 - 2 * (np.arange(2**seeds)[:, None] >> np.arange(seeds) & 1)
     else:

@@ -173,6 +173,23 @@ def test_holm():
         stats.holm([0.1, 1.1])
 
 
+@pytest.mark.parametrize("unit", [1e200, 1e-200])
+def test_no_product_of_scores_overflows_or_vanishes(unit):
+    """The squares of these scores, and areas under such curves, are no floats."""
+    scores = unit * np.arange(1.0, 6)
+    assert stats.paired_p_value(scores, np.zeros(5)) == 2 / 2**5
+    assert stats.westfall_young([scores, scores / unit]) == [2 / 2**5] * 2
+    assert stats.area_under_curve(scores, [scores]) == pytest.approx([3 * unit], rel=1e-12)
+
+
+def test_points_and_numbers_of_tests_that_are_not_finite_are_refused():
+    for x in ([0, np.nan], [0, np.inf]):
+        with refuses("x", "finite"):
+            stats.area_under_curve(x, [[1, 1]])
+    with refuses("p-values", "nan"):
+        stats.holm([0.1], tests=np.nan)
+
+
 @pytest.mark.parametrize("scores", [[], [np.nan, 1], np.zeros((2, 2, 2))])
 def test_what_are_no_scores_is_refused(scores):
     with refuses("scores"):
