@@ -13,7 +13,7 @@ from rich.console import Console
 from sweep_helpers import CONFIG, compile_once, make_grid, run, table  # noqa: F401
 
 from mjx_dher import Options, cli, lookup
-from mjx_dher.cli import fleet
+from mjx_dher.cli import fleet, sweep
 from mjx_dher.fleet import chunks, cluster, worker
 from mjx_dher.fleet.chunks import FleetOptions, Task
 from mjx_dher.fleet.cluster import LostError, Running
@@ -164,6 +164,23 @@ def test_a_damaged_run_is_rejected_and_nothing_is_lost(trained, tmp_path):
     assert not (tmp_path / "b" / "outside").exists()
     with refuses("seed", error=FolderError):  # another trial
         worker.unpack(tmp_path / "c", dataclasses.replace(trial, seed=1), parcel)
+
+
+def test_the_sweep_without_ray_removes_chunks_whose_runs_have_ended(tmp_path, monkeypatch):
+    ended, waiting = make_grid(("future",), (0, 1))
+    run(tmp_path, [ended])
+    monkeypatch.setattr(sweep, "_write_tables", lambda args, console: None)
+    args, _ = sweep.parse_sweep_args(["--out", str(tmp_path), "--preset", "cpu"], print)
+    storage = fleet.storage_of(FleetOptions(ray="local"), tmp_path)
+    both, one = (chunks.make(specs, OPTIONS, None, CPU, storage, {}) for specs in ((ended, waiting), (ended,)))
+    for chunk in (both, one):
+        chunks.make_folder(chunk)
+        (chunk.storage / "cells").mkdir()
+    assert sweep._end(args, [ended], [], 0, Console()) == 0
+    assert [path.name for path in storage.iterdir()] == [both.id]  # a larger sweep needs it
+    run(tmp_path, [waiting])
+    assert sweep._end(args, [ended, waiting], [waiting], 0, Console()) == 0
+    assert not (tmp_path / "unfinished").exists()
 
 
 def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):

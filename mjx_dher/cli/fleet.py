@@ -1,6 +1,5 @@
 """A sweep on a Ray cluster: `sweep --ray`."""
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -101,10 +100,8 @@ def _train(
     if lost:
         tries = cluster.RETRIES + 1
         raise ValueError(f"ray: {len(lost)} tasks were lost {tries} times ({'; '.join(lost[:3])}); run the same command again")
-    if not signals.are_asked() and storage is not None:
-        for path in (storage, storage.parent) if args.fleet.storage is None else (storage,):
-            with contextlib.suppress(OSError):  # not empty
-                path.rmdir()
+    if storage is not None:
+        chunks.clear(storage, args.out)
 
 
 class _Screen:

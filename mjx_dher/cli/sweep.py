@@ -17,6 +17,7 @@ from mjx_dher.cli import parse, settings
 from mjx_dher.cli.common import Devices, Screen, join, make_env, settle_compiler, try_components
 from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
+from mjx_dher.fleet import chunks
 from mjx_dher.fleet.chunks import FleetOptions
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import Engine, Options, RunSpec
@@ -243,6 +244,10 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: in
             f"{args.out}: another process is training {len(left)} of the {len(trials)} runs, which are not in the tables;"
             " run the same command again when it has ended"
         )
+    for storage in (args.out / "unfinished").glob("fleet-*"):  # its cluster may never finish it
+        with contextlib.suppress(OSError, files.BusyError), files.lock(args.out):
+            chunks.clear(storage, args.out)
+            storage.parent.rmdir()
     return 0
 
 
