@@ -109,6 +109,16 @@ def test_wandb_that_cannot_start_is_an_error_with_a_cure(kind, tmp_path, monkeyp
         loggers.open_sinks(tmp_path / "run", ["wandb"])
 
 
+def test_a_lost_process_of_wandb_is_an_error_that_names_it_and_not_the_run_folder(tmp_path, monkeypatch):
+    wandb, lost = pytest.importorskip("wandb"), Mock(side_effect=ConnectionResetError("Connection lost"))
+    monkeypatch.setattr(wandb, "init", Mock(return_value=Mock(log=lost, finish=lost)))
+    run_folder.write_config(tmp_path / "run", RunSpec(), "native", {})
+    sink = loggers.open_sinks(tmp_path / "run", ["wandb"])[1]
+    for call in (lambda: sink.write(row(1)), sink.close):
+        with refuses("log wandb", "Connection lost", "checkpoint", error=FolderError), run_folder.named(tmp_path / "run"):
+            call()
+
+
 def test_logs_are_refused_by_name_and_by_the_extra_that_is_missing(monkeypatch):
     with refuses("log", "tensorbord", "tensorboard"):
         Options(log=("jsonl", "tensorbord")).check()

@@ -10,7 +10,7 @@ from typing import Any
 
 from mjx_dher.config import Config
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.folder.run_folder import METRICS_FILE
+from mjx_dher.runs.folder.run_folder import METRICS_FILE, named
 from mjx_dher.system import files, machine
 from mjx_dher.system.files import FolderError
 
@@ -54,8 +54,7 @@ class CsvSink:
         self._file.close()
 
     def _make_writer(self, columns: Sequence[str]) -> "csv.DictWriter[str]":
-        # A resumed run keeps the columns of its file.
-        return csv.DictWriter(self._file, columns, extrasaction="ignore")
+        return csv.DictWriter(self._file, columns, extrasaction="ignore")  # a resumed run keeps its file's columns
 
 
 class JsonlSink:
@@ -85,9 +84,8 @@ def _to_json(row: dict[str, Any]) -> str:
 
 def flush_logs(folder: Path) -> None:
     """Flushes the CSV file and the JSON lines of the run in `folder` to disk."""
-    for name in (METRICS_FILE, JSON_FILE):
-        if (folder / name).exists():
-            files.flush(folder / name)
+    for path in filter(Path.exists, (folder / METRICS_FILE, folder / JSON_FILE)):
+        files.flush(path)
     files.flush(folder)
 
 
@@ -120,6 +118,7 @@ class WandbSink:
 
         from mjx_dher.runs.folder import reading
 
+        self._folder = folder
         content = reading.read_config(folder)
         run = reading.to_spec(folder, content)
         # A resumed run keeps its id, which therefore excludes settings that may change.
@@ -139,10 +138,12 @@ class WandbSink:
             raise ValueError(f"log wandb cannot start ({reason}); WANDB_MODE=offline needs no account") from error
 
     def write(self, row: dict[str, Any]) -> None:
-        self._run.log(row, step=row["epoch"], commit=True)
+        with named(self._folder, "log wandb"):
+            self._run.log(row, step=row["epoch"], commit=True)
 
     def close(self) -> None:
-        self._run.finish()
+        with named(self._folder, "log wandb"):
+            self._run.finish()
 
 
 Sink = CsvSink | JsonlSink | TensorBoardSink | WandbSink
@@ -161,10 +162,9 @@ def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: in
 def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:
     """Row for the sinks, in the order of metrics.csv, from a `loop.Progress` and the metrics of one run."""
     steps, updates = progress.env_steps / progress.epoch, progress.updates / progress.epoch  # all epochs are equal
-    first = {name: metrics[name] for name in FIRST_COLUMNS if name in metrics}
     return {
         **{name: getattr(progress, name) for name in COUNTS},
-        **first,
+        **{name: metrics[name] for name in FIRST_COLUMNS if name in metrics},
         **metrics,
         "steps_per_second": steps / progress.epoch_seconds,
         "updates_per_second": updates / progress.epoch_seconds,

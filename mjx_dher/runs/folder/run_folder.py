@@ -211,13 +211,13 @@ class Claims:
 
 
 @contextlib.contextmanager
-def named(folder: Path) -> Iterator[None]:
-    """Converts an OSError to a FolderError that names the folder and its last checkpoint."""
+def named(folder: Path, place: object = None) -> Iterator[None]:
+    """Converts an OSError to a FolderError that names `place`, by default the folder, and the folder's last checkpoint."""
     try:
         yield
     except OSError as error:
         reason = error.strerror or error
-        raise FolderError(f"{folder} cannot be written to ({reason}); {last_checkpoint(folder)}") from error
+        raise FolderError(f"{place or folder} cannot be written to ({reason}); {last_checkpoint(folder)}") from error
 
 
 def last_checkpoint(folder: Path) -> str:
