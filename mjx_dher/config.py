@@ -23,8 +23,8 @@ class Number:
 
 Count = Annotated[int, Number("[1, 1000000]")]
 Share = Annotated[float, Number("[0, 1]")]
-Positive = Annotated[float, Number("(0, inf)")]
-NotNegative = Annotated[float, Number("[0, inf)")]
+Positive = Annotated[float, Number("[1e-30, 1e30]")]
+NotNegative = Annotated[float, Number("[0, 1e30]")]  # programs compute in float32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,7 @@ class HParams(NamedTuple):
     """Final learning rates as a fraction of the initial ones, reached linearly. 1 keeps them constant."""
     adam_eps: Annotated[float, Number("[1e-30, 1]")] = 1e-8
     """Adam's epsilon. Summing the gradients of W workers, instead of averaging them, is the same as dividing this by W."""
-    gamma: Annotated[float, Number("[0, 1)")] = 0.98
+    gamma: Annotated[float, Number("[0, 0.9999999]")] = 0.98
     """Discount factor. Target values are clipped to the range of possible returns, [-1/(1-gamma), 0] for Fetch."""
     polyak: Share = 0.95
     """Fraction of the old target that a soft update keeps: 1 - tau in other libraries."""
@@ -119,7 +119,7 @@ class HParams(NamedTuple):
     """Fraction of each batch drawn in proportion to episode priority. The rest is uniform."""
     epsilon: Share = 0.2
     """Probability that epsilon_closest draws a uniform future goal instead of the closest."""
-    temperature: Annotated[float, Number("(0, inf]")] = 1.0
+    temperature: Annotated[float, Number("[1e-30, inf]")] = 1.0
     """Temperature of weighted. Larger values give more even weights; inf equals future."""
     weight_scale: Annotated[float, Number("[1e-6, 1e6]")] = 0.05
     """Distance in metres that counts as 1, for weighted with weight_normalization none."""
@@ -129,7 +129,7 @@ class HParams(NamedTuple):
     """Target noise is clipped to +- this."""
     entropy_weight: NotNegative = 1.0
     """Initial weight of the policy's entropy."""
-    entropy_target: Annotated[float, Number("(-inf, inf)")] = -1.0
+    entropy_target: Annotated[float, Number("[-1e30, 1e30]")] = -1.0
     """Target entropy per action dimension, for which the learner adapts the entropy weight."""
     logsumexp_penalty: NotNegative = 0.1
     """Weight of the mean squared logsumexp of the energies in the contrastive loss."""

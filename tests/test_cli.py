@@ -126,7 +126,7 @@ BAD = [
         ["--replay-size", "1500"],
         ["replay_size must hold at least one cycle of 32 episodes x 50 steps = 1600 transitions; got 1500"],
     ),
-    (["--gamma", "1.0"], ["gamma must lie in [0, 1); got 1.0"]),
+    (["--gamma", "1.0"], ["gamma must lie in [0, 0.9999999]; got 1.0"]),
     (["--final-episodes", "0"], ["final_episodes must lie in [1, 1000000]; got 0"]),
     (["--env", "x", "--num-envs", "0", "--gamma", "2"], ["env must be", "num_envs must lie", "gamma must lie"]),
     (

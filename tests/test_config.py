@@ -113,6 +113,7 @@ BAD_CONFIG = [  # settings, and what the message must have
 BAD_HPARAMS = [
     *[("gamma", 1.0), ("polyak", -0.1), ("actor_lr", float("nan")), ("noise_std", float("inf")), ("temperature", 0.0)],
     *[("her_k", -1), ("priority_fraction", 1.5)],
+    *[("gamma", 1 - 1e-9), ("action_l2", 1e39), ("obs_clip", 1e-300)],  # float32 would make 1, infinity and 0 of them
 ]
 
 

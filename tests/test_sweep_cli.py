@@ -143,7 +143,7 @@ def test_a_signal_in_the_last_epoch_loses_nothing(tmp_path, point_mass, monkeypa
         (["--checkpoint-every", "-1"], r"checkpoint_every must lie in \[0, .*; got -1"),
         (["--lanes", "0"], r"lanes must lie in \[1, .*; got 0"),
         (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
-        (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 1\); got 1.5"),
+        (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 0.9999999\]; got 1.5"),
         (["--sweep.gamma"], r"sweep.gamma must be one or more numbers; got none"),
         (["--seeds", "2", "--first-seed", "4294967295"], r"first_seed must lie in \[0, 4294967294\]; got 4294967295"),
         (["--batch-size", "0"], r"batch_size must lie in \[1, .*; got 0"),
