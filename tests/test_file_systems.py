@@ -52,6 +52,13 @@ def test_folders_that_cannot_be_flushed_are_passed_over_and_files_are_not(number
     assert not list(tmp_path.glob("y.json*"))
 
 
+def test_a_folder_where_a_file_is_to_be_is_named_and_not_the_partial_file(tmp_path):
+    (tmp_path / "finals.csv").mkdir()
+    with pytest.raises(IsADirectoryError) as raised:
+        files.write(tmp_path / "finals.csv", b"")
+    assert sentence(raised.value) == f"{tmp_path / 'finals.csv'}: {os.strerror(errno.EISDIR)}"
+
+
 @pytest.mark.parametrize("make", [files.make_folder, lambda path: files.new_folder(path).__enter__()])
 def test_a_folder_that_cannot_be_flushed_is_named_and_does_not_stay(make, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", failing(errno.EIO, is_folder=True))

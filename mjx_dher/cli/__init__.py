@@ -121,7 +121,7 @@ def sentence(error: Exception) -> str | None:
     if isinstance(error, ValueError):
         return str(error)
     if isinstance(error, OSError):
-        return f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+        return f"{error.filename2 or error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
     if "MemoryError: engine" in str(error):  # from a call of the host in a compiled program
         return _first_line(error).partition("MemoryError: ")[2]
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
