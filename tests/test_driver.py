@@ -13,6 +13,7 @@ from conftest import EXAMPLES, refuses
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
+from mjx_dher.cli.common import Screen
 from mjx_dher.learners import ddpg
 from mjx_dher.runs import driver
 from mjx_dher.runs.folder import checkpoint, fingerprint, lane_checkpoints, reading
@@ -52,6 +53,16 @@ def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, mo
         assert set(ours.files) == set(other.files)
         assert all(np.array_equal(ours[name], other[name]) for name in ours.files)
     assert reading.read_spec(trial) == reading.read_spec(tmp_path / "run")
+
+
+def test_a_run_folder_that_is_moved_while_it_trains_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    run = tmp_path / "run"
+    monkeypatch.setattr(Screen, "show", lambda self, specs, progress: run.exists() and run.rename(tmp_path / "moved"))
+    assert cli.main([*FLAGS, "--checkpoint-every", "1", "--out", str(run)]) == 2
+    told = capsys.readouterr()
+    assert "cannot write a checkpoint" in told.out
+    assert f"error: {run} cannot be written to (No such file or directory)" in told.err
 
 
 def breaking():

@@ -148,7 +148,7 @@ def new_folder(folder: Path) -> Iterator[None]:
     """
 
     def unlink_lock() -> None:
-        if not is_used(folder):
+        if folder.is_dir() and not is_used(folder):  # it may have been moved
             (folder / LOCK).unlink(missing_ok=True)  # nobody waits for it, because the folder is removed too
 
     with made(folder):

@@ -151,7 +151,7 @@ class LaneCheckpoints:
         try:
             self.save(progress)
         except (OSError, checkpoint.CheckpointError) as error:
-            self.report(str(error))
+            self.report(str(error) if isinstance(error, FolderError) else f"cannot write a checkpoint ({error})")
 
     def clear(self, keep_end: bool = False) -> None:
         """Removes the checkpoints of these runs, and those in `shared` whose runs have all ended.
