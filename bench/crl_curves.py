@@ -88,7 +88,9 @@ def match_jaxgcrl() -> None:
         weights = jnp.where(later > 0, hparams.gamma**later, 0.0)
         totals = jnp.maximum(jnp.cumsum(weights), 1e-30)  # of a window that ends in each step
         shares = jnp.cumsum(jnp.where(later > 0, 1.0 / totals, 0.0)[::-1])[::-1]  # of the windows that end there or later
-        return jnp.log(weights * (shares + step / totals[-1]))  # `step` windows ended before, and have no effect
+        return jnp.log(
+            weights * (shares + step / totals[-1])
+        )  # the other `step` windows end before; then the episode's end counts
 
     first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
     replaced: Any = {
@@ -105,7 +107,7 @@ def match_jaxgcrl() -> None:
 
 def train_ours(who: str, task: str, seeds: range, toy: bool) -> Iterable[tuple]:
     """Rows of the learner `crl`, with JaxGCRL's numbers."""
-    from mjx_dher.__main__ import main as command
+    from mjx_dher import cli
     from mjx_dher.sweeps import comparison, tables
 
     size = SIZES[task]
@@ -121,8 +123,7 @@ def train_ours(who: str, task: str, seeds: range, toy: bool) -> Iterable[tuple]:
             f" --eval-episodes {2 if toy else EVALUATED}"
             f" --seeds {len(seeds)} --first-seed {seeds[0]} --out {out}/sweep"
         )
-        sys.argv = ["train.py", "sweep", *options.split()]
-        if status := command():
+        if status := cli.main(["sweep", *options.split()]):
             raise SystemExit(status)
         for groups in comparison.groups(tables.read(Path(out) / "sweep")).values():
             for group in groups:

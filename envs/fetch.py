@@ -134,7 +134,7 @@ class FetchEnv(SimulatedTask):
           desired_goal: goal [3] in m.
 
         Raises:
-          ValueError: an array has another shape, or a quaternion has no length, outside `jit`.
+          ValueError: an array has another shape or, outside `jit`, a quaternion has length 0.
         """
         physics: Physics = jax.tree.map(jnp.asarray, self._rest)
         if object_qpos is not None:

@@ -100,7 +100,7 @@ class ObjectPose(Goal):
         goal = jnp.asarray(goal, jnp.float32)
         check_shape("desired_goal", goal, (self.size,))
         length = _norm(goal[3:])
-        if not isinstance(goal, jax.core.Tracer) and not 0 < float(length) < np.inf:
+        if not isinstance(goal, jax.core.Tracer) and not 0 < np.linalg.norm(np.asarray(goal)[3:]) < np.inf:
             raise ValueError(f"desired_goal must end with a quaternion of finite length, more than 0; got {np.asarray(goal)}")
         return jnp.concatenate([goal[:3], jnp.where(jnp.abs(length - 1.0) < 1e-5, goal[3:], goal[3:] / length)])
 
@@ -193,7 +193,7 @@ class HandTask(MujocoTask):
           qvel: [24] rad/s, followed by an object's [6] velocity. Default: at rest.
 
         Raises:
-          ValueError: an array has another shape, or a quaternion has no length, outside `jit`.
+          ValueError: an array has another shape or, outside `jit`, a quaternion has length 0.
         """
         start: Physics = jax.tree.map(jnp.asarray, self._rest)
         moving = jnp.zeros_like(start.qvel) if qvel is None else jnp.asarray(qvel, jnp.float32)

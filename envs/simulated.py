@@ -122,14 +122,14 @@ class SimulatedTask(GoalEnv):
         return dataclasses.replace(physics, factors=draw(self._ranges, key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`.
-        Outside `jit`, raises ValueError if a free or ball joint has a quaternion without length.
+        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`. Outside
+        `jit`, raises ValueError if a free or ball joint has a quaternion of length 0.
         """
         check_shape("desired_goal", desired_goal, (self.goal_size,))
         if not isinstance(physics.qpos, jax.core.Tracer):
-            kinds, starts = self.model.jnt_type, self.model.jnt_qposadr
+            kinds, starts, qpos = self.model.jnt_type, self.model.jnt_qposadr, np.asarray(physics.qpos)
             for at in (starts + 3 * (kinds == 0))[kinds < 2]:  # kind 0 is a free joint, 1 a ball joint
-                if not np.linalg.norm(quat := np.asarray(physics.qpos[at : at + 4])):
+                if not np.linalg.norm(quat := qpos[at : at + 4]):
                     raise ValueError(f"qpos[{at}:{at + 4}] must be a quaternion of a length above 0; got {quat}")
         physics = self._sensed(physics)
         sound = self.is_sound(physics)

@@ -27,8 +27,8 @@ class Start:
       keyframe: name of a keyframe of the model, or None for the model's default configuration.
       ranges: low and high, by the name of a free body (positions, [3] m each) or of a hinge or slide (rad or m), to draw from.
       settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
-        Mocap targets hold it, and so do servos, unless the keyframe has inputs or activations. Servos of spatial tendons and
-        sites hold it roughly.
+        Servos hold it, those of spatial tendons and sites roughly, unless the keyframe has inputs or activations. Mocap
+        targets hold bodies that `ranges` draws, and without `turn` only their positions.
     """
 
     def __init__(self, keyframe: str | None = None, ranges: Mapping[str, tuple[Any, Any]] | None = None, settle: int = 0):
@@ -95,11 +95,12 @@ class Start:
 def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
     """For each name of a free body, hinge or slide: first index in qpos and in qvel, and limits (3 numbers, or 1)."""
     places, free = {}, mujoco.mjMAXVAL * np.array([[-1.0], [1.0]])  # MuJoCo takes larger positions for a divergence
+    unlimited = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_LIMIT
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
         if kind == FREE:
             places[names_of(model, "body")[model.jnt_bodyid[i]]] = (*at, *np.repeat(free, 3, axis=1))
         elif kind in (HINGE, SLIDE):
-            low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] else free
+            low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] and not unlimited else free
             places[names_of(model, "joint")[i]] = (*at, low - 1e-6, high + 1e-6)
     return places

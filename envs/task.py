@@ -131,12 +131,17 @@ class MujocoTask(SimulatedTask):
     def start_physics(self, key: PRNGKey) -> Physics:
         """Draws the physics of a start."""
         rest: Physics = jax.tree.map(jnp.asarray, self._rest)
-        physics, hold = self.start.held(dataclasses.replace(rest, qpos=self.start.draw(key), sensors=None))
+        physics, hold = self._held(dataclasses.replace(rest, qpos=self.start.draw(key), sensors=None))
+        return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, hold), physics)
+
+    def _held(self, physics: Physics) -> tuple[Physics, Controls]:
+        """A drawn start with activations, and inputs that hold it."""
+        physics, hold = self.start.held(physics)
         drawn = {each.qpos for each in self.start.drawn}
         for part in self.parts:  # the mocap target of a body that was drawn is at the body
             if isinstance(part, Mocap) and any(joint.qpos in drawn for joint in part.place.joints):
                 hold = part.apply(physics, jnp.zeros(part.size, jnp.float32), hold)
-        return jax.lax.fori_loop(0, self.start.settle, lambda _, now: self.engine.advance(now, hold), physics)
+        return physics, hold
 
     def sample_goal(self, key: PRNGKey) -> Array:
         """Draws a goal [G]."""
@@ -172,7 +177,7 @@ class MujocoTask(SimulatedTask):
     def _sensed(self, physics: Physics, controls: Controls | None = None) -> Physics:
         if self._sensors is None:
             return physics
-        controls = jax.tree.map(jnp.asarray, self._hold) if controls is None else controls
+        controls = self._held(physics)[1] if controls is None else controls
         return dataclasses.replace(physics, sensors=self._sensors.read(physics, controls))
 
 

@@ -23,8 +23,8 @@ class Number:
 
 Count = Annotated[int, Number("[1, 1000000]")]
 Share = Annotated[float, Number("[0, 1]")]
-Positive = Annotated[float, Number("[1e-30, 1e30]")]
-NotNegative = Annotated[float, Number("[0, 1e30]")]  # programs compute in float32
+Positive = Annotated[float, Number("[1e-37, 3e38]")]
+NotNegative = Annotated[float, Number("[0, 3e38]")]  # programs compute in float32
 
 
 @dataclasses.dataclass(frozen=True)

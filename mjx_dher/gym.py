@@ -151,7 +151,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 
         Raises:
           ValueError: `action` does not have shape [A], or is not finite.
-          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has raised another error since.
+          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has failed since, other than for its action.
         """
         obs, reward, info = self._moved(self._compiled.step, self._state, _checked(action, self.action_space, self._state))
         terminated, truncated = (bool(flag) for flag in self._compiled.ended(self._state))
@@ -162,7 +162,7 @@ class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
 
         Raises:
           ValueError: the environment was made without render_mode="rgb_array", or cannot be drawn on this machine.
-          gymnasium.error.ResetNeeded: `reset` has not been called.
+          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has failed since.
         """
         if self.render_mode is None:
             raise ValueError('render_mode must be "rgb_array" to draw the environment; got None')
@@ -255,7 +255,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
 
         Raises:
           ValueError: `actions` does not have shape [N, A] or is not finite, or `GoalEnv.check` found a fault.
-          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has raised another error since.
+          gymnasium.error.ResetNeeded: `reset` has not been called, or a step has failed since, other than for its action.
         """
         actions = _checked(actions, self.action_space, self._state)
         restarted = self._ended
@@ -317,7 +317,7 @@ def _copied(tree: Any) -> Any:
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
-    """Converts `actions` to float32. Raises an error before the first `reset` or if they do not fit `space`, bounds aside."""
+    """Converts `actions` to float32. Raises an error without a `state` or if they do not fit `space`, bounds aside."""
     if state is None:
         raise gymnasium.error.ResetNeeded("reset must be called before step")
     actions = np.asarray(actions, np.float32)

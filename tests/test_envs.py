@@ -159,6 +159,8 @@ def test_starts_and_goals_of_another_shape_are_rejected(task):
     state, start, goal = env.reset(jax.random.key(0)), jnp.array([1.3, 0.7, 0.425, 1, 0, 0, 0]), jnp.zeros(3)
     with refuses("object_qpos", "[1]", "[7]"):
         env.init_state(jnp.ones(1), goal)
+    physics = jax.tree.map(jnp.asarray, state.physics)
+    assert jax.jit(lambda goal: env.first_state(physics, goal))(goal).obs["desired_goal"].shape == (3,)
     with refuses("qpos", "quaternion"):
         env.init_state(start.at[3].set(0.0), goal)
     with refuses("desired_goal", "[]", "[3]"):

@@ -119,6 +119,7 @@ def test_a_keyframe_outside_a_joint_s_range_is_rejected(at):
     with refuses("bent", "'j'", "-2.01", "-2 to 2") if at < -2 else contextlib.nullcontext():
         make(model, start=task.Start("bent"))
     make(model, start=task.Start("bent", ranges={"j": (0, 1)}))
+    make(model.replace("<worldbody>", '<option><flag limit="disable"/></option><worldbody>'), start=task.Start("bent"))
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.2])
@@ -151,11 +152,13 @@ def test_a_mocap_target_is_relative_to_the_welded_body(weld, turn):
 
 @pytest.mark.parametrize("turn", [0.0, 0.2])
 def test_a_mocap_target_follows_a_drawn_start_while_it_settles(turn):
-    declared = {"goal": PLACE, "control": task.Mocap("target", 0.05, turn), "observations": ("body:hand",)}
+    declared = {"goal": PLACE, "control": task.Mocap("target", 0.05, turn), "observations": ("body:hand", "sensor:acc")}
     start = task.Start(ranges={"hand": ((0, 0, 0.2), (0.2, 0.2, 0.6))}, settle=20)
-    env = make(WELDED.format('body1="target" body2="hand"'), start=start, **declared)
+    sensor = '<sensor><framelinacc name="acc" objtype="body" objname="hand"/></sensor></mujoco>'
+    env = make(WELDED.format('body1="target" body2="hand"').replace("</mujoco>", sensor), start=start, **declared)
     key = jax.random.key(3)
     np.testing.assert_allclose(jax.jit(env.start_physics)(key).qpos, env.start.draw(key), atol=1e-3)
+    np.testing.assert_allclose(jax.jit(env.reset)(key).physics.sensors, 0.0, atol=0.1)  # the target is at the hand there, too
 
 
 @pytest.mark.parametrize("weld", ['site1="at" site2="grip"', 'body1="target" body2="hand" active="false"'])
@@ -207,7 +210,7 @@ def test_names_may_have_spaces():
     )
     assert (env.parts[0].moved, env.goal.moved, env.observation_size) == (["my servo"], ["my j"], 3)
     for name in ("your j", "my k"):
-        with refuses("my servo", "my j", name.split()[0]):
+        with refuses("my servo", "my j", f"got {name.split()[0]!r}"):
             make(model, control=task.JointDelta(name), goal=task.Joints("my j"))
 
 

@@ -244,8 +244,8 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: in
             f"{args.out}: another process is training {len(left)} of the {len(trials)} runs, which are not in the tables;"
             " run the same command again when it has ended"
         )
-    for storage in (args.out / "unfinished").glob("fleet-*"):  # its cluster may never finish it
-        with contextlib.suppress(OSError, files.BusyError), files.lock(args.out):
+    for storage in (args.out / "unfinished").glob("fleet-*"):  # a driver that still trains holds the lock
+        with contextlib.suppress(OSError, files.FolderError), files.lock(args.out):
             chunks.clear(storage, args.out)
             storage.parent.rmdir()
     return 0

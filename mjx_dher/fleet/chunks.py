@@ -142,7 +142,8 @@ def clear(storage: Path, sweep: Path) -> None:
     """Removes the chunks in a storage whose runs have all ended in the sweep, and the storage if nothing is left in it."""
     for path in storage.glob(f"*/{NAMES_FILE}"):
         with contextlib.suppress(OSError, ValueError, TypeError):  # damaged
-            if all((sweep / grid.CELLS / name / run_folder.RESULT_FILE).exists() for name in files.read_json(path)):
+            names = files.read_json(path)
+            if names and all((sweep / grid.CELLS / name / run_folder.RESULT_FILE).exists() for name in names):
                 shutil.rmtree(path.parent)
     with contextlib.suppress(OSError):  # not empty
         storage.rmdir()
