@@ -90,7 +90,7 @@ def match_jaxgcrl() -> None:
         shares = jnp.cumsum(jnp.where(later > 0, 1.0 / totals, 0.0)[::-1])[::-1]  # of the windows that end there or later
         return jnp.log(
             weights * (shares + step / totals[-1])
-        )  # the other `step` windows end before; then the episode's end counts
+        )  # for windows that end before, the episode's end counts
 
     first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
     replaced: Any = {

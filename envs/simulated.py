@@ -122,8 +122,8 @@ class SimulatedTask(GoalEnv):
         return dataclasses.replace(physics, factors=draw(self._ranges, key))
 
     def first_state(self, physics: Physics, desired_goal: Array) -> State:
-        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`. Outside
-        `jit`, raises ValueError if a free or ball joint has a quaternion of length 0.
+        """First state of an episode from `physics`, with a goal [G]. If it has diverged, it is like a state from `step`.
+        Outside `jit`, raises ValueError if a free or ball joint has a quaternion of length 0.
         """
         check_shape("desired_goal", desired_goal, (self.goal_size,))
         if not isinstance(physics.qpos, jax.core.Tracer):
