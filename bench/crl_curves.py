@@ -88,9 +88,7 @@ def match_jaxgcrl() -> None:
         weights = jnp.where(later > 0, hparams.gamma**later, 0.0)
         totals = jnp.maximum(jnp.cumsum(weights), 1e-30)  # of a window that ends in each step
         shares = jnp.cumsum(jnp.where(later > 0, 1.0 / totals, 0.0)[::-1])[::-1]  # of the windows that end there or later
-        return jnp.log(
-            weights * (shares + step / totals[-1])
-        )  # for windows that end before, the episode's end counts
+        return jnp.log(weights * (shares + step / totals[-1]))  # for windows that end before, the episode's end counts
 
     first = {"kernel_init": nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")}
     replaced: Any = {
