@@ -124,7 +124,7 @@ def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
     x, curves = _curves(x, curves)
     if len(x) < 2 or not (np.diff(x) > 0).all() or np.isinf(x[-1] - x[0]):
         raise ValueError(f"x must have at least two finite points, in increasing order; got {x}")
-    return np.trapezoid(curves, (x - x[0]) / (x[-1] - x[0]), axis=1)
+    return np.trapezoid(curves, x := np.ldexp(x, -np.frexp(x[-1] - x[0])[1]), axis=1) / (x[-1] - x[0])
 
 
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
