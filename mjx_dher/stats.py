@@ -71,8 +71,7 @@ def bootstrap_interval(
       ValueError: there are no scores, `level` does not lie between 0 and 1, or `repeats` is less than 1.
     """
     scores = _scores(scores)
-    rng = _generator(seed, repeats)
-    chosen = rng.integers(len(scores), size=(repeats, *scores.shape))
+    chosen = _generator(seed, repeats).integers(len(scores), size=(repeats, *scores.shape))
     resampled = np.take_along_axis(scores[None], chosen, axis=1).reshape(repeats, -1)
     low, high = _quantiles(statistic(resampled, axis=1), level)
     return float(low), float(high)
@@ -124,7 +123,8 @@ def area_under_curve(x: ArrayLike, curves: ArrayLike) -> NDArray:
     x, curves = _curves(x, curves)
     if len(x) < 2 or not (np.diff(x) > 0).all() or np.isinf(x[-1] - x[0]):
         raise ValueError(f"x must have at least two finite points, in increasing order; got {x}")
-    return np.trapezoid(curves, x := np.ldexp(x, -np.frexp(x[-1] - x[0])[1]), axis=1) / (x[-1] - x[0])
+    span, power = np.frexp(x[-1] - x[0])
+    return np.trapezoid(curves, np.ldexp(x, -power), axis=1) / span
 
 
 def probability_of_improvement(a: ArrayLike, b: ArrayLike) -> float:
