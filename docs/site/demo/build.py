@@ -36,7 +36,7 @@ LIBRARIES = (
 
 def settings(env: fetch.FetchEnv) -> dict[str, object]:
     """The task's numbers as JSON."""
-    state, model, task = env.init_state(jnp.zeros(7), jnp.zeros(3)), env.model, env.task
+    state, model, task = env.init_state(jnp.zeros(7).at[3].set(1.0), jnp.zeros(3)), env.model, env.task
     return {
         "qpos": np.asarray(state.physics.qpos, float).tolist(),
         "qvel": np.asarray(state.physics.qvel, float).tolist(),
