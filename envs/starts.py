@@ -27,8 +27,8 @@ class Start:
       keyframe: name of a keyframe of the model, or None for the model's default configuration.
       ranges: low and high, by the name of a free body (positions, [3] m each) or of a hinge or slide (rad or m), to draw from.
       settle: environment steps for which the start is held before the episode begins. They cost as much as other steps.
-        Servos hold it, those of spatial tendons and sites roughly, unless the keyframe has inputs or activations. Mocap
-        targets hold bodies that `ranges` draws, and without `turn` only their positions.
+        Servos hold it, unless the keyframe has inputs or activations. Servos of spatial tendons and sites hold it roughly.
+        Mocap targets hold bodies that `ranges` draws. Without `turn` they hold only positions.
     """
 
     def __init__(self, keyframe: str | None = None, ranges: Mapping[str, tuple[Any, Any]] | None = None, settle: int = 0):

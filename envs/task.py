@@ -217,7 +217,7 @@ def _folder(task: type) -> Path:
 
 
 def _check_names(task: type) -> None:
-    """Raises ValueError if a task class has a value under the name of an argument, or nearly that of a field."""
+    """Raises ValueError if a task class has a value under an argument's name, or under nearly a field's name."""
     fields = [name for name in SimulatedTask.__annotations__ | MujocoTask.__annotations__ if name[0] != "_"]
     arguments = inspect.signature(SimulatedTask).parameters.keys() - fields
     for owner in task.__mro__[: task.__mro__.index(MujocoTask)]:

@@ -163,10 +163,6 @@ def _gpu_hand_reach(env: str) -> Settings:
     return _with(base, noise_std=0.1, random_eps=0.1, her_k=4.0, priority_fraction=0.0)
 
 
-def _cpu_hand_reach(env: str) -> Settings:
-    return _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
-
-
 def _gpu_slide(env: str) -> Settings:
     base = _with(_gpu(env), updates_per_cycle=1000, total_steps=8_000_000, n_step=3, renewals=5)
     return _with(base, hidden_sizes=(512, 512, 512), target_noise=0.0, policy_delay=2, learner_dtype="bfloat16")
@@ -187,7 +183,7 @@ def _gpu_pick_and_place(env: str) -> Settings:
 
 
 class _Best(NamedTuple):
-    """A preset's learner for a task. Without `setup`, its settings are those for `ddpg`."""
+    """A preset's learner for a task. Without `setup`, it has the settings for `ddpg`."""
 
     learner: str
     networks: str
@@ -202,7 +198,9 @@ _LEARNERS = {  # by preset, and environment or robot
     ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
     ("cpu", "arms"): _Best("sac", "layer_norm", _cpu_arm, {"sampler": "final"}),
     ("gpu", "arms"): _Best("sac", "layer_norm", _gpu_arm, {"sampler": "final"}),
-    ("cpu", "hand_reach"): _Best("ddpg", "mlp", _cpu_hand_reach),
+    ("cpu", "hand_reach"): _Best(
+        "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
+    ),
     ("cpu", "push"): _Best(
         "td3", "mlp", lambda env: _small(_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000, critic_lr=2e-3)
     ),

@@ -95,8 +95,7 @@ def curve_interval(
 
     curves = np.asarray(curves, float)
     _curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)
-    num_seeds = len(curves)
-    chosen = _generator(seed, repeats).integers(num_seeds, size=(repeats, num_seeds))
+    chosen = _generator(seed, repeats).integers(len(curves), size=(repeats, len(curves)))
     low, high = _quantiles(trim_mean(curves[chosen], 0.25, axis=1), level)
     return trim_mean(curves, 0.25, axis=0), low, high
 

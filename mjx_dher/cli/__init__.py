@@ -142,7 +142,7 @@ def run(name: str, argv: Sequence[str], console: Console) -> int:
 
 
 def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
-    """Parses the words after a command's name into `kind`, such as EvalArgs. `options` are those of `tyro.cli`. Raises
+    """Parses the words after a command's name into `kind`, such as EvalArgs. `options` go to `tyro.cli`. Raises
     ValueError for a flag of another library. The message names ours.
     """
     import tyro

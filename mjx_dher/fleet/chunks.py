@@ -7,14 +7,13 @@ import hashlib
 import json
 import math
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from mjx_dher import __version__, import_paths
 from mjx_dher.lookup import require_extra
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import Options, RunSpec, custom_components
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
@@ -140,13 +139,9 @@ def make_folder(chunk: Chunk) -> None:
 
 def clear(storage: Path, sweep: Path) -> None:
     """Removes the chunks in a storage whose runs have all ended in the sweep, and the storage if nothing is left in it."""
-    for path in storage.glob(f"*/{NAMES_FILE}"):
-        with contextlib.suppress(OSError, ValueError, TypeError):  # damaged
-            names = files.read_json(path)
-            if names and all((sweep / grid.CELLS / name / run_folder.RESULT_FILE).exists() for name in names):
-                shutil.rmtree(path.parent)
-    with contextlib.suppress(OSError):  # not empty
-        storage.rmdir()
+    from mjx_dher.runs.folder import lane_checkpoints  # loads JAX
+
+    lane_checkpoints.remove_ended(storage, NAMES_FILE, sweep / grid.CELLS)
 
 
 def code_of(specs: Sequence[RunSpec]) -> dict[str, str]:

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from mjx_dher.runs.folder.restoring import Restored
 
 NAMES_FILE = "cells.json"  # names of the run folders that share a checkpoint
-SECONDS_TO_FIRST, SECONDS_BETWEEN = 120.0, 600.0  # checkpoints by the clock
-SHARE = 0.05
+SECONDS_TO_FIRST, SECONDS_BETWEEN, SHARE = 120.0, 600.0, 0.05  # checkpoints by the clock, as `Schedule` says
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,9 +153,8 @@ class LaneCheckpoints:
             self.report(str(error) if isinstance(error, FolderError) else f"cannot write a checkpoint ({error})")
 
     def clear(self, keep_end: bool = False) -> None:
-        """Removes the checkpoints of these runs, and those in `shared` whose runs have all ended.
-
-        With `keep_end`, the newest checkpoint in a run's own folder stays.
+        """Removes the checkpoints of these runs, and those in `shared` whose runs have all ended. With `keep_end`, the newest
+        checkpoint in a run's own folder stays.
         """
         if not processes.leads():
             return
@@ -164,12 +162,7 @@ class LaneCheckpoints:
         old = run_folder.checkpoints(own)[1:] if keep_end else [own / run_folder.CHECKPOINTS]
         for path in {*old, self.folder} - {own}:
             shutil.rmtree(path, ignore_errors=True)
-        for path in self.shared.glob(f"*/{NAMES_FILE}"):
-            names = _names(path)
-            if names and all((self.folders[0].parent / name / run_folder.RESULT_FILE).exists() for name in names):
-                shutil.rmtree(path.parent, ignore_errors=True)
-        with contextlib.suppress(OSError):  # not empty, or never made
-            self.shared.rmdir()
+        remove_ended(self.shared, NAMES_FILE, own.parent)
 
 
 class Schedule:
@@ -189,10 +182,20 @@ class Schedule:
         self._due = time.monotonic() + max(SECONDS_BETWEEN, (time.monotonic() - began) / SHARE)
 
 
+def remove_ended(storage: Path, names_file: str, cells: Path) -> None:
+    """Removes folders in `storage` whose runs, by their file of names, have all ended in `cells`, and `storage` if empty."""
+    for path in storage.glob(f"*/{names_file}"):
+        if (names := _names(path)) and all((cells / name / run_folder.RESULT_FILE).exists() for name in names):
+            shutil.rmtree(path.parent, ignore_errors=True)
+    with contextlib.suppress(OSError):  # not empty, or never made
+        storage.rmdir()
+
+
 def _names(path: Path) -> list[str]:
-    """Names of the runs that share a checkpoint. Empty if another process has just removed it, or if it is damaged."""
+    """Run names in a file, which is their list or has it as "cells". Empty if the file was just removed, or is damaged."""
     try:
-        names = files.read_json(path)["cells"]
+        content = files.read_json(path)
+        names = content["cells"] if isinstance(content, dict) else content
         return names if all(name == Path(name).name for name in names) else []
     except (OSError, ValueError, KeyError, TypeError):
         return []
