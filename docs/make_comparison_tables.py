@@ -26,6 +26,7 @@ from bakeoff_report import ALPHA, Row, compare, corrected, forest
 from bakeoff_runs import by_arm, load
 from crl import CONTRASTIVE
 from hands import HANDS
+from modern_critics import CRITICS
 
 EXPERIMENTS, IMAGES, SCRIPT, SEEDS = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py", 10
 COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
@@ -53,6 +54,7 @@ REPEAT, THIRD = repeat("next_future", "energy", "td_error"), repeat("td_error")
 _REPEATS = EXPERIMENTS / "bakeoff_repeats.md"
 PAGES = (
     Page(ABLATION, EXPERIMENTS / "ablation.md", DOCS / "ablation_runs.csv", "ablation"),
+    Page(CRITICS, EXPERIMENTS / "ablation.md", DOCS / "modern_critics_runs.csv", "modern_critics", pictures=False),
     Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
     Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
     Page(PUBLISHED["cher"], EXPERIMENTS / "as_published.md", DOCS / "as_published_cher_runs.csv", "cher", pictures=False),
