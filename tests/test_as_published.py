@@ -1,7 +1,9 @@
 """bench/as_published.py, td_controls.py, unseen.py, modern_critics.py and hands.py: the runs that docs/experiments plans."""
 
 import csv
+import dataclasses
 
+import numpy as np
 from conftest import ROOT, refuses
 
 from mjx_dher.spec import validate
@@ -39,6 +41,26 @@ def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
     assert (one.config.num_envs, one.config.batch_size, one.hparams.priority_fraction) == (2, 64, 1.0)
     assert (many.config.num_envs, many.config.batch_size, many.config.total_steps) == (38, 4864, 4_750_000)
     assert unseen.spec_of("cpu", "push", unseen.UNSEEN.arms[0]).sampler == "weighted"
+
+
+def test_runs_with_both_reward_conventions_differ_in_the_rewards_alone(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import crl_rewards
+
+    from mjx_dher.envs import make
+
+    for task in crl_rewards.REWARDS.tasks:
+        runs = {name: [crl_rewards.spec_of(name, task, arm) for arm in crl_rewards.ARMS] for name in crl_rewards.SETTINGS}
+        for negative, positive in runs.values():
+            validate(positive)
+            assert negative == dataclasses.replace(positive, env=negative.env) != positive
+        here, there = (make(run.env) for run in runs["sac_k4"])
+        goal = np.zeros((2, here.spec.goal_size), np.float32)
+        reached = goal + np.float32([[0.0], [1.0]])
+        assert [*here.compute_reward(reached, goal)] == [0.0, -1.0]
+        assert here.spec.reward_range == (-1.0, 0.0)
+        assert [*there.compute_reward(reached, goal)] == [1.0, 0.0]
+        assert there.spec.reward_range == (0.0, 1.0)
 
 
 def test_the_tuned_k_has_the_largest_mean_success(monkeypatch, tmp_path):
