@@ -35,7 +35,7 @@ class Start:
         self.keyframe, self.ranges, self.settle = keyframe, dict(ranges or {}), settle
 
     def bind(self, model: mujoco.MjModel) -> Self:
-        """Copy for `model`. Raises ValueError for a name that the model lacks, invalid bounds, or a keyframe with a joint more
+        """Copy for `model`. Raises ValueError for a name that the model lacks, invalid bounds, or a start with a joint more
         than 0.001 rad or m outside its range.
         """
         bound = copy.copy(self)
@@ -54,11 +54,17 @@ class Start:
                 raise ValueError(f"start: {name!r} reaches {low[0]:g} to {high[0]:g}; its range is {ends}")
             bound.drawn.append(drawn)
             data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
-        for name, (at, _, low, high) in places.items() if self.keyframe is not None else ():
+        outside: list[str] = []
+        for name, (at, _, low, high) in places.items():
             # Keyframes have rounded numbers, such as 1.5708, and joints that rest against a stop.
             if len(low) == 1 and not low[0] - 1e-3 <= (value := data.qpos[at]) <= high[0] + 1e-3:
-                limits = f"{low[0]:g} to {high[0]:g}"
-                raise ValueError(f"start: keyframe {self.keyframe!r} has joint {name!r} at {value:g}; its range is {limits}")
+                outside.append(f"{name!r} at {value:g} with the range {low.round(5)[0]:g} to {high.round(5)[0]:g}")
+        if outside:  # the limits would throw the joints back at the first step of every episode
+            pose = "the model's default configuration" if self.keyframe is None else f"keyframe {self.keyframe!r}"
+            raise ValueError(
+                f"start: {pose} has joint {', '.join(outside)}; pass the name of a keyframe within the ranges, or positions of"
+                " these joints in `ranges`"
+            )
         given = data.ctrl.any() or data.act.any()
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
             compute(model, data)  # the actuators' lengths

@@ -122,6 +122,16 @@ def test_a_keyframe_outside_a_joint_s_range_is_rejected(at):
     make(model.replace("<worldbody>", '<option><flag limit="disable"/></option><worldbody>'), start=task.Start("bent"))
 
 
+def test_a_default_configuration_outside_joints_ranges_is_rejected():
+    """The joints' zeros lie outside the ranges, as in many robots' MJCFs. Free and ball joints have none."""
+    turning = '<body pos="0 0 2"><joint type="ball" range="0 1"/><geom size=".1"/></body>'
+    other = '<body pos="0 0 3"><joint name="k" range="0.01 1"/><geom size=".1"/></body>'
+    model = arm(POSITION, more=BALL + turning + other).replace('range="-2 2"', 'range="-2 -1"')
+    with refuses("default configuration", "'j' at 0", "-2 to -1", "'k' at 0", "0.01 to 1", "keyframe", "`ranges`"):
+        make(model)
+    make(model, start=task.Start(ranges={"j": (-2, -1.5), "k": (0.5, 0.5)}))
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.2])
 @pytest.mark.parametrize(
     "weld",
