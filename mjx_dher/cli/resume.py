@@ -88,7 +88,7 @@ def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any],
         options = dataclasses.replace(options, stop_at=stop_at)
     if content.get("lanes", 1) > 1 and not run_folder.checkpoints(args.run):
         raise FolderError(f"{args.run} was trained side by side with other runs of a sweep: the sweep's command resumes them")
-    run_folder.checkpoints_to_resume(args.run)
+    results.checkpoints_to_resume(args.run)
     if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:
         console.print(
             f"learning rates fall to {run.hparams.lr_end:g} of their start over the whole run. Its length has changed: they"

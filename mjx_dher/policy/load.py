@@ -39,7 +39,10 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     path = run_dir if folder is None else run_dir / run_folder.POLICY_FILE
     content, spec = reading.read_run(folder, trust) if folder else ({}, None)
     if not path.is_file():
-        raise FolderError(f"{path} is missing: the run was stopped before its first epoch ended")
+        from mjx_dher.runs.folder import results
+
+        why = results.failure_of(run_dir) or "the run was stopped before its first epoch ended"
+        raise FolderError(f"{path} is missing: {why}")
     with reading.checked(path, "is damaged or not a policy of this program"):
         arrays: dict[str, Any] = npz.read(path, ratio=reading.POLICY_RATIO)
         if spec and (other := reading.foreign(content, spec, reading.policy_settings(arrays))):

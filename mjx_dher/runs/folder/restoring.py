@@ -10,7 +10,8 @@ import numpy as np
 
 from mjx_dher.runs.folder.checkpoint import STATE_FOLDER, CheckpointError, digest_of, files_of, is_key, to_shapes
 from mjx_dher.runs.folder.reading import checked, read_manifest
-from mjx_dher.runs.folder.run_folder import checkpoints_to_resume, epoch_of
+from mjx_dher.runs.folder.results import checkpoints_to_resume
+from mjx_dher.runs.folder.run_folder import epoch_of
 from mjx_dher.system.files import FolderError
 
 _HPARAMS = ".hparams."

@@ -98,6 +98,20 @@ def earlier_digests(folder: Path, digest: str) -> list[str]:
     return [one for one, after in zip(known, [*known[1:], digest]) if one != after]
 
 
+def failure_of(folder: Path) -> str | None:
+    """Epoch in which a run failed and why, or None if it did not fail. Raises FolderError if its result is damaged."""
+    result = read_result(folder) if has_result(folder) else {"status": ""}
+    return f"it failed in epoch {result['epochs']}: {result['reason']}" if result["status"] == FAILED else None
+
+
+def checkpoints_to_resume(folder: Path) -> list[Path]:
+    """Checkpoints of a run, newest first. Raises FolderError, with the reason, if there is none."""
+    if paths := run_folder.checkpoints(folder):
+        return paths
+    why = failure_of(folder) or "it was stopped before it had saved any (see --checkpoint-every)"
+    raise FolderError(f"{folder} has no checkpoint to resume from: {why}")
+
+
 def can_go_on(folder: Path, total_steps: int) -> bool:
     """Whether an ended run can resume: it failed or made fewer than `total_steps`, and it has a checkpoint. Raises FolderError
     if its result is damaged.

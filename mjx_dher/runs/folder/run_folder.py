@@ -132,15 +132,6 @@ def epoch_of(checkpoint: Path) -> int:
     return int(checkpoint.name[6:])
 
 
-def checkpoints_to_resume(path: Path) -> list[Path]:
-    """Checkpoints of the run in `path`, newest first. Raises FolderError if there is none."""
-    if paths := checkpoints(path):
-        return paths
-    raise FolderError(
-        f"{path} has no checkpoint to resume from: it was stopped before it had saved any (see --checkpoint-every)"
-    )
-
-
 def save_policy(path: Path, policy: Any, run: Mapping[str, Any], interface: Mapping[str, Any] | None = None) -> None:
     """Writes policy.npz of the run in `path`, with the run's `identity` and its environment's `contract.robot_interface`."""
     texts = {name: json.dumps(part) for name, part in (("settings", run), ("interface", interface)) if part}
