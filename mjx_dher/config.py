@@ -78,7 +78,7 @@ class Config:
     """Type of the hidden layers while learning. bfloat16 is faster on a GPU with large batches or many parallel runs.
     Parameters, and the policy that plays, are float32 with either."""
     n_step: Annotated[int, Number("[1, 1000]")] = 1
-    """Rewards in a return before it bootstraps from the critic."""
+    """Rewards in a return before it bootstraps from the critic, at most an episode's."""
     renewals: Annotated[int, Number("[0, 1000000]")] = 0
     """Priorities renewed per cycle and new episode: the new episodes first, then random ones. 0 renews the whole ring. Read by
     renewable priorities that weigh each episode alone: of the built-in ones, td_error."""
@@ -173,6 +173,6 @@ def num_updates(config: Config, episode_length: int) -> int:
 
 
 def of_one_device(config: Config, devices: int) -> Config:
-    """Sizes per device if `devices` share a run. `validation.check_parts` tests that they can be divided."""
+    """Sizes per device if `devices` share a run. `validation.check_plan` tests that they can be divided."""
     divided = ("num_envs", "batch_size", "replay_size", "total_steps", "eval_episodes")
     return dataclasses.replace(config, **{name: math.ceil(getattr(config, name) / devices) for name in divided})

@@ -26,10 +26,14 @@ def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[st
     return host.strip("[]"), int(port)
 
 
-def check_parts(config: Config, episode_length: int, parts: int) -> None:
-    """Raises ValueError for sizes that `parts` devices cannot share. It names each field and the nearest valid values."""
+def check_plan(config: Config, episode_length: int, parts: int) -> None:
+    """Raises ValueError for sizes that the environment's episodes do not allow, or that `parts` devices cannot share. It names
+    each field and the nearest valid values.
+    """
     episodes = episodes_capacity(config, episode_length)
     problems = []
+    if config.n_step > episode_length:
+        problems.append(f"n_step must lie in [1, {episode_length}], the steps of an episode; got {config.n_step}")
     for field, count, unit in (
         ("num_envs", config.num_envs, 1),
         ("batch_size", config.batch_size, 1),

@@ -3,14 +3,17 @@ import dataclasses
 import itertools
 
 import pytest
+from configs import SMALL
 from conftest import refuses
 
 from mjx_dher import components, config, presets, spec, validation
 from mjx_dher.cli import train as cli_train
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import Config, HParams, Number
+from mjx_dher.runs import loop, program
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.spec import RunSpec
+from probes import PointMass
 
 
 @pytest.mark.parametrize(
@@ -110,6 +113,7 @@ BAD_CONFIG = [  # settings, and what the message must have
     ({"replay_size": 799, "num_envs": 16}, ["replay_size", 799, 800]),
     ({"batch_size": 2000, "replay_size": 1000}, ["batch_size", 2000, 1000]),
 ]
+NOT_FOR_TEN_STEPS = [({"n_step": 11}, ["n_step", 11, "[1, 10]"])]  # of an episode
 BAD_HPARAMS = [
     *[("gamma", 1.0), ("polyak", -0.1), ("actor_lr", float("nan")), ("noise_std", float("inf")), ("temperature", 0.0)],
     *[("her_k", -1), ("priority_fraction", 1.5)],
@@ -121,6 +125,16 @@ def test_a_bad_size_is_reported_with_its_value_and_what_is_allowed():
     for change, parts in BAD_CONFIG:
         with refuses(*parts):
             validation.validate(dataclasses.replace(Config(), **change), HParams(), 50)
+
+
+@pytest.mark.parametrize(("change", "parts"), NOT_FOR_TEN_STEPS)
+def test_a_size_that_the_episodes_do_not_allow_is_reported_before_anything_is_compiled(change, parts, monkeypatch):
+    monkeypatch.setattr(loop, "compile_program", lambda *args: pytest.fail("compiled"))
+    sizes = dataclasses.replace(SMALL, **change)
+    with refuses(*parts):
+        next(iter(loop.train(PointMass(), sizes)))
+    with refuses(*parts):
+        program.check_runs(PointMass(), [RunSpec(env="point_mass:PointMass", config=sizes)])
 
 
 def test_a_number_out_of_its_range_is_reported_with_its_value():

@@ -80,7 +80,7 @@ def train(
     hparams = HParams() if hparams is None else hparams
     validation.validate(config, hparams, env.episode_length)
     layout = mesh.arrange(mesh.find(devices), 1)
-    validation.check_parts(config, env.episode_length, layout.shards)
+    validation.check_plan(config, env.episode_length, layout.shards)
     program = make_train(env, config_lib.of_one_device(config, layout.shards), axis_name=layout.axis_name, **parts)
     key = jax.random.key(seed)
     check_memory(program, config, layout.sharers)

@@ -71,7 +71,7 @@ class Program(NamedTuple):
 
 def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -> Train:
     """Training loop of runs that share a program, with their components."""
-    validation.check_parts(spec.config, env.episode_length, layout.shards)
+    validation.check_plan(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
     generator = None
     if set(choices.generators) != {"reset"}:
