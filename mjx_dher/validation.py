@@ -7,15 +7,12 @@ from mjx_dher.config import Config, HParams, Number, episodes_capacity, metadata
 from mjx_dher.lookup import check_name
 
 _INT32_MAX = 2**31 - 1  # counters on the device are int32
-_MAX_DEVICES = 1_000_000
 
 
 def check_devices(devices: Any) -> None:
     """Raises ValueError unless `devices` is a number of devices or "all". JAX checks later that they exist."""
-    if devices != "all":
-        is_number = isinstance(devices, int) and not isinstance(devices, bool)
-        if not is_number or not 1 <= devices <= _MAX_DEVICES:
-            raise ValueError(f"devices must be an integer in [1, {_MAX_DEVICES}], or all; got {devices!r}")
+    if devices != "all" and _number_problem("devices", devices, Number("[1, 1000000]"), int):
+        raise ValueError(f"devices must be an integer in [1, 1000000], or all; got {devices!r}")
 
 
 def host_and_port(name: str, value: str, allowed: str = "HOST:PORT") -> tuple[str, int]:

@@ -12,7 +12,7 @@ from conftest import ROOT, names, refuses
 
 import mjx_dher
 from mjx_dher import cli
-from mjx_dher.cli import common
+from mjx_dher.cli import common, policies
 from mjx_dher.cli.train import parse_train_args
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, results
@@ -72,8 +72,8 @@ def test_the_documents_have_every_policy():
 def test_a_run_of_warp_plays_on_a_machine_without_a_gpu(monkeypatch, engine, made):
     monkeypatch.setattr(common, "make_env", lambda run, engine: engine)
     run = RunSpec(env="push", engine=engine)
-    assert common.played_env(run, None) == made
-    assert common.played_env(run, "warp") == "warp"  # typed: an error says that there is no GPU
+    assert policies.played_env(run, None) == made
+    assert policies.played_env(run, "warp") == "warp"  # typed: an error says that there is no GPU
 
 
 def test_every_setting_can_be_told_by_a_command():

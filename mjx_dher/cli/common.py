@@ -17,9 +17,8 @@ from typing_extensions import Doc
 
 from mjx_dher import __version__, envs
 from mjx_dher.cli import PlainConsole
-from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.spec import ENGINES, RunSpec, custom_components
+from mjx_dher.spec import RunSpec, custom_components
 
 CURVE_WIDTH = 24  # characters of the live curve
 # Types of options.
@@ -43,22 +42,9 @@ def warn_of_tau(polyak: float, console: Console) -> None:
         )
 
 
-def check_engine(engine: str | None) -> None:
-    """Raises ValueError for an unknown engine."""
-    if engine is not None:
-        check_name("engine", engine, ENGINES)
-
-
 def make_env(run: RunSpec, engine: str | None = None) -> Any:
     """Makes the environment of a run, with `engine` instead of the run's if given."""
     return envs.make(run.env, engine=engine or run.engine, **run.env_arguments)
-
-
-def played_env(run: RunSpec, engine: str | None) -> Any:
-    """Makes the environment to play a run's policy in. A run of warp plays on native where JAX has no GPU."""
-    import jax
-
-    return make_env(run, "auto" if engine is None and run.engine == "warp" and jax.default_backend() == "cpu" else engine)
 
 
 def settle_compiler(engine: str) -> None:

@@ -14,9 +14,10 @@ from rich.console import Console
 from mjx_dher import envs, lookup
 from mjx_dher.cli import PlainConsole, common, parse
 from mjx_dher.cli.common import EnvKwargs, Physics, Trust
+from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, run_folder
-from mjx_dher.spec import RunSpec, to_arguments, to_texts
+from mjx_dher.spec import ENGINES, RunSpec, to_arguments, to_texts
 from mjx_dher.system.machine import check_platform, keep_compiled_programs
 from mjx_dher.validation import check_count, check_number
 
@@ -25,8 +26,17 @@ def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Seq
     """Raises ValueError for an invalid option of a command that plays episodes."""
     check_count("episodes", episodes)
     check_number("seed", seed, "[0, 4294967295]")
-    common.check_engine(engine)
+    if engine is not None:
+        check_name("engine", engine, ENGINES)
     to_arguments(env_kwargs)
+
+
+def played_env(run: RunSpec, engine: str | None) -> Any:
+    """Makes the environment to play a run's policy in. A run of warp plays on native if JAX has no GPU."""
+    import jax
+
+    on_cpu = engine is None and run.engine == "warp" and jax.default_backend() == "cpu"
+    return common.make_env(run, "auto" if on_cpu else engine)
 
 
 def changed_arguments(run: RunSpec, env_kwargs: Sequence[str]) -> RunSpec:
@@ -87,7 +97,7 @@ def eval_command(argv: list[str], console: Console) -> int:
     policies = [load_policy(folder) for folder in folders]  # all, before any is played
     keep_compiled_programs()
     key_of = operator.attrgetter("env", "engine", "env_kwargs")
-    made = {key: common.played_env(run, args.engine) for key, run in {key_of(run): run for run in runs}.items()}
+    made = {key: played_env(run, args.engine) for key, run in {key_of(run): run for run in runs}.items()}
     for run, policy in zip(runs, policies):
         check_fits(policy, made[key_of(run)])
     for path, run, policy in zip(args.runs, runs, policies):
@@ -168,7 +178,7 @@ def _draw(played: RunSpec, policy: Any, args: RenderArgs, console: Console) -> N
     render.ffmpeg()
     gl = render.choose_gl()
     check_platform()
-    env: Any = common.played_env(played, args.engine)  # Any: a GoalEnv need not have a model
+    env: Any = played_env(played, args.engine)  # Any: a GoalEnv need not have a model
     if policy is not None:
         check_fits(policy, env)
     import jax
@@ -235,7 +245,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     keep_compiled_programs()
     if run.env_kwargs:
         console.print(f"trained with {' '.join(run.env_kwargs)}; played without them in both tasks", soft_wrap=True)
-    env = common.played_env(dataclasses.replace(run, env_kwargs=()), args.engine)
+    env = played_env(dataclasses.replace(run, env_kwargs=()), args.engine)
     check_fits(policy, env)
     console.print(f"{name}, {args.episodes} episodes ...")
     theirs = transfer.play_apart(folder, python, args.episodes, args.seed, workers=usable_cores())

@@ -48,7 +48,8 @@ def resume_command(argv: list[str], console: Console) -> int:
     asked = parse(ResumeArgs, argv)  # to find the run
     content = reading.read_config(asked.run)
     args = parse(ResumeArgs, argv, default=dataclasses.replace(asked, options=settings.options_of(content)))
-    common.check_engine(args.engine)
+    if args.engine is not None:
+        lookup.check_name("engine", args.engine, spec.ENGINES)
     if args.devices is not None:
         check_devices(args.devices)
     settle_compiler(args.engine or content["physics"])
