@@ -46,7 +46,7 @@ class Config:
     batch_size: Annotated[int, Number("[1, 10000000]")] = 256
     """Transitions per gradient step."""
     total_steps: Annotated[int, Number("[1, 2000000000]")] = 1_000_000
-    """Environment steps of the run, rounded up to whole epochs."""
+    """Environment steps of the run, rounded up to whole epochs; at least a tenth of one."""
     replay_size: Annotated[int, Number("[1, 10000000000]")] = 1_000_000
     """Transitions in the replay ring (the buffer)."""
     hidden_sizes: Annotated[tuple[int, ...], Number("[1, 65536]")] = (256, 256, 256)

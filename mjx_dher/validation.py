@@ -29,6 +29,12 @@ def check_plan(config: Config, episode_length: int, parts: int) -> None:
     """
     episodes = episodes_capacity(config, episode_length)
     problems = []
+    if 10 * config.total_steps < (epoch := steps_per_epoch(config, episode_length)):
+        problems.append(
+            f"total_steps must be at least {-(-epoch // 10)}, a tenth of an epoch (num_envs {config.num_envs} x"
+            f" cycles_per_epoch {config.cycles_per_epoch} x {episode_length} steps), because runs have whole epochs; got"
+            f" {config.total_steps}"
+        )
     if config.n_step > episode_length:
         problems.append(f"n_step must lie in [1, {episode_length}], the steps of an episode; got {config.n_step}")
     for field, count, unit in (

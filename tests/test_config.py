@@ -113,7 +113,10 @@ BAD_CONFIG = [  # settings, and what the message must have
     ({"replay_size": 799, "num_envs": 16}, ["replay_size", 799, 800]),
     ({"batch_size": 2000, "replay_size": 1000}, ["batch_size", 2000, 1000]),
 ]
-NOT_FOR_TEN_STEPS = [({"n_step": 11}, ["n_step", 11, "[1, 10]"])]  # of an episode
+NOT_FOR_TEN_STEPS = [  # of an episode
+    ({"n_step": 11}, ["n_step", 11, "[1, 10]"]),
+    ({"cycles_per_epoch": 61}, ["total_steps", 240, 244, "num_envs 4", "cycles_per_epoch 61"]),
+]
 BAD_HPARAMS = [
     *[("gamma", 1.0), ("polyak", -0.1), ("actor_lr", float("nan")), ("noise_std", float("inf")), ("temperature", 0.0)],
     *[("her_k", -1), ("priority_fraction", 1.5)],
@@ -135,6 +138,12 @@ def test_a_size_that_the_episodes_do_not_allow_is_reported_before_anything_is_co
         next(iter(loop.train(PointMass(), sizes)))
     with refuses(*parts):
         program.check_runs(PointMass(), [RunSpec(env="point_mass:PointMass", config=sizes)])
+
+
+def test_a_run_of_a_tenth_of_an_epoch_has_one_epoch():
+    sizes = dataclasses.replace(SMALL, cycles_per_epoch=60)
+    validation.check_plan(sizes, 10, 1)
+    assert config.num_epochs(sizes, 10) == 1
 
 
 def test_a_number_out_of_its_range_is_reported_with_its_value():

@@ -287,7 +287,7 @@ def test_networks_that_cannot_fit_are_refused_before_anything_is_compiled(monkey
 def test_what_the_compiler_counts_as_too_much_is_refused_before_training(monkeypatch):
     """Against 300 MB of memory: the ring, 260 MB, and the networks fit, the program does not."""
     monkeypatch.setattr(machine, "available_bytes", lambda: 3 * 10**8)
-    large = dataclasses.replace(SMALL, cycles_per_epoch=1, replay_size=10**6, total_steps=1, batch_size=10**6)
+    large = dataclasses.replace(SMALL, cycles_per_epoch=1, replay_size=10**6, total_steps=40, batch_size=10**6)
     with refuses("300.0 MB", "batch_size", 10**6):
         next(iter(loop.train(ENV, large)))
 
