@@ -94,6 +94,26 @@ def test_a_second_train_on_a_folder_is_refused_before_it_writes(tmp_path, capsys
     assert names_in(tmp_path / "run") == [files.LOCK]
 
 
+@pytest.mark.parametrize("place", ["checkpoints", "checkpoints/mine", "link/mine"])
+def test_a_folder_in_another_run_s_checkpoints_is_refused(place, tmp_path, capsys):
+    """That run would delete it at its end."""
+    run_folder.write_config(tmp_path, RunSpec(), "native", {})
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "link").symlink_to("checkpoints")
+    problem = f"out: {tmp_path / place} lies in the checkpoints of the run {tmp_path}, which"
+    with refuses(problem, error=FolderError), run_folder.claim_new(tmp_path / place, RunSpec()):
+        pass
+    for command in ([], ["sweep"]):
+        assert cli.main([*command, "--env", "reach", "--dry-run", "--out", str(tmp_path / place)]) == 2
+        assert f"error: {problem}" in capsys.readouterr().err
+    assert not any((tmp_path / "checkpoints").iterdir())
+
+
+def test_a_folder_named_checkpoints_is_a_place_for_runs(tmp_path):
+    with run_folder.claim_new(tmp_path / "checkpoints" / "mine", RunSpec()) as chosen:
+        assert chosen.is_dir()
+
+
 def test_the_same_folder_twice_is_refused(tmp_path):
     specs = [spec_of(seed=0), spec_of(seed=1)]
     with refuses("folder"):

@@ -62,10 +62,11 @@ def changes(before: RunSpec, now: RunSpec) -> str:
 
 
 def check_out(out: Path | None) -> None:
-    """Raises FolderError if there is something at `out`, or its parent folder is not writable. Leaves no trace."""
+    """Raises FolderError if there is something at `out`, or no run can be written there. Leaves no trace."""
     if out is None:
         return
-    if (out.is_symlink() or out.exists()) and (not out.is_dir() or files.is_used(out)):
+    run_folder.check_place(out)
+    if out.exists() and files.is_used(out):
         raise FolderError(f"out: {out} exists and is never overwritten; pass a new or empty folder")
     check_writable(out)
 

@@ -19,7 +19,7 @@ from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet import chunks
 from mjx_dher.fleet.chunks import FleetOptions
-from mjx_dher.runs.folder import fingerprint
+from mjx_dher.runs.folder import fingerprint, run_folder
 from mjx_dher.spec import Engine, Options, RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
@@ -154,8 +154,7 @@ def _check(args: SweepArgs) -> None:
         raise ValueError("devices and distributed cannot be combined with ray, where each task has its own device")
     if args.fleet.ray is not None and args.dry_run:
         raise ValueError("dry_run cannot be combined with ray: try the command without --ray")
-    if args.out.exists() and not args.out.is_dir():
-        raise FolderError(f"out: {args.out} exists and is not a folder")
+    run_folder.check_place(args.out)
     if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / grid.CELLS).is_dir():
         raise FolderError(f"out: {args.out} holds something other than a sweep; pass a new or empty folder")
     files.inside(args.out, [*args.out.glob("*"), *args.out.glob("*/*")])

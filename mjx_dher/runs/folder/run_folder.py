@@ -5,6 +5,7 @@ import dataclasses
 import datetime
 import json
 import math
+import os
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -36,10 +37,10 @@ Run = tuple[RunSpec, Path]  # and its folder
 @contextlib.contextmanager
 def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
     """Makes and locks the folder of a new run: `out`, or a new one under runs/. Removes it if it stays empty. Raises
-    FolderError if `out` is not an empty folder, or another process has locked it.
+    FolderError if `out` is not an empty folder, lies in a run's checkpoints, or another process has locked it.
     """
-    if out is not None and (out.is_symlink() or out.exists()) and not out.is_dir():
-        raise FolderError(f"out: {out} exists and is not a folder")
+    if out is not None:
+        check_place(out)
     while True:
         folder = _fresh(spec) if out is None else out
         with contextlib.ExitStack() as stack:
@@ -51,6 +52,16 @@ def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
                 continue  # another process has just taken it
             yield folder
             return
+
+
+def check_place(out: Path) -> None:
+    """Raises FolderError if `out` is a file, or lies in the checkpoints of a run, which deletes them at its end."""
+    if (out.is_symlink() or out.exists()) and not out.is_dir():
+        raise FolderError(f"out: {out} exists and is not a folder")
+    real = Path(os.path.realpath(out))
+    for folder in (real, *real.parents):
+        if folder.name == CHECKPOINTS and (folder.parent / CONFIG_FILE).exists():
+            raise FolderError(f"out: {out} lies in the checkpoints of the run {folder.parent}, which deletes them at its end")
 
 
 def _fresh(spec: RunSpec) -> Path:
