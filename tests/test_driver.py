@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -55,14 +56,17 @@ def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, mo
     assert reading.read_spec(trial) == reading.read_spec(tmp_path / "run")
 
 
-def test_a_run_folder_that_is_moved_while_it_trains_is_named(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("remove", [shutil.rmtree, lambda run: run.rename(run.with_name("moved"))], ids=["deleted", "moved"])
+def test_a_run_folder_that_is_moved_while_it_trains_is_named(tmp_path, monkeypatch, capsys, remove):
+    """After the next epoch of three."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    run = tmp_path / "run"
-    monkeypatch.setattr(Screen, "show", lambda self, specs, progress: run.exists() and run.rename(tmp_path / "moved"))
+    run, shown = tmp_path / "run", []
+    monkeypatch.setattr(Screen, "show", lambda self, specs, progress: (remove(run), shown.append(progress.epoch)))
     assert cli.main([*FLAGS, "--checkpoint-every", "1", "--out", str(run)]) == 2
     told = capsys.readouterr()
     assert "cannot write a checkpoint" in told.out
-    assert f"error: {run} cannot be written to (No such file or directory)" in told.err
+    assert f"error: {run} was moved or deleted during training" in told.err
+    assert (shown, run.exists()) == ([1], False)
 
 
 def breaking():

@@ -68,9 +68,13 @@ class _Watch:
     warned: set[tuple[int, str]] = dataclasses.field(default_factory=set)
 
     def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
-        """Records the lanes that failed in an epoch, and reports each kind of warning once."""
+        """Records the lanes that failed in an epoch, and reports each kind of warning once. Raises FolderError if a folder
+        is gone, because writing to the open metrics.csv raises nothing then.
+        """
         finite = np.atleast_1d(progress.finite)
         for lane, (spec, folder, row) in enumerate(zip(self.specs, self.folders, rows)):
+            if processes.leads() and not folder.is_dir():
+                raise files.FolderError(f"{folder} was moved or deleted during training, so nothing more can be saved")
             name = f"{folder.name}: " if len(self.specs) > 1 else ""
             if lane in self.failed:
                 continue
@@ -122,7 +126,7 @@ def train_runs(
     Raises:
       ValueError: a run cannot be trained, memory or devices are insufficient, the devices do not divide the sizes, or
         `stop_at` or `keep_end` is given for several runs.
-      FolderError: a run has ended, another process trains it, or its folder is not writable.
+      FolderError: a run has ended, another process trains it, or its folder is not writable or moved during training.
     """
     options = options or Options()
     _check_runs(env, specs, folders, options, sweep)
