@@ -4,17 +4,19 @@
     python bench/crl_rewards.py --out rewards --first-seed 20 --minutes 12   trains, plays and reports; run it again to resume
     python bench/crl_rewards.py --out toy --toy --seeds 2   the same on Reach, on a CPU
 
-It is bench/bakeoff.py with other arms, and has its options. When all runs have ended, it plays each policy for 500 episodes
-and writes rewards_played.csv. docs/experiments/crl.md has the plan.
+It is bench/bakeoff.py with other arms, and has its options. When all runs have ended, it corrects p over the HER arms of a task
+in rewards.csv and the plots, plays each policy for 500 episodes (rewards_played.csv), and writes rewards_curves.csv. Runs of
+--runs have no policies. docs/experiments/crl.md has the plan.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
 import dataclasses
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from bakeoff_arms import Arm, Experiment
+from bakeoff_report import Row, compare, corrected, forest
+from bakeoff_runs import by_arm
 
 from mjx_dher.cli.common import make_env
 from mjx_dher.envs.arms import ArmPushEasy
@@ -31,7 +35,7 @@ from mjx_dher.envs.fetch import PickAndPlace, Reach
 from mjx_dher.policy import Policy
 from mjx_dher.policy.load import load_plain
 from mjx_dher.rollout import record_rollout
-from mjx_dher.runs.folder import reading
+from mjx_dher.runs.folder import fingerprint, reading
 from mjx_dher.spec import RunSpec
 from mjx_dher.stats import first_reach
 from mjx_dher.sweeps import grid, tables
@@ -75,15 +79,16 @@ POSITIVE = {
     "pick_and_place": "crl_rewards:PositivePickAndPlace",
     "arm_push_easy": "crl_rewards:PositiveArmPushEasy",
 }
-SETTINGS = {arm.name: arm for arm in crl.ARMS if arm.name in ("crl", "sac_k4", "sac_final", "tqc_k4", "tqc_final")}
+HER = ("sac_k4", "sac_final", "tqc_k4", "tqc_final")
+SETTINGS = {arm.name: arm for name in (*HER, "crl") for arm in crl.ARMS if arm.name == name}
 ARMS = (Arm("negative", "negative"), Arm("positive", "positive"))
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Run of a setting of bench/crl.py with the arm's rewards, seed 0. `crl` reads none, so its two runs differ by chance."""
+    """Run of a setting of bench/crl.py with the arm's rewards, seed 0. `crl` reads no rewards, and is one run for both arms."""
     task = "reach" if toy else task
     run = crl.spec_of("equal", task, SETTINGS[learner], toy)
-    return dataclasses.replace(run, env=POSITIVE[task] if arm.name == "positive" else task)
+    return dataclasses.replace(run, env=POSITIVE[task] if arm.name == "positive" and learner in HER else task)
 
 
 def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
@@ -99,14 +104,14 @@ class Played(NamedTuple):
 
     learner: str
     task: str
-    rewards: str
+    rewards: str  # "negative" or "positive", of `crl` "none"
     seed: int
     last: float  # share of episodes with success in the last state
     any_step: float  # ... in any state after the first
     time_at_goal: float  # share of the states after the first
     at_reset: float
     steps: float  # environment steps at the first evaluation with THRESHOLD; infinite where there is none
-    seconds: float  # of training until then, with all runs of its program
+    seconds: float  # of training until then, without compiling, next to all runs of its program
 
 
 def play(folder: Path, run: RunSpec, plays: dict[str, Any]) -> tuple[float, float, float, float]:
@@ -132,37 +137,53 @@ def play(folder: Path, run: RunSpec, plays: dict[str, Any]) -> tuple[float, floa
     return float(after[:, -1].mean()), float(after.max(1).mean()), float(after.mean()), float(success[:, 0].mean())
 
 
-def played(out: Path, tasks: Iterable[str], toy: bool) -> list[Played]:
-    """Rows of all runs that have ended."""
-    rows, plays = [], dict[str, Any]()
-    for task in tasks:
-        for learner in SETTINGS:
-            wanted = {spec_of(learner, task, arm, toy): arm.name for arm in ARMS}
-            folder = bakeoff.folder_of(bakeoff.argparse.Namespace(out=out), learner, task)
-            for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
-                _, run = reading.read_run(trial["folder"])
-                rewards = wanted.get(dataclasses.replace(run, seed=0))
-                if rewards is None or not trial["final"]:
-                    continue
-                steps, success, seconds = (np.asarray(trial["curve"][name], float) for name in CURVE)
-                (at,) = first_reach(steps, success[None], THRESHOLD)
-                until = float(np.interp(at, steps, seconds)) if math.isfinite(at) else math.inf
-                own = play(Path(trial["folder"]), run, plays)
-                rows.append(Played(learner, task, rewards, run.seed, *own, float(at), until))
-    return rows
+def trials(args: argparse.Namespace, task: str) -> Iterator[tuple[str, str, RunSpec, dict[str, Any]]]:
+    """Setting, rewards, run and trial (`tables.read`) of each run of a task that has ended with a policy."""
+    for learner in args.learners:
+        wanted = {spec_of(learner, task, arm, args.toy): arm.name if learner in HER else "none" for arm in ARMS}
+        folder = bakeoff.folder_of(args, learner, task)
+        for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
+            _, run = reading.read_run(trial["folder"])
+            if (rewards := wanted.get(dataclasses.replace(run, seed=0))) is not None and trial["final"]:
+                yield learner, rewards, run, trial
+
+
+def compared(args: argparse.Namespace, task: str) -> list[Row]:
+    """Rows of the comparison of rewards, with p corrected over the HER arms of a task."""
+    scores = {name: by_arm(bakeoff.read(args, name, task)) for name in args.learners if name in HER}
+    rows = [row for name, own in scores.items() if "negative" in own for row in compare(name, task, own, ARMS, len(HER))]
+    return corrected(rows, len(HER))
+
+
+def write(path: Path, columns: tuple[str, ...], rows: Iterable[Iterable[Any]]) -> None:
+    """Writes a CSV."""
+    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+    print(f"wrote {path}")
 
 
 def main() -> int:
-    """Trains and reports as bench/bakeoff.py does, then plays. Returns its status."""
-    status = bakeoff.main(None, REWARDS, __doc__)
-    args = bakeoff.parse(None, REWARDS, __doc__)
-    if status == 0 and not args.plan and (rows := played(args.out, args.tasks, args.toy)):
-        path = args.out / "rewards_played.csv"
-        with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(Played._fields)
-            writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
-        print(f"wrote {path}, {len(rows)} runs")
+    """Trains and reports as bench/bakeoff.py does, then compares, plays and writes curves. Returns its status."""
+    args, status = bakeoff.parse(None, REWARDS, __doc__), bakeoff.main(None, REWARDS, __doc__)
+    if status or args.plan:
+        return status
+    rows, players, curves, plays = [], [], [], dict[str, Any]()
+    for task in args.tasks:
+        rows += (own := compared(args, task))
+        if own:
+            forest(own, args.out / f"{fingerprint.in_a_path(task)}_forest.png", "negative")
+        for learner, rewards, run, trial in trials(args, task):
+            which = (learner, task, rewards, run.seed)
+            steps, success, seconds = (np.asarray(trial["curve"][name], float) for name in CURVE)
+            curves += [(*which, *point) for point in zip(steps, success, seconds)]
+            (at,) = first_reach(steps, success[None], THRESHOLD)
+            until = float(np.interp(at, steps, seconds)) if math.isfinite(at) else math.inf
+            players.append(Played(*which, *play(Path(trial["folder"]), run, plays), float(at), until))
+    write(args.out / REWARDS.table, Row._fields, rows)
+    write(args.out / "rewards_played.csv", Played._fields, players)
+    write(args.out / "rewards_curves.csv", ("learner", "task", "rewards", "seed", *CURVE), curves)
     return status
 
 
