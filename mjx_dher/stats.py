@@ -155,11 +155,11 @@ def improvement_interval(
     probability_of_improvement(a, b)  # raises if they cannot be compared
     a, b = (scores[:, None] if scores.ndim == 1 else scores for scores in (a, b))  # [A, K], [B, K]
     wins = np.greater(a[:, None], b[None]) + np.equal(a[:, None], b[None]) / 2  # [A, B, K]
+    drawn = rng.integers(np.repeat([len(a), len(b)], [a.size, b.size]), size=(repeats, a.size + b.size))
     of_a, of_b = np.zeros((repeats, *a.shape)), np.zeros((repeats, *b.shape))  # how often a score was drawn
-    tasks = np.arange(a.shape[1])
-    for drawn_a, drawn_b in zip(of_a, of_b):
-        for drawn in (drawn_a, drawn_b):
-            np.add.at(drawn, (rng.integers(len(drawn), size=drawn.shape), tasks), 1)
+    repeat, task = np.arange(repeats)[:, None, None], np.arange(a.shape[1])
+    for times, chosen in zip((of_a, of_b), np.split(drawn, [a.size], axis=1)):
+        np.add.at(times, (repeat, chosen.reshape(times.shape), task), 1)
     resampled = np.einsum("rbk,rbk->r", np.einsum("rak,abk->rbk", of_a, wins), of_b) / wins.size
     low, high = _quantiles(resampled, level)
     return float(low), float(high)
