@@ -52,16 +52,23 @@ def passed(lines):
     return len(lines) == 1 and "passed before" in lines[0] and "task_of_verdicts:Task" in lines[0]
 
 
+def install(folder, version):
+    (folder / "some_package.dist-info").mkdir(exist_ok=True)
+    (folder / "some_package.dist-info" / "METADATA").write_text(f"Name: some-package\nVersion: {version}\n")
+
+
 CHANGES = {
     "the module": lambda folder: (folder / "task_of_verdicts.py").write_text(TASK + "# another comment"),
     "a module that it imports": lambda folder: (folder / "helper_of_verdicts.py").write_text("NEAR = 1.5  # longer"),
     "a file that it reads": lambda folder: (folder / "radius.json").write_text("0.2"),
+    "the version of an installed package": lambda folder: install(folder, "2.0"),
 }
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 def test_a_change_is_checked_again(told, tmp_path, monkeypatch, change):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    install(tmp_path, "1.0")
     first = told(SPEC)
     assert [line.partition(" ")[0] for line in first] == ["testing", "env:"]
     assert passed(told(SPEC))
