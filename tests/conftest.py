@@ -6,6 +6,7 @@ import contextlib
 import functools
 import gc
 import importlib.metadata
+import inspect
 import itertools
 import os
 import re
@@ -13,6 +14,7 @@ import socket
 import sys
 import threading
 import time
+import types
 import zlib
 from pathlib import Path
 
@@ -27,6 +29,9 @@ KEPT = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-d
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(KEPT / "xla"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # small programs take half of the time
 os.environ.setdefault("WARP_CACHE_PATH", str(KEPT / "warp"))
+# Python's tracebacks of each operation, which JAX writes into a program, take a tenth of the time of tracing and lowering.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+os.environ.setdefault("HYPOTHESIS_NO_PLUGINS", "1")  # Trio's, which comes with selenium
 MONTH = 30 * 24 * 60 * 60  # s
 
 
@@ -205,8 +210,24 @@ def pytest_collection_finish():
     gc.set_threshold(20_000, 10, 10)
     gc.enable()
     _share_contexts()
+    _keep_sources()
     if warp := sys.modules.get("warp"):
         warp.config.optimization_level = 0
+
+
+def _keep_sources():
+    """Keeps the source of each class. For each command line, tyro parses the file of its class again, for the docstrings. Where
+    pytest is loaded, it also computes a tenth of what it has cached again, at random, to test its cache.
+    """
+    inspect.getsource = functools.cache(inspect.getsource)
+    cache = sys.modules.get("tyro._unsafe_cache")
+    if hasattr(cache, "sys"):
+        cache.sys = types.SimpleNamespace(modules={})
+
+
+def pytest_sessionfinish():
+    """pytest, its plugins and Python search for reference cycles at the end: among nothing, after this."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items):
