@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from bakeoff_arms import BAKEOFF, THRESHOLDS, Experiment
-from bakeoff_report import Row, compare, forest
+from bakeoff_report import Row, compare, corrected, forest
 from bakeoff_runs import Run, by_arm, load, merged, save
 from rich.console import Console
 
@@ -157,16 +157,22 @@ def is_done(args: argparse.Namespace, folder: Path, run: RunSpec) -> bool:
     return fingerprint.trial_name(run) in args.known or grid.is_done(folder, run)
 
 
-def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
-    """Results of the runs that have ended: first from the sweep's folder, then from --runs."""
-    folder, threshold = folder_of(args, learner, task), THRESHOLDS.get(task, 0.9)
-    wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in args.experiment.arms}
-    trials: dict[str, list[dict[str, Any]]] = {}
+def trials_by_arm(args: argparse.Namespace, learner: str, task: str) -> dict[str, list[dict[str, Any]]]:
+    """Trials (`tables.read`) of a sweep's folder that have ended, by arm. Equal arms share trials, which the first one has."""
+    folder, arms = folder_of(args, learner, task), args.experiment.arms
+    wanted = {args.experiment.spec_of(learner, task, arm, args.toy): arm.name for arm in reversed(arms)}
+    found: dict[str, list[dict[str, Any]]] = {arm.name: [] for arm in arms}
     for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
         _, spec = reading.read_run(trial["folder"])
         if (arm := wanted.get(dataclasses.replace(spec, seed=0))) is not None:
-            trials.setdefault(arm, []).append(trial)
-    own = [run for arm in wanted.values() if arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]
+            found[arm].append(trial)
+    return {arm: trials for arm, trials in found.items() if trials}
+
+
+def read(args: argparse.Namespace, learner: str, task: str) -> list[Run]:
+    """Results of the runs that have ended: first from the sweep's folder, then from --runs."""
+    threshold, trials = THRESHOLDS.get(task, 0.9), trials_by_arm(args, learner, task)
+    own = [run for arm in trials for run in _runs((learner, task, arm), trials[arm], threshold)]
     return merged([*own, *(run for run in args.known.values() if (run.learner, run.task) == (learner, task))])
 
 
@@ -187,11 +193,14 @@ def report(args: argparse.Namespace, console: Console) -> int:
     """Writes the table and the forest plots of the ended runs. Returns the number of rows."""
     rows: list[Row] = []
     runs: list[Run] = []
+    tests = args.experiment.tests
     for task in args.tasks:
+        its: list[Row] = []
         for learner in args.learners:
             runs += (own := read(args, learner, task))
             scores = by_arm(own)
-            rows += compare(learner, task, scores, args.arms) if args.experiment.baseline in scores else []
+            its += compare(learner, task, scores, args.arms, tests) if args.experiment.baseline in scores else []
+        rows += corrected(its, tests) if tests else its
     if not rows:
         console.print(f"{args.out}: no run of `{args.experiment.baseline}` has ended, and so nothing can be compared yet")
         return 0
@@ -204,9 +213,9 @@ def report(args: argparse.Namespace, console: Console) -> int:
         writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
     console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
-        if its := [row for row in rows if row.task == task]:
+        if shown := [row for row in rows if row.task == task]:
             path = args.out / f"{fingerprint.in_a_path(task)}_forest.png"
-            forest(its, path, args.experiment.baseline)
+            forest(shown, path, args.experiment.baseline)
             console.print(f"wrote {path}")
     return len(rows)
 

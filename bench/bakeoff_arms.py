@@ -47,6 +47,7 @@ class Experiment:
     spec_of: Callable[[str, str, Arm, bool], Any]  # the RunSpec of a learner, task and arm, seed 0; the last one: as a toy
     minutes: Callable[[tuple[str, ...], tuple[str, ...], tuple[Arm, ...], int], float]  # of one H200, by an estimate
     table: str  # name of the report's table
+    tests: int | None = None  # comparisons of a task that p is corrected over; by default, each learner's arms
 
     @property
     def runs(self) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from bakeoff_arms import Experiment
@@ -32,12 +32,12 @@ class Run(NamedTuple):
     steps: float  # environment steps to the threshold; infinite where it is never reached
 
 
-def save(path: Path, runs: Iterable[Run]) -> None:
-    """Writes one row per run."""
+def save(path: Path, rows: Iterable[Iterable[Any]], columns: Sequence[str] = Run._fields) -> None:
+    """Writes rows, by default runs, under the names of their columns."""
     with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(Run._fields)
-        writer.writerows([f"{value:.12g}" if isinstance(value, float) else value for value in run] for run in runs)
+        writer.writerow(columns)
+        writer.writerows([f"{value:.12g}" if isinstance(value, float) else value for value in row] for row in rows)
 
 
 def load(path: Path, experiment: Experiment | None = None) -> list[Run]:

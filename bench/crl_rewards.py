@@ -1,22 +1,20 @@
-"""Both reward conventions for HER, and success at any step and time at the goal, beside contrastive RL.
+"""Both reward conventions for HER, and success at any step and time at the goal, with contrastive RL.
 
     python bench/crl_rewards.py --out rewards --first-seed 20 --plan
     python bench/crl_rewards.py --out rewards --first-seed 20 --minutes 12   trains, plays and reports; run it again to resume
     python bench/crl_rewards.py --out toy --toy --seeds 2   the same on Reach, on a CPU
 
-It is bench/bakeoff.py with other arms, and has its options. When all runs have ended, it corrects p over the HER arms of a task
-in rewards.csv and the plots, plays each policy for 500 episodes (rewards_played.csv), and writes rewards_curves.csv. Runs of
---runs have no policies. docs/experiments/crl.md has the plan.
+It is bench/bakeoff.py with other arms, and has its options. p is corrected over the HER arms of a task. When all runs have
+ended, it plays each policy for 500 episodes (rewards_played.csv) and writes rewards_curves.csv. Runs of --runs have no
+policies. docs/experiments/crl.md has the plan.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import dataclasses
+import itertools
 import math
 import sys
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from bakeoff_arms import Arm, Experiment
-from bakeoff_report import Row, compare, corrected, forest
-from bakeoff_runs import by_arm
+from bakeoff_runs import save
 
 from mjx_dher.cli.common import make_env
 from mjx_dher.envs.arms import ArmPushEasy
@@ -35,11 +32,8 @@ from mjx_dher.envs.fetch import PickAndPlace, Reach
 from mjx_dher.policy import Policy
 from mjx_dher.policy.load import load_plain
 from mjx_dher.rollout import record_rollout
-from mjx_dher.runs.folder import fingerprint, reading
 from mjx_dher.spec import RunSpec
 from mjx_dher.stats import first_reach
-from mjx_dher.sweeps import grid, tables
-from mjx_dher.system import files
 from mjx_dher.types import Array, EnvSpec
 
 EPISODES, SEED, THRESHOLD = 500, 1, 0.5
@@ -93,10 +87,11 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
 
 def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
     """Estimated minutes of one H100, compilation included."""
-    return len(arms) * sum(crl.minutes(("equal",), tasks, (SETTINGS[name],), seeds) for name in learners)
+    times = [*learners, *(len(arms) - 1) * [name for name in learners if name in HER]]
+    return sum(crl.minutes(("equal",), tasks, (SETTINGS[name],), seeds) for name in times)
 
 
-REWARDS = Experiment(ARMS, tuple(SETTINGS), ("arm_push_easy", "pick_and_place"), spec_of, minutes, "rewards.csv")
+REWARDS = Experiment(ARMS, tuple(SETTINGS), ("arm_push_easy", "pick_and_place"), spec_of, minutes, "rewards.csv", len(HER))
 
 
 class Played(NamedTuple):
@@ -132,58 +127,30 @@ def play(folder: Path, run: RunSpec, plays: dict[str, Any]) -> tuple[float, floa
         plays[run.env] = jax.jit(episodes)
     arrays = {name: getattr(policy, name) for name in ARRAYS}
     success, valid = map(np.asarray, plays[run.env](arrays, jax.random.key(SEED)))
-    success = np.where(valid[:, None], success, 0.0)  # [episodes, T + 1]
+    success = np.where(valid[:, None], success, 0.0).astype(float)  # [episodes, T + 1]
     after = success[:, 1:]
     return float(after[:, -1].mean()), float(after.max(1).mean()), float(after.mean()), float(success[:, 0].mean())
 
 
-def trials(args: argparse.Namespace, task: str) -> Iterator[tuple[str, str, RunSpec, dict[str, Any]]]:
-    """Setting, rewards, run and trial (`tables.read`) of each run of a task that has ended with a policy."""
-    for learner in args.learners:
-        wanted = {spec_of(learner, task, arm, args.toy): arm.name if learner in HER else "none" for arm in ARMS}
-        folder = bakeoff.folder_of(args, learner, task)
-        for trial in tables.read(folder) if any((folder / grid.CELLS).glob("*/result.json")) else []:
-            _, run = reading.read_run(trial["folder"])
-            if (rewards := wanted.get(dataclasses.replace(run, seed=0))) is not None and trial["final"]:
-                yield learner, rewards, run, trial
-
-
-def compared(args: argparse.Namespace, task: str) -> list[Row]:
-    """Rows of the comparison of rewards, with p corrected over the HER arms of a task."""
-    scores = {name: by_arm(bakeoff.read(args, name, task)) for name in args.learners if name in HER}
-    rows = [row for name, own in scores.items() if "negative" in own for row in compare(name, task, own, ARMS, len(HER))]
-    return corrected(rows, len(HER))
-
-
-def write(path: Path, columns: tuple[str, ...], rows: Iterable[Iterable[Any]]) -> None:
-    """Writes a CSV."""
-    with files.atomic_write(path) as partial, partial.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
-    print(f"wrote {path}")
-
-
 def main() -> int:
-    """Trains and reports as bench/bakeoff.py does, then compares, plays and writes curves. Returns its status."""
+    """Trains and reports as bench/bakeoff.py does, then plays and writes curves. Returns its status."""
     args, status = bakeoff.parse(None, REWARDS, __doc__), bakeoff.main(None, REWARDS, __doc__)
     if status or args.plan:
         return status
-    rows, players, curves, plays = [], [], [], dict[str, Any]()
-    for task in args.tasks:
-        rows += (own := compared(args, task))
-        if own:
-            forest(own, args.out / f"{fingerprint.in_a_path(task)}_forest.png", "negative")
-        for learner, rewards, run, trial in trials(args, task):
-            which = (learner, task, rewards, run.seed)
-            steps, success, seconds = (np.asarray(trial["curve"][name], float) for name in CURVE)
-            curves += [(*which, *point) for point in zip(steps, success, seconds)]
-            (at,) = first_reach(steps, success[None], THRESHOLD)
-            until = float(np.interp(at, steps, seconds)) if math.isfinite(at) else math.inf
-            players.append(Played(*which, *play(Path(trial["folder"]), run, plays), float(at), until))
-    write(args.out / REWARDS.table, Row._fields, rows)
-    write(args.out / "rewards_played.csv", Played._fields, players)
-    write(args.out / "rewards_curves.csv", ("learner", "task", "rewards", "seed", *CURVE), curves)
+    rows, curves, plays = [], [], dict[str, Any]()
+    for task, learner in itertools.product(args.tasks, args.learners):
+        for arm, trials in bakeoff.trials_by_arm(args, learner, task).items():
+            run = spec_of(learner, task, next(each for each in ARMS if each.name == arm), args.toy)
+            for trial in (trial for trial in trials if trial["final"]):  # others failed
+                which = (learner, task, arm if learner in HER else "none", trial["seed"])
+                steps, success, seconds = (np.asarray(trial["curve"][name], float) for name in CURVE)
+                curves += [(*which, *point) for point in zip(steps, success, seconds)]
+                (at,) = first_reach(steps, success[None], THRESHOLD)
+                until = float(np.interp(at, steps, seconds)) if math.isfinite(at) else math.inf
+                rows.append(Played(*which, *play(Path(trial["folder"]), run, plays), float(at), until))
+    save(args.out / "rewards_played.csv", rows, Played._fields)
+    save(args.out / "rewards_curves.csv", curves, ("learner", "task", "rewards", "seed", *CURVE))
+    print(f"wrote rewards_played.csv and rewards_curves.csv, {len(rows)} runs")
     return status
 
 

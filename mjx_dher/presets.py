@@ -67,7 +67,7 @@ def _with(settings: Settings, **changes: Any) -> Settings:
 
 
 def _kept(settings: Settings, steps: int, **changes: Any) -> Settings:
-    """The settings with `steps` environment steps, all of which the ring keeps, and other `changes`."""
+    """The settings with `steps` environment steps, a ring that keeps them all, and other `changes`."""
     return _with(settings, total_steps=steps, replay_size=steps, **changes)
 
 

@@ -65,6 +65,29 @@ def test_runs_with_both_reward_conventions_differ_in_the_rewards_alone(monkeypat
         assert there.spec.reward_range == (0.0, 1.0)
 
 
+def test_rewards_are_compared_over_the_arms_of_a_task(monkeypatch, tmp_path):
+    """Ten equal differences have p 2/1024, and four arms are compared."""
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import bakeoff
+    import bakeoff_runs
+    import crl_rewards
+
+    task, runs = "pick_and_place", tmp_path / "runs.csv"
+    rows = [
+        bakeoff_runs.Run(name, task, arm.name, seed, bakeoff_runs.name_of(spec, seed), 0, 0.5 + 0.1 * number, 0.5, 1.0)
+        for name in ("sac_k4", "tqc_k4")
+        for number, arm in enumerate(crl_rewards.ARMS)
+        for spec in [crl_rewards.spec_of(name, task, arm)]
+        for seed in range(20, 30)
+    ]
+    bakeoff_runs.save(runs, rows)
+    options = ["--out", str(tmp_path), "--tasks", task, "--runs", str(runs), "--report"]
+    assert bakeoff.main(options, crl_rewards.REWARDS) == 0
+    with (tmp_path / "rewards.csv").open(newline="") as file:
+        found = [row for row in csv.DictReader(file) if row["arm"] == "positive"]
+    assert [(row["learner"], float(row["p_corrected"])) for row in found] == [("sac_k4", 0.0078125), ("tqc_k4", 0.0078125)]
+
+
 def test_the_tuned_k_has_the_largest_mean_success(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(ROOT / "bench")
     import as_published

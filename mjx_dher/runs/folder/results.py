@@ -37,8 +37,8 @@ def read_result(folder: Path) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Reads metrics.csv, all lines of which must belong to the run in `folder`. Raises FolderError if it is not a run folder,
-    or a line is missing, invalid or belongs to another run.
+    """Reads metrics.csv. All of its lines must belong to the run in `folder`. Raises FolderError if it is not a run folder, or
+    a line is missing, invalid or belongs to another run.
     """
     path, content = folder / run_folder.METRICS_FILE, reading.read_config(folder)
     rows = read_rows(path, reading.digests(content))
@@ -122,7 +122,7 @@ def can_go_on(folder: Path, total_steps: int) -> bool:
 
 
 class Record(NamedTuple):
-    """What the folder of a run says."""
+    """Content of a run's folder."""
 
     folder: Path
     content: dict[str, Any]  # content of config.json
