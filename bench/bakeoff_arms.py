@@ -215,10 +215,11 @@ def tuned(task: str, **parts: str) -> RunSpec:
     """The run of the preset `gpu` that these experiments start from, with `parts` replaced.
 
     For PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments and a
-    larger ring.
+    larger ring. On Block Z, k is 4, as until 2026-11-27.
     """
     run = presets.preset("frugal" if task == "pick_and_place" else "gpu", task, **parts)
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **_AS_OF_2026_11_25.get(task, {})))
+    hparams = run.hparams._replace(her_k=4.0) if task == "block_rotate_z" else run.hparams
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, **_AS_OF_2026_11_25.get(task, {})), hparams=hparams)
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
