@@ -7,8 +7,8 @@
     python bench/crl_curves.py matched --tasks arm_reach --out matched.csv   with five of JaxGCRL's details
     python bench/crl_curves.py report ours.csv theirs.csv matched.csv
 
-docs/experiments/crl.md has the plan. JaxGCRL's tasks, learner and loop run unchanged. Its evaluator is replaced, because it
-needs metrics that arm tasks lack. wandb and the removed part of Brax are empty modules.
+docs/experiments/crl_jaxgcrl.md has the plan. JaxGCRL's tasks, learner and loop run unchanged. Its evaluator is replaced,
+because it needs metrics that arm tasks lack. wandb and the removed part of Brax are empty modules.
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ from bakeoff_arms import BAKEOFF, Experiment
 from bakeoff_report import ALPHA, Row, compare, corrected, forest
 from bakeoff_runs import by_arm, load
 from crl import CONTRASTIVE
+from crl_rewards import REWARDS
 from hands import HANDS
 from modern_critics import CRITICS
 
@@ -66,6 +67,7 @@ PAGES = (
         pictures=False,
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
+    Page(REWARDS, EXPERIMENTS / "crl.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
     Page(HANDS, EXPERIMENTS / "preset_hands.md", DOCS / "hands_runs.csv", "hands", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
@@ -74,13 +76,15 @@ PAGES = (
 def read(page: Page) -> list[Row]:
     """Rows of a file's arms whose seeds are complete, learner by learner and task by task."""
     experiment, runs, found = page.experiment, load(page.data), []
-    tests = (len(experiment.arms) - 1) * (len(experiment.tasks) if page.over_tasks else 1)
+    tests = experiment.tests or (len(experiment.arms) - 1) * (len(experiment.tasks) if page.over_tasks else 1)
     for learner in experiment.learners:
         for task in experiment.tasks:
             scores = by_arm(run for run in runs if (run.learner, run.task) == (learner, task))
             whole = {arm: own for arm, own in scores.items() if len(own.seeds) == SEEDS}
             if experiment.baseline in whole:
                 found += compare(learner, task, whole, experiment.arms, tests)
+    if experiment.tests:  # over a task's learners
+        return [new for task in experiment.tasks for new in corrected([row for row in found if row.task == task], tests)]
     return corrected(found, tests) if page.over_tasks else found
 
 

@@ -50,7 +50,46 @@ def test_curves_of_jaxgcrls_own_code_are_those_of_the_file(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "bench")
     import crl_curves
 
-    assert crl_curves.report([ROOT / "docs" / "crl_curves.csv"]) in (ROOT / "docs" / "experiments" / "crl.md").read_text()
+    assert (
+        crl_curves.report([ROOT / "docs" / "crl_curves.csv"]) in (ROOT / "docs" / "experiments" / "crl_jaxgcrl.md").read_text()
+    )
+
+
+def test_success_at_any_step_is_that_of_the_file():
+    """Means over ten seeds of the plays in docs/crl_rewards_played.csv, row by row, and the last time that `crl` is ahead."""
+    page = (ROOT / "docs" / "experiments" / "crl.md").read_text()
+    table = [cells(line)[-5:] for line in page.partition("| any state |")[2].splitlines()[2:20]]
+    arms: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    with (ROOT / "docs" / "crl_rewards_played.csv").open() as file:
+        for row in csv.DictReader(file):
+            arms.setdefault((row["task"], row["learner"], row["rewards"]), []).append(row)
+    order = [key for learner in ("sac_k4", "sac_final", "tqc_k4", "tqc_final", "crl") for key in arms if key[1] == learner]
+    for key, found in zip(sorted(order, key=lambda key: key[0]), table, strict=True):
+        last, any_step, held, steps, seconds = (np.array([float(row[name]) for row in arms[key]]) for name in PLAYED)
+        reached, median = np.isfinite(steps).sum(), np.median(steps)
+        fast = (f"{median / 1e3:.0f}", f"{np.median(seconds):.0f}") if np.isfinite(median) else ("\u2013", "\u2013")
+        times = (f"{fast[0]} ({reached})", fast[1])
+        assert [cell.strip() for cell in found] == [*(f"{value.mean():.3f}" for value in (last, any_step, held)), *times], key
+
+    curves: dict[tuple[str, str], dict[str, dict[float, list[float]]]] = {}
+    with (ROOT / "docs" / "crl_rewards_curves.csv").open() as file:
+        for row in csv.DictReader(file):
+            arm = curves.setdefault((row["task"], row["learner"]), {}).setdefault(row["rewards"], {})
+            arm.setdefault(float(row["env_steps"]), []).append(float(row["success_rate"]))
+    for task, until in {"arm_push_easy": 76_800, "pick_and_place": 128_000}.items():
+        (crl,) = curves[task, "crl"].values()
+        ahead = [
+            steps
+            for (its, learner), rewards in curves.items()
+            for arm in rewards.values()
+            for steps in crl
+            if (its, learner != "crl") == (task, True) and np.mean(crl[steps]) > np.mean(arm[steps])
+        ]
+        assert max(ahead) == until
+        assert f"the first {until:,} of" in page
+
+
+PLAYED = ("last", "any_step", "time_at_goal", "steps", "seconds")
 
 
 def paired(file, task, arm, base):
