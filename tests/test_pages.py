@@ -174,12 +174,13 @@ def test_the_table_of_unseen_seeds_is_of_the_file():
     finals = {}
     with (ROOT / "docs" / "unseen_runs.csv").open() as file:
         for row in csv.DictReader(file):
-            assert 600 <= int(row["seed"]) < 610
+            first = 610 if row["task"] == "block_rotate_z" else 600
+            assert first <= int(row["seed"]) < first + 10
             finals.setdefault((row["learner"], row["task"]), []).append(float(row["final"]))
     page = (ROOT / "docs" / "experiments" / "presets.md").read_text()
     shown = {
         (preset, task): SUCCESS.findall(line)
-        for preset, task, line in re.findall(r"\| `(cpu|gpu|frugal)`, `(\w+)` (\|.*)", page)
+        for preset, task, line in re.findall(r"\| `(cpu|gpu|frugal)`, `(\w+)`[^|]* (\|.*)", page)
     }
     assert shown.keys() == finals.keys()
     for of, values in finals.items():
