@@ -68,6 +68,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--goals", type=int, default=300, help="goals of each finger")
     count = parser.parse_args().goals
+    if count < 1:
+        parser.error(f"--goals must be 1 or more; got {count}")
     env: Any = make("hand_reach", engine="native")
     keys = jax.random.split(jax.random.key(1), 8 * count)
     goals = np.asarray(jax.vmap(env.goal.sample)(keys)).reshape(-1, len(TIPS), 3)

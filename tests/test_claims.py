@@ -11,6 +11,7 @@ from sweep_helpers import LONGER, compile_once, make_grid, run, spec_of, table  
 
 import mjx_dher
 from mjx_dher import RunSpec, cli
+from mjx_dher.runs import driver
 from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps import grid, tables
 from mjx_dher.system import files
@@ -101,8 +102,8 @@ def test_a_folder_in_another_run_s_checkpoints_is_refused(place, tmp_path, capsy
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "link").symlink_to("checkpoints")
     problem = f"out: {tmp_path / place} lies in the checkpoints of the run {tmp_path}, which"
-    with refuses(problem, error=FolderError), run_folder.claim_new(tmp_path / place, RunSpec()):
-        pass
+    with refuses(problem, error=FolderError):
+        driver.train_runs(PointMass(), [spec_of()], [tmp_path / place])
     for command in ([], ["sweep"]):
         assert cli.main([*command, "--env", "reach", "--dry-run", "--out", str(tmp_path / place)]) == 2
         assert f"error: {problem}" in capsys.readouterr().err

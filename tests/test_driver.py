@@ -115,8 +115,8 @@ def test_a_library_call_trains_runs_side_by_side(trained):
     assert not (folder / "cells" / "unfinished").exists()
 
 
-def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
-    """In its result, its curve, the tables and the comparison; the others are what they were without it."""
+def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained, capsys):
+    """In its result, its curve, `resume`, the tables and the comparison; the others are what they were without it."""
     folder, _, results, _, _ = trained
     diverged = results[1].folder
     content = json.loads((diverged / "result.json").read_text())
@@ -124,6 +124,8 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained):
     assert "success_rate" not in content
     assert [row["epoch"] for row in rows_of(diverged)] == ["1"]
     assert not (diverged / "policy.npz").exists()
+    assert cli.main(["resume", str(diverged)]) == 2
+    assert "no checkpoint to resume from: it failed in epoch 2" in capsys.readouterr().err
     trials = tables.read(folder)
     tables.write(folder, trials)
     with (folder / "finals.csv").open() as file:

@@ -87,7 +87,7 @@ def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any],
     if results.has_result(args.run) and (result := results.read_result(args.run))["status"] != run_folder.FAILED:
         _check_ended(args, run, stop_at, result)
         options = dataclasses.replace(options, stop_at=stop_at)
-    if content.get("lanes", 1) > 1 and not run_folder.checkpoints(args.run):
+    if content.get("lanes", 1) > 1 and not run_folder.checkpoints(args.run) and results.failure_of(args.run) is None:
         raise FolderError(f"{args.run} was trained side by side with other runs of a sweep: the sweep's command resumes them")
     results.checkpoints_to_resume(args.run)
     if run.config.total_steps != content["config"]["total_steps"] and run.hparams.lr_end != 1:

@@ -126,7 +126,7 @@ def train_runs(
     Raises:
       ValueError: a run cannot be trained, memory or devices are insufficient, the devices do not divide the sizes, or
         `stop_at` or `keep_end` is given for several runs.
-      FolderError: a run has ended, another process trains it, or its folder is not writable or moved during training.
+      FolderError: a run has ended, another process trains it, or its folder is not writable, in a run's checkpoints, or moved.
     """
     options = options or Options()
     _check_runs(env, specs, folders, options, sweep)
@@ -150,12 +150,14 @@ def train_runs(
 
 
 def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], options: Options, sweep: bool) -> None:
-    """Raises ValueError for invalid options, and for runs that cannot be trained or do not share a program."""
+    """Raises ValueError or FolderError for invalid options or folders, and runs that cannot be trained or share no program."""
     options.check()
     if sweep or len(specs) > 1:
         options.check_many()
     for spec in specs:
         spec_lib.validate(spec, env.episode_length)
+    for folder in folders:
+        run_folder.check_place(folder)
     if len({spec.program for spec in specs}) != 1 or len({folder.absolute() for folder in folders}) != len(specs):
         raise ValueError("train_runs needs one or more runs that agree in RunSpec.program, each with its own folder")
 

@@ -37,10 +37,8 @@ Run = tuple[RunSpec, Path]  # and its folder
 @contextlib.contextmanager
 def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
     """Makes and locks the folder of a new run: `out`, or a new one under runs/. Removes it if it stays empty. Raises
-    FolderError if `out` is not an empty folder, lies in a run's checkpoints, or another process has locked it.
+    FolderError if `out` is not an empty folder, or another process has locked it.
     """
-    if out is not None:
-        check_place(out)
     while True:
         folder = _fresh(spec) if out is None else out
         with contextlib.ExitStack() as stack:
@@ -56,7 +54,7 @@ def claim_new(out: Path | None, spec: RunSpec) -> Iterator[Path]:
 
 def check_place(out: Path) -> None:
     """Raises FolderError if `out` is a file, or lies in the checkpoints of a run, which deletes them at its end."""
-    if (out.is_symlink() or out.exists()) and not out.is_dir():
+    if os.path.lexists(out) and not out.is_dir():
         raise FolderError(f"out: {out} exists and is not a folder")
     real = Path(os.path.realpath(out))
     for folder in (real, *real.parents):
