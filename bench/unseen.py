@@ -1,4 +1,4 @@
-"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609.
+"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609 (Block Z: 610 to 619).
 
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --minutes 9
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --report
