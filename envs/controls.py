@@ -77,6 +77,8 @@ class Actuators(Control):
         for i in filter(lambda i: self._suits(model, i) and _acts(model, i), range(model.nu)):
             joints[i] = names_of(model, "joint")[joint] if (joint := _joint(model, i)) >= 0 else ""
             own[i] = model.actuator(i).name or joints[i] or Numbered(f"actuator_{i}")
+        if not any(own):
+            raise ValueError(f"control {type(self).__name__}({self.names!r}) has nothing to move: {_others(model)}")
         bound.indices = pick(f"actuator of control {type(self).__name__}", self.names, own, joints)
         bound.moved = [own[i] for i in bound.indices]
         bound.size = 1 if self.together else len(bound.indices)
@@ -282,6 +284,18 @@ def _joint(model: mujoco.MjModel, index: int) -> int:
     return joint if joint >= 0 and int(model.jnt_type[joint]) in (2, 3) else -1
 
 
+def _others(model: mujoco.MjModel) -> str:
+    """What a model has in place of actuators that a control could move."""
+    kinds = {"motor": Torque(), "position servo": JointPosition()}
+    names = []
+    for i in filter(lambda i: _acts(model, i), range(model.nu)):
+        kind = next((kind for kind, control in kinds.items() if control._suits(model, i)), "other")
+        names.append(f"{model.actuator(i).name or f'actuator_{i}'} ({kind})")
+    if names:
+        return f"the model's actuators are {', '.join(names)}. Torque moves motors, JointPosition servos, and Actuators all"
+    return "all actuators of the model are disabled" if model.nu else "the model has no actuators"
+
+
 def _range(model: mujoco.MjModel, index: int) -> Any:
     """Lowest and highest input of an actuator."""
     joint = _joint(model, index)
@@ -294,4 +308,5 @@ def _range(model: mujoco.MjModel, index: int) -> Any:
     if (abs(ends) <= mujoco.mjMAXVAL).all():  # MuJoCo replaces larger inputs by 0
         return ends
     name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")
-    raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange in the MJCF")
+    ignored = ', and ctrllimited="true"' if model.actuator_ctrlrange[index].any() else ""
+    raise ValueError(f"actuator {name!r} has no range: give it a ctrlrange{ignored} in the MJCF")

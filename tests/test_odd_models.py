@@ -1,6 +1,7 @@
 """Tasks from models with unusual parts: welds with an offset, filtered and tendon servos, unlimited slides, odd names."""
 
 import contextlib
+import dataclasses
 import re
 
 import jax
@@ -247,6 +248,33 @@ def test_controls_that_are_not_finite_fail_the_step():
 def test_a_robot_that_is_too_fast_in_its_units_is_told_of_max_speed():
     with refuses("failed", "max_speed", "0.01"):
         testing.check_env(make(arm(POSITION), max_speed=0.01))
+
+
+def test_starts_with_nan_are_not_blamed_on_speed_alone():
+    class Broken(task.MujocoTask):
+        model, goal, control = arm(POSITION), task.Joints("j"), task.JointDelta("j")
+
+        def start_physics(self, key):
+            physics = super().start_physics(key)
+            return dataclasses.replace(physics, qpos=jnp.full_like(physics.qpos, jnp.nan))
+
+    with refuses("starts", "NaN", "max_speed"):
+        testing.check_env(Broken(engine="native"))
+
+
+@pytest.mark.parametrize(
+    ("control", "actuators", "parts"),
+    [
+        (task.JointDelta, '<motor name="m" joint="j" ctrlrange="-1 1"/>', ("JointDelta", "m (motor)", "Torque")),
+        (task.Torque, POSITION, ("Torque", "servo (position servo)", "JointPosition")),
+        (task.Torque, '<velocity joint="j" ctrlrange="-1 1"/>', ("actuator_0 (other)", "Actuators")),
+        (task.Actuators, "", ("Actuators", "the model has no actuators")),
+        (task.Torque, '<motor name="m" joint="j" ctrlrange="-1 1" ctrllimited="false"/>', ('ctrllimited="true"', "'m'")),
+    ],
+)
+def test_a_model_without_actuators_for_its_control_says_what_it_has(control, actuators, parts):
+    with refuses(*parts):
+        make(arm(actuators), control=control())
 
 
 def test_a_robots_loop_rejects_a_quaternion_without_length():

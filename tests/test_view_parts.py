@@ -136,11 +136,31 @@ class Recorder:
         return lambda name, *args, **options: self.calls.append((name, args, options)) or object()
 
 
+FIELD = """<mujoco><asset><hfield name="h" nrow="2" ncol="3" size="1 2 4 1" elevation="0 0 1 0 2 0"/></asset>
+    <worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>"""
+
+
 def test_a_geom_that_cannot_be_drawn_is_named():
-    xml = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
-        <worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>"""
-    with refuses("mjGEOM_HFIELD"):
-        scene.visible(mujoco.MjModel.from_xml_string(xml))
+    model = mujoco.MjModel.from_xml_string(FIELD)
+    model.geom_type[:] = mujoco.mjtGeom.mjGEOM_SDF
+    with refuses("mjGEOM_SDF"):
+        scene.visible(model)
+
+
+def test_a_height_field_is_drawn_where_a_ray_meets_it():
+    """Each vertex and the middle of each triangle, on which a ray from above ends."""
+    model = mujoco.MjModel.from_xml_string(FIELD)
+    scene.add(recorder := Recorder(), model)
+    ((_, (vertices, faces), _),) = [call for call in recorder.calls if len(call[1]) == 2]
+    assert (vertices.shape, faces.shape) == ((6, 3), (4, 3))
+    assert vertices.max(0).tolist() == [1, 2, 4]
+    corners = vertices[faces]
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 0).all()  # seen from above
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for point in [*(0.999 * vertices), *corners.mean(1)]:
+        far = mujoco.mj_ray(model, data, [*point[:2], 9.0], [0.0, 0, -1], None, 1, -1, np.zeros(1, np.int32))
+        assert 9 - far == pytest.approx(point[2], abs=0.02)
 
 
 # Critics

@@ -117,8 +117,9 @@ def _check_episodes(env: Any, spec: EnvSpec, played: dict[str, NDArray]) -> NDAr
         ended = ended | reached
     over = np.logical_or.accumulate(np.concatenate([none[:1], ended[:-1]]))
     valid = ~failed & ~over
-    fastest = f": joints may be faster than max_speed, {env.max_speed:g}" if hasattr(env, "max_speed") else ""
-    expect(not failed[-1].all(), f"not every episode of random actions may end with `failed`; all of them did{fastest}")
+    fastest = f", or joints be faster than max_speed, {env.max_speed:g}" if hasattr(env, "max_speed") else ""
+    why = f": starts or inputs may have NaN or infinite numbers{fastest}"
+    expect(not failed[-1].all(), f"not every episode of random actions may end with `failed`; all of them did{why}")
     for name, values in played.items():
         fine = np.isfinite(values).all(axis=tuple(range(2, values.ndim))) | ~valid
         step = int(np.argmin(fine.all(axis=1)))

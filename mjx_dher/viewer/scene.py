@@ -10,7 +10,8 @@ from mjx_dher.tools.render import geom_rgba, ghost_rgba
 _FLOOR = (0.80, 0.82, 0.85)  # colour of a plane with a material
 _TYPES = mujoco.mjtGeom
 _ROUND = (_TYPES.mjGEOM_SPHERE, _TYPES.mjGEOM_CAPSULE, _TYPES.mjGEOM_ELLIPSOID, _TYPES.mjGEOM_CYLINDER)
-_KINDS = {int(kind) for kind in (*_ROUND, _TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH)}
+_FLAT = (_TYPES.mjGEOM_PLANE, _TYPES.mjGEOM_BOX, _TYPES.mjGEOM_MESH, _TYPES.mjGEOM_HFIELD)
+_KINDS = {int(kind) for kind in (*_ROUND, *_FLAT)}
 
 
 def visible(model: Any) -> list[int]:
@@ -97,10 +98,12 @@ def _add_geom(scene: Any, model: Any, geom: int, rgba: np.ndarray, name: str) ->
 
 
 def _mesh(model: Any, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] in m and triangles [F, 3] of a capsule, an ellipsoid or a mesh."""
+    """Vertices [V, 3] in m and triangles [F, 3] of a capsule, an ellipsoid, a mesh or a height field."""
     import trimesh
 
     kind, size = model.geom_type[geom], model.geom_size[geom]
+    if kind == _TYPES.mjGEOM_HFIELD:
+        return _heights(model, int(model.geom_dataid[geom]))
     if kind == _TYPES.mjGEOM_CAPSULE:
         mesh = trimesh.creation.capsule(height=2 * float(size[1]), radius=float(size[0]), count=[24, 24])
         middle = np.mean(mesh.bounds, axis=0)  # the origin of a capsule depends on trimesh's version
@@ -112,6 +115,18 @@ def _mesh(model: Any, geom: int) -> tuple[np.ndarray, np.ndarray]:
     start, count = int(model.mesh_vertadr[number]), int(model.mesh_vertnum[number])
     first, faces = int(model.mesh_faceadr[number]), int(model.mesh_facenum[number])
     return model.mesh_vert[start : start + count].copy(), model.mesh_face[first : first + faces].astype(np.uint32)
+
+
+def _heights(model: Any, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] in m and triangles [F, 3] of a height field, without its sides and its base."""
+    rows, columns, first = (int(at[number]) for at in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    wide, deep, high, _ = model.hfield_size[number]
+    y, x = np.meshgrid(np.linspace(-deep, deep, rows), np.linspace(-wide, wide, columns), indexing="ij")
+    z = high * model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+    at = np.arange(rows * columns, dtype=np.uint32).reshape(rows, columns)
+    near, far = (at[:-1, :-1], at[:-1, 1:], at[1:, 1:]), (at[:-1, :-1], at[1:, 1:], at[1:, :-1])
+    faces = np.concatenate([np.stack(corners, -1).reshape(-1, 3) for corners in (near, far)])
+    return np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32), faces
 
 
 def _to_bytes(rgba: Any) -> tuple[int, ...]:
