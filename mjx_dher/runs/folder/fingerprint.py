@@ -87,8 +87,8 @@ def varying(settings: Sequence[Mapping[str, Any]]) -> list[str]:
 def sources(spec: RunSpec) -> dict[str, str]:
     """Names and digests of the files of custom components and demonstrations, by field: "push2d.py 3fa9c1d2e4".
 
-    A component's digest includes MJCF files that it names and the ones that these include, but no meshes, and not the files
-    that it imports. Each file is read once per process, like its module.
+    A component's digest includes the models that it names, with their meshes and other files (`model_files`), but not the
+    files that it imports. Each file is read once per process, like its module.
     """
     read = {name: _source(value) for name, value in custom_components(spec).items()}
     if spec.demonstrations is not None:
@@ -99,27 +99,12 @@ def sources(spec: RunSpec) -> dict[str, str]:
 @functools.cache
 def _source(import_path: str) -> str | None:
     from mjx_dher.import_paths import module_file
+    from mjx_dher.runs.folder.model_files import model_files
 
     file = module_file(import_path)
     if file is None:
         return None
-    return _name_and_digest(file, [file, *_models(file)])
-
-
-def _models(file: Path) -> list[Path]:
-    """MJCF files that a Python file names, and the files that these include."""
-    code, models = file.read_bytes(), set[Path]()
-    named = [model for model in file.parent.glob("*.xml") if model.name.encode() in code]
-    named += [file.parent / os.fsdecode(name) for name in re.findall(rb"[\"']([^\"'\n]{1,250}\.xml)[\"']", code)]
-    waiting = [(model, model.parent) for model in named]
-    while waiting:  # a nested file's path is relative to the first one's folder, or to its own
-        model, first = waiting.pop()
-        model = Path(os.path.normpath(model))
-        if model not in models and os.path.isfile(model):
-            models.add(model)
-            for name in re.findall(rb"<include\s+file\s*=\s*[\"']([^\"'\n]{1,250})[\"']", model.read_bytes()):
-                waiting += [(folder / os.fsdecode(name), first) for folder in (first, model.parent)]
-    return sorted(models)
+    return _name_and_digest(file, [file, *model_files(file)])
 
 
 @functools.cache
@@ -134,7 +119,9 @@ def _demonstrations(source: str) -> str | None:
 def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
     content = hashlib.sha256()
     for file in files:
-        content.update(file.read_bytes())
+        with file.open("rb") as opened:
+            while part := opened.read(1 << 20):  # a mesh or data set may be larger than the memory
+                content.update(part)
     return f"{path.name} {content.hexdigest()[:10]}"
 
 
