@@ -48,7 +48,7 @@ def make(name: str, /, engine: str = "auto", **overrides: Any) -> "GoalEnv":
         env = constructor(**overrides)
     except ValueError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         kind = "" if isinstance(error, TypeError) else f"{type(error).__name__}: "
         raise ValueError(f"env {name!r} cannot be made: {kind}{error}") from error
     _check_members(name, env, ("action_size", "episode_length", *_METHODS))

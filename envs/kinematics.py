@@ -67,7 +67,7 @@ class Place:
 
     def __init__(self, model: mujoco.MjModel, name: str):
         if not isinstance(name, str):
-            raise ValueError(f"must be the name of a site or body, such as 'site:tip'; got {name!r}")
+            raise ValueError(f"a place, such as a goal's `of`, must be the name of a site or body ('site:tip'); got {name!r}")
         kind, colon, rest = name.partition(":")
         plain = [each for each in ("site", "body") if name in names_of(model, each)]
         if not colon or plain:

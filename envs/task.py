@@ -201,7 +201,10 @@ def _compile(task: type, model: Any) -> mujoco.MjModel:
         if isinstance(model, str) and model.lstrip().startswith("<"):
             return mujoco.MjModel.from_xml_string(model)
         if isinstance(model, (str, Path)):
-            return mujoco.MjModel.from_xml_path(str(_folder(task) / model))
+            path = _folder(task) / model
+            if path.is_dir():  # MuJoCo would call it an empty file, and warn of its size
+                raise ValueError(f"{str(model)!r} is the folder {path}, not an MJCF file")
+            return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ValueError(f"model of {task.__name__}: {error}") from error
     raise ValueError(f"model of {task.__name__} must be an MJCF (path or text), MjSpec or MjModel; got {model!r}")

@@ -28,6 +28,8 @@ def check(field: str, value: str) -> None:
     top = name.partition(".")[0]
     if top not in sys.modules and find_module(top) is None:
         raise _no_module(field, value, top)
+    if name.endswith(".py") and module_file(value) is None:
+        raise ValueError(f"{field} {value!r}: a module's name has no .py (did you mean {name[:-3] + ':' + attribute!r}?)")
 
 
 def load(field: str, value: str) -> Any:
@@ -42,13 +44,12 @@ def load(field: str, value: str) -> Any:
         sys.path.append("")
     try:
         module = importlib.import_module(name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and f"{name}.".startswith(f"{missing}."):  # else the module itself imports a missing one
             raise _no_module(field, value, missing) from None
-        frames = traceback.extract_tb(error.__traceback__)
-        place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-        raise ValueError(f"{field} {value!r}: importing it failed: {type(error).__name__}: {error}{place}") from error
+        reason = f"{type(error).__name__}: {error}".removesuffix(": ") + _place(error)
+        raise ValueError(f"{field} {value!r}: importing it failed: {reason}") from error
     if not hasattr(module, attribute):
         nearest = hint(attribute, [name for name in dir(module) if not name.startswith("_")])
         raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{nearest}")
@@ -84,6 +85,12 @@ def module_file(value: str) -> Path | None:
 def _check_origin(field: str, value: str, module: str) -> None:
     if module.partition(".")[0] in NO_COMPONENTS:
         raise ValueError(f"{field} must be a component; {value!r} is from {module}, which has none")
+
+
+def _place(error: BaseException) -> str:
+    """Place of an error in the user's code. The text of a syntax error has it already, and its last frame is Python's."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames and not isinstance(error, SyntaxError) else ""
 
 
 def _no_module(field: str, value: str, missing: str) -> ValueError:

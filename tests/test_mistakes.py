@@ -102,6 +102,10 @@ def always(index):
     return Priority(choose=lambda key, sample, batch, number, context: index(jnp.arange(number), key))
 
 
+def leaving(achieved, desired, step, hparams):
+    raise SystemExit(4)
+
+
 calls = itertools.count()
 MORE = {  # what a check is handed, and a word of what it says
     "the same normalized distance": (lambda: check_normalization(deaf), "tells no distances apart"),
@@ -123,6 +127,7 @@ MORE = {  # what a check is handed, and a word of what it says
         lambda: check_generator(lambda key, obs, ring, context: obs["desired_goal"] + next(calls), TRIAL),
         "generator, called twice .* same result",
     ),
+    "a program's end": (lambda: check_sampler(leaving, TRIAL), "raises SystemExit: 4"),
     "another weight each time": (
         lambda: check_priority(lambda episode, context: jnp.zeros(()) + next(calls), TRIAL),
         "priority, called twice .* same result",

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -301,7 +302,7 @@ def test_a_first_state_needs_quaternions_with_a_length(joint):
         (arm('<intvelocity joint="j" kp="20" actrange="-2 2" ctrlrange="-1 1"/>'), {}, ["JointDelta", "j"]),
         (arm(POSITION, sensors='<clock name="c"/>'), {"observations": ("sensor:c",)}, ["c", "clock"]),
         (arm(POSITION), {"observations": None}, ["observations", None]),
-        (arm(POSITION), {"goal": task.Position(3, (0, 0, 0), (1, 1, 1))}, ["site", 3]),
+        (arm(POSITION), {"goal": task.Position(3, (0, 0, 0), (1, 1, 1))}, ["place", "`of`", "site", 3]),
         (arm(POSITION), {"goal": task.Joints("j", high=(1, 2, 3))}, ["goal", 1]),
         (arm(POSITION).replace('gravity="0 0 0"', 'timestep="0"'), {}, ["timestep", 0.0]),
         (arm(POSITION).replace('gravity="0 0 0"', 'timestep="-0.004"'), {}, ["timestep", -0.004]),
@@ -322,6 +323,13 @@ def test_a_first_state_needs_quaternions_with_a_length(joint):
 def test_an_unusual_declaration_is_rejected(model, declared, parts):
     with refuses(*parts):
         make(model, **declared)
+
+
+@pytest.mark.parametrize("path", ["", ".", Path()])
+def test_a_folder_is_no_model(path, capfd):
+    with refuses("Odd", str(path), "folder"):
+        make(path)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_polynomial_damping_cannot_vary():

@@ -50,6 +50,9 @@ class MyTask(PointMass):
 
 TWO = 2
 
+def leave():
+    raise SystemExit(4)
+
 traced = set()  # which parts a program was made of
 
 def metric(achieved, desired):
@@ -254,11 +257,12 @@ def test_make_imports_it():
 UNUSABLE = [  # constructor, name, and what the error must name
     (envs.make, "pont_mass:PointMass", ["pont_mass", "point_mass"]),
     (envs.make, "mjx_dher.envs.fetsh:Reach", ["mjx_dher.envs.fetsh", "mjx_dher.envs.fetch"]),
-    (envs.make, "point_mass.py:PointMass", ["point_mass.py", "point_mass"]),
+    (envs.make, "point_mass.py:PointMass", ["'point_mass.py:PointMass'", "'point_mass:PointMass'"]),
     (envs.make, "point_mass:PontMass", ["point_mass", "PontMass", "PointMass"]),
     (envs.make, "point_mass:a:b", ["env", "module:attribute", "point_mass:a:b"]),
     (envs.make, "my_tasks:TWO", ["env", "my_tasks:TWO", 2]),
     (envs.make, "point_mass:PointState", ["reset"]),
+    (envs.make, "my_tasks:leave", ["env", "my_tasks:leave", "SystemExit: 4"]),
     (envs.make, "collections:Counter", ["env", "collections:Counter"]),
     (samplers.make, "my_tasks:TWO", ["sampler", "(achieved, desired, step, hparams)", 2]),
     (samplers.make, "point_mass:PointMass", ["sampler", "(achieved, desired, step, hparams)", "PointMass"]),
@@ -284,6 +288,22 @@ def test_what_a_module_raises_is_named_and_the_cause_kept(monkeypatch, tmp_path)
     with refuses("env", "lacks_another:Task", "not_there") as error:
         envs.make("lacks_another:Task")
     assert isinstance(error.value.__cause__, ModuleNotFoundError)
+
+
+@pytest.mark.parametrize(
+    ("code", "end"),
+    [
+        ("import sys\nsys.exit(4)", "SystemExit: 4 (FILE, line 2)"),
+        ("\nx = (", "SyntaxError: '(' was never closed (NAME, line 2)"),
+    ],
+)
+def test_a_module_that_exits_or_has_no_syntax_is_one_error_with_one_place(code, end, monkeypatch, tmp_path, capsys):
+    file = tmp_path / f"ends_{len(code)}.py"
+    file.write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert cli.main(["--env", f"{file.stem}:Task"]) == 2
+    end = end.replace("FILE", str(file)).replace("NAME", file.name)
+    assert capsys.readouterr().err == f"error: env '{file.stem}:Task': importing it failed: {end}\n"
 
 
 def test_nothing_is_assumed_of_the_length_of_its_episodes():

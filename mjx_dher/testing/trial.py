@@ -139,13 +139,13 @@ def attempt(what: str, function: Callable[..., Any], *args: Any) -> Any:
         return function(*args)
     except ComponentError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if isinstance(error, ValueError) and traceback.extract_tb(error.__traceback__)[-1].filename.startswith(_OURS):
             raise ComponentError(str(error)) from error
         raise ComponentError(f"{what} raises {_describe(error)}") from error
 
 
-def _describe(error: Exception) -> str:
+def _describe(error: BaseException) -> str:
     """An error's type, the first line of its message, and its last place outside JAX and this library."""
     reason = (str(error).strip().splitlines() or [""])[0]
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(_INNER)]
