@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import refuses
+from mujoco import mjx
 
 from mjx_dher.envs.engines import Controls, Physics, make_engine
-from mjx_dher.envs.engines.corrections import gyroscopic
+from mjx_dher.envs.engines.corrections import Equality, equalities_of, gyroscopic
 
 NUM = 64
 BOX = '<geom type="box" size=".1 .2 .3" pos="{}" contype="0"/>'
@@ -77,30 +78,80 @@ def test_a_timestep_of_random_servos_and_free_bodies_is_mujoco_c_s(seed, integra
     assert at_limit > NUM / 2
 
 
-CONNECTED = f"""
-<mujoco><worldbody>
+def held_together(*equalities):
+    """Five bodies in two trees, sites on two of them, and a mocap body."""
+    return f"""
+<mujoco><worldbody><body name="hand" mocap="true" pos="0.6 0.1 1"/>
 <body name="a" pos="0 0 1"><joint axis="0 1 0.3"/>{BOX.format("0 0 0")}
-  <body name="b" pos="0.3 0 0"><joint type="ball"/>{BOX.format("0 0.1 0")}</body></body>
+  <body name="b" pos="0.3 0 0"><joint type="ball"/>{BOX.format("0 0.1 0")}
+    <site name="s" pos="0.1 0.05 0" euler="10 20 30"/></body></body>
 <body name="c" pos="0.6 0 1"><freejoint/>{BOX.format("0 0 0")}
   <body name="d" pos="0 0.3 0"><joint axis="0 0 1"/>{BOX.format("0.1 0 0")}</body>
-  <body name="e" pos="0 -0.3 0">{BOX.format("0 0 0")}</body></body></worldbody>
-<equality><connect body1="b" body2="c" anchor="0.1 0.05 0"/><connect body1="d" anchor="0 0 0.1"/>
-<connect body1="e" body2="a" anchor="0 0 0.1"/></equality></mujoco>"""
+  <body name="e" pos="0 -0.3 0">{BOX.format("0 0 0")}<site name="t" pos="0 0 0.1" euler="50 0 10"/></body></body></worldbody>
+<equality>{"".join(equalities)}</equality></mujoco>"""
+
+
+CONNECTED = (
+    '<connect body1="b" body2="c" anchor="0.1 0.05 0"/><connect body1="d" anchor="0 0 0.1"/>',
+    '<connect body1="e" body2="a" anchor="0 0 0.1"/>',
+)
+CONNECTED_SITES = ('<connect site1="s" site2="t"/>',)
+WELDED = (
+    '<weld body1="b" body2="c" relpose="0.1 0 0 0.9 0.1 0 0.2" anchor="0.01 0.02 0" torquescale="0.3"/>',
+    '<weld body1="d"/><weld body1="hand" body2="e" relpose="0.1 0 0 0.9 0.1 0 0"/>',
+)
+WELDED_SITES = ('<weld site1="s" site2="t" torquescale="2"/>',)
 
 
 @pytest.mark.slow
-def test_a_timestep_of_connected_bodies_is_mujoco_c_s():
-    """The first one holds bodies of two trees, the second one a body and the world, the third one a part of a free body."""
-    model, rng = mujoco.MjModel.from_xml_string(CONNECTED), np.random.default_rng(0)
+@pytest.mark.parametrize("equalities", [CONNECTED, CONNECTED_SITES, WELDED[:1], WELDED[1:], WELDED_SITES])
+def test_a_timestep_of_bodies_held_together_is_mujoco_c_s(equalities):
+    """Bodies of two trees, a body and the world, a part of a free body, and a mocap body."""
+    model, rng = mujoco.MjModel.from_xml_string(held_together(*equalities)), np.random.default_rng(0)
     qpos, qvel = np.tile(model.qpos0, (NUM, 1)).astype(np.float32), (2 * rng.normal(size=(NUM, model.nv))).astype(np.float32)
     advance = jax.jit(jax.vmap(make_engine("jax", model, 1, iterations=20, ls_iterations=20).advance))
-    none = Controls(jnp.zeros((NUM, 0)), jnp.zeros((NUM, 0, 7)))
-    here, data = advance(Physics(qpos, qvel, np.zeros_like(qvel), np.zeros((NUM, 0), np.float32)), none), mujoco.MjData(model)
+    data = mujoco.MjData(model)
+    mocap = np.tile(np.concatenate([data.mocap_pos, data.mocap_quat], axis=1).astype(np.float32), (NUM, 1, 1))
+    given = Controls(jnp.zeros((NUM, 0)), jnp.asarray(mocap))
+    here = advance(Physics(qpos, qvel, np.zeros_like(qvel), np.zeros((NUM, 0), np.float32)), given)
     for i in range(NUM):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
         mujoco.mj_step(model, data)
         np.testing.assert_allclose(here.qvel[i], data.qvel, atol=5e-4)  # 0.2 without the velocity term
+
+
+def test_velocity_terms_of_connects_and_welds_are_mujoco_c_s():
+    """MuJoCo C's aref is -b J qvel - k d r - J' qvel."""
+    text = held_together(
+        *CONNECTED_SITES, *WELDED, *WELDED_SITES, *CONNECTED, '<connect body1="a" anchor="0 0 0" active="false"/>'
+    )
+    model, rng = mujoco.MjModel.from_xml_string(text), np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    data.qvel[:] = 2 * rng.normal(size=model.nv)
+    mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 0.1)
+    mujoco.mj_forward(model, data)
+    stiffness, damping, impedance = data.efc_KBIP[:, :3].T
+    biases = -data.efc_aref - damping * data.efc_vel - stiffness * impedance * data.efc_pos
+    rows, here = equalities_of(model), mjx.put_data(model, data, impl="jax")
+    order = [
+        *np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT),
+        *np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_WELD),
+    ]
+    for index, row in zip(order, rows, strict=True):
+        if model.eq_active0[index]:
+            there = biases[data.efc_id[: data.ne] == index]
+            assert isinstance(row, Equality)
+            assert np.abs(there).max() > 0.1
+            np.testing.assert_allclose(row.bias(here), there, rtol=1e-4, atol=1e-4)
+        else:
+            assert row == 3
+
+
+def test_rk4_without_velocity_terms_is_reported():
+    rk4 = held_together(*WELDED).replace("<worldbody>", '<option integrator="RK4"/><worldbody>')
+    with pytest.warns(UserWarning, match="velocity term.*RK4"):
+        assert equalities_of(mujoco.MjModel.from_xml_string(rk4)) == []
 
 
 def test_free_bodies_are_implicit_in_gyroscopic_forces_as_in_mujoco_c():

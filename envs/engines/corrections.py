@@ -1,6 +1,7 @@
 """Parts of MuJoCo C's timestep that MJX 3.17 lacks: terms of equality constraints, and details of implicitfast."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,12 @@ from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.types import Array
 
 
-class _Carried:
-    """A body, and the degrees of freedom that move it."""
+class _Frame:
+    """A frame on a body, and the degrees of freedom that move it."""
 
-    def __init__(self, model: mujoco.MjModel, body: int):
-        self.body, self._root = body, int(model.body_rootid[body])
+    def __init__(self, model: mujoco.MjModel, body: int, position: np.ndarray, quat: np.ndarray):
+        self._body, self._root = body, int(model.body_rootid[body])
+        self._position, self._quat = position.astype(np.float32), quat.astype(np.float32)
         while body and not model.body_dofnum[body]:
             body = int(model.body_parentid[body])
         dofs = [int(model.body_dofadr[body] + model.body_dofnum[body] - 1)] if body else []
@@ -24,14 +26,38 @@ class _Carried:
             dofs.append(int(model.dof_parentid[dofs[-1]]))
         self._dofs = np.array(dofs, int)
 
-    def bias(self, data: mjx.Data, point: Array) -> tuple[Array, Array]:
-        """Accelerations [3] without qacc: of a point on the body, m/s^2, and of its orientation, rad/s^2."""
+    def quat(self, data: mjx.Data) -> Array:
+        """Orientation [4] (w, x, y, z)."""
+        return quat_multiply(data.xquat[self._body], jnp.asarray(self._quat, data.xquat.dtype))
+
+    def omega(self, data: mjx.Data) -> Array:
+        """Angular velocity [3], rad/s."""
+        return data.cvel[self._body][:3]
+
+    def bias(self, data: mjx.Data) -> tuple[Array, Array]:
+        """Accelerations [3] without qacc: of the frame's origin, m/s^2, and of its orientation, rad/s^2."""
+        if not len(self._dofs):  # of the world, or of a mocap body, which counts as at rest
+            return jnp.zeros(3), jnp.zeros(3)
         # Spatial vectors (angular, linear) at the centre of mass of the whole tree.
         acceleration = data.qvel[self._dofs] @ data.cdof_dot[self._dofs]
-        velocity, arm = data.cvel[self.body], point - data.subtree_com[self._root]
+        point = data.xpos[self._body] + data.xmat[self._body] @ self._position
+        velocity, arm = data.cvel[self._body], point - data.subtree_com[self._root]
         omega, alpha = velocity[:3], acceleration[:3]
         at_point = velocity[3:] + jnp.cross(omega, arm)
         return acceleration[3:] + jnp.cross(alpha, arm) + jnp.cross(omega, at_point), alpha
+
+
+def _frames(model: mujoco.MjModel, index: int) -> tuple[_Frame, _Frame]:
+    """Frames that an equality holds together. Those of a connect count only by their origins."""
+    ids, numbers, identity = (int(model.eq_obj1id[index]), int(model.eq_obj2id[index])), model.eq_data[index], np.eye(4)[0]
+    if model.eq_objtype[index] == int(mujoco.mjtObj.mjOBJ_SITE):
+        first, second = (_Frame(model, int(model.site_bodyid[i]), model.site_pos[i], model.site_quat[i]) for i in ids)
+    elif model.eq_type[index] == int(mujoco.mjtEq.mjEQ_CONNECT):
+        first, second = (_Frame(model, body, at, identity) for body, at in zip(ids, (numbers[:3], numbers[3:6])))
+    else:  # a weld has the second body's anchor first
+        first = _Frame(model, ids[0], numbers[3:6], numbers[6:10])
+        second = _Frame(model, ids[1], numbers[:3], identity)
+    return first, second
 
 
 class Equality:
@@ -42,53 +68,41 @@ class Equality:
     """
 
     def __init__(self, model: mujoco.MjModel, index: int):
-        self._first, self._second = (_Carried(model, int(of[index])) for of in (model.eq_obj1id, model.eq_obj2id))
-        self._anchors = model.eq_data[index, :6].reshape(2, 3)
-
-
-class _Weld(Equality):
-    """Of a body that is welded to a mocap body, which counts as at rest, with coinciding frames."""
+        self._first, self._second = _frames(model, index)
+        self._is_weld = bool(model.eq_type[index] == int(mujoco.mjtEq.mjEQ_WELD))
+        self._torquescale = float(model.eq_data[index, 10])
 
     def bias(self, data: mjx.Data) -> Array:
-        """J' qvel [6]: three rows of position in m/s^2, three of orientation in 1/s^2."""
-        body = self._second.body
-        position, alpha = self._second.bias(data, data.xpos[body])
-        # The residual is the vector part of q^-1 p (q the body's orientation, p the target's), and q' = omega q / 2.
-        omega, inverse = data.cvel[body][:3], data.xquat[body] * jnp.array([1.0, -1.0, -1.0, -1.0])
-        turn = jnp.concatenate([0.25 * jnp.dot(omega, omega)[None], 0.5 * alpha])
-        orientation = quat_multiply(quat_multiply(inverse, turn), data.xquat[self._first.body])[1:]
-        return -jnp.concatenate([position, orientation])
+        """J' qvel [3] of a connect, in m/s^2, or [6] of a weld: three more rows of orientation, in 1/s^2."""
+        (first, alpha_first), (second, alpha_second) = self._first.bias(data), self._second.bias(data)
+        if not self._is_weld:
+            return first - second
+        # The residual is the vector part of q^-1 p (p the first frame's orientation, q the second's); q' = omega q / 2.
+        ours, theirs = self._first.omega(data), self._second.omega(data)
+        speed, alpha = ours - theirs, alpha_first - alpha_second + jnp.cross(ours, theirs)
+        turn = jnp.concatenate([-0.25 * jnp.dot(speed, speed)[None], 0.5 * alpha])
+        inverse = self._second.quat(data) * jnp.array([1.0, -1.0, -1.0, -1.0])
+        orientation = quat_multiply(quat_multiply(inverse, turn), self._first.quat(data))[1:]
+        return jnp.concatenate([first - second, self._torquescale * orientation])
 
 
-class _Connect(Equality):
-    """Of two bodies that are connected at a point."""
+def equalities_of(model: mujoco.MjModel) -> list[int | Equality]:
+    """First rows of a model's constraints in order: equalities to correct, and numbers of other rows.
 
-    def bias(self, data: mjx.Data) -> Array:
-        """J' qvel [3] in m/s^2."""
-        ends = zip((self._first, self._second), self._anchors.astype(np.float32))
-        first, second = (end.bias(data, data.xpos[end.body] + data.xmat[end.body] @ anchor)[0] for end, anchor in ends)
-        return first - second
-
-
-def equalities_of(model: mujoco.MjModel) -> list[int | _Weld | _Connect]:
-    """First rows of a model's constraints in order: equalities to correct, and numbers of other rows."""
+    MJX's RK4 calls `mjx.forward` for its inner stages, so nothing is corrected there, and a warning says so.
+    """
     disabled = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    connect, weld = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
-    if model.opt.disableflags & disabled or model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
+    rows: list[int | Equality] = []
+    if not model.opt.disableflags & disabled:
+        for kind, size in ((mujoco.mjtEq.mjEQ_CONNECT, 3), (mujoco.mjtEq.mjEQ_WELD, 6)):
+            for index in np.flatnonzero(model.eq_type == int(kind)).tolist():
+                rows.append(Equality(model, index) if model.eq_active0[index] else size)
+    if not any(isinstance(row, Equality) for row in rows):
         return []
-    of_bodies = (model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY)) & (model.eq_active0 > 0)
-
-    def is_plain(index: int) -> bool:
-        same_frame = np.allclose(model.eq_data[index, :11], [0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1])
-        moves = model.body_weldid[model.eq_obj2id[index]] > 0
-        return bool(same_frame and moves and model.body_mocapid[model.eq_obj1id[index]] >= 0)
-
-    rows: list[int | _Weld | _Connect] = []
-    for index in np.flatnonzero(model.eq_type == connect).tolist():
-        rows.append(_Connect(model, index) if of_bodies[index] else 3)
-    for index in np.flatnonzero(model.eq_type == weld).tolist():
-        rows.append(_Weld(model, index) if of_bodies[index] and is_plain(index) else 6)
-    return rows if any(isinstance(row, Equality) for row in rows) else []
+    if model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_RK4):
+        warnings.warn("engine jax ignores the velocity term of connects and welds with the integrator RK4", stacklevel=3)
+        return []
+    return rows
 
 
 def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: mjx.Data) -> mjx.Data:
