@@ -2,19 +2,23 @@
 
     PYTHONPATH=.:tests python bench/engine_paths.py [--allow-cpu] [--models arm block_rotate_z] [--num-envs 1024 8192]
     PYTHONPATH=.:tests python bench/engine_paths.py --models push --varied mass:object friction:object
+    PYTHONPATH=.:tests python bench/engine_paths.py --models block_rotate_z --threads 16 32 --warps 4 8 --constraints 96 128
 
 A model is one of tests/engine_models.py, an MJCF file, or a task. Distances are the largest of all coordinates within 8
 environment steps of 64 environments under random controls. A task has its own number of timesteps per step. The speed is
 measured over the next 24 steps, of physics alone. Each line is printed as soon as it is measured. With --varied, the models
-run with and without varied physics, by random factors from 0.5 to 1.5.
+run with and without varied physics, by random factors from 0.5 to 1.5. On a GPU, the fused kernel can be tried with other
+numbers of threads for an environment, of warps in a block at most, and of constraint rows than it chooses.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,6 +30,7 @@ from timing import machine
 
 from mjx_dher import envs
 from mjx_dher.envs.engines import make_engine
+from mjx_dher.envs.engines.fused import simulation
 
 FEW = 64  # environments that `native` plays, too
 HEAD = "| model | varied | path | environments | env steps/s | first call, s | median distance | largest |"
@@ -39,6 +44,11 @@ def load(name: str) -> tuple[mujoco.MjModel, int]:
         return mujoco.MjModel.from_xml_path(name), SUBSTEPS
     env: Any = envs.make(name, engine="native")  # Any: a GoalEnv need not have a model
     return env.model, env.engine._substeps
+
+
+def threads_of(asked: int, chosen: Callable[[mujoco.MjModel], int], model: mujoco.MjModel) -> int:
+    """Threads of an environment: those asked for, or those chosen for a model if `asked` is 0."""
+    return asked or chosen(model)
 
 
 def measure(engine, model, num_envs: int, factors: int) -> tuple[float, float, np.ndarray]:
@@ -72,24 +82,33 @@ def main() -> None:
     parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
     parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object"')
+    parser.add_argument("--threads", type=int, nargs="+", default=[0], help="threads of an environment; 0: the kernel's choice")
+    parser.add_argument("--warps", type=int, nargs="+", default=[simulation.WARPS], help="most warps of a block")
+    parser.add_argument("--constraints", type=int, nargs="+", default=[0], help="constraint rows; 0: the kernel's choice")
     args = parser.parse_args()
+    chosen = simulation.threads_for
     print(f"{machine()}\n\n{HEAD}\n|{'---|' * 8}", flush=True)
     for name, varied in itertools.product(args.models, [[], args.varied] if args.varied else [[]]):
         model, substeps = load(name)
         native = measure(make_engine("native", model, substeps, varied=varied), model, FEW, len(varied))
         row = f"| {name} | {', '.join(varied)} |"
         print(f"{row} native | {FEW} | {native[0]:,.0f} | {native[1]:.1f} | | |", flush=True)
-        for path in args.paths:
+        for path, threads, simulation.WARPS, rows in itertools.product(args.paths, args.threads, args.warps, args.constraints):
+            simulation.threads_for = functools.partial(threads_of, threads, chosen)
+            sizes = {"constraints": rows} if rows else {}
+            shown = (
+                f"{path}{f', {threads} threads' if threads else ''}, {simulation.WARPS} warps{f', {rows} rows' if rows else ''}"
+            )
             try:
-                engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu, varied=varied)
+                engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu, varied=varied, **sizes)
             except ValueError as error:
-                print(f"{row} {path} | {error} | | | | |", flush=True)
+                print(f"{row} {shown} | {error} | | | | |", flush=True)
                 continue
             for num_envs in args.num_envs:
                 rate, compiled, qpos = measure(engine, model, num_envs, len(varied))
                 apart = np.abs(qpos - native[2]).max(axis=(1, 2))
                 distances = f"{np.median(apart):.1e} | {apart.max():.1e}"
-                print(f"{row} {path} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
+                print(f"{row} {shown} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
 
 
 if __name__ == "__main__":
