@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from conftest import refuses
 
+from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.engines.mjx import MjxEngine
 from mjx_dher.envs.robot import RobotLoop
 from mjx_dher.envs.task import MujocoTask, Position
 
@@ -63,6 +65,31 @@ def test_sensors_are_those_of_the_present_state(engine, options):
     assert data.sensordata[3] > 10.0  # N: it touches
     np.testing.assert_allclose(state.obs["observation"][1], expected(), rtol=1e-3, atol=1e-3)
     env.check()
+
+
+HELD = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 1"><joint axis="0 1 0"/><geom size=".05" mass="1" pos=".2 0 0"/><site name="end" pos=".4 0 0"/></body>
+    <body pos=".4 0 1"><freejoint/><geom size=".05" mass=".5" pos="0 0 -.3"/><site name="top"/><site name="imu" pos="0 0 -.3"/>
+    </body>
+  </worldbody>
+  <equality><connect site1="end" site2="top"/></equality>
+  <sensor><accelerometer site="imu"/><gyro site="imu"/><framepos objtype="site" objname="imu"/></sensor>
+</mujoco>"""
+
+
+def test_an_accelerometer_on_a_held_body_is_mujoco_c_s():
+    """On `jax`, whose equalities lack a term of the acceleration in MJX."""
+    model = mujoco.MjModel.from_xml_string(HELD)
+    data = mujoco.MjData(model)
+    data.qvel[:] = [3, 0, 0, -1.2, 0, 2, 0]
+    mujoco.mj_forward(model, data)
+    physics = Physics(*map(jnp.float32, (data.qpos, data.qvel, np.zeros(model.nv), np.zeros(0))))
+    controls = Controls(ctrl=jnp.zeros(0), mocap=jnp.zeros((0, 7)))
+    found = MjxEngine(model, 1, iterations=50, sensors=True).read_sensors(physics, controls)
+    np.testing.assert_allclose(found, data.sensordata, atol=1e-3)
+    assert abs(data.sensordata[0]) > 0.03  # m/s^2: 0 without the term
 
 
 def test_a_robots_loop_takes_sensors():

@@ -190,7 +190,11 @@ class MjxEngine:
         check_shapes(self._mujoco_model, physics, controls, self._variation.size)
         data = _loaded(jax.tree.map(jnp.asarray, self._data), physics, controls)
         with jax.default_matmul_precision("highest"):
-            return mjx.forward(self._varied(physics), data).sensordata.astype(jnp.float32)
+            model = self._varied(physics)
+            data = self._with_equalities(model, data) if self._equalities else mjx.forward(model, data)
+            for read in (mjx.sensor_pos, mjx.sensor_vel, mjx.sensor_acc) if self._equalities else ():
+                data = read(model, data)
+            return data.sensordata.astype(jnp.float32)
 
     def check(self) -> None:
         pass  # there is memory for all contacts
