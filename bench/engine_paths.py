@@ -82,23 +82,23 @@ def main() -> None:
     parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
     parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object"')
-    parser.add_argument("--threads", type=int, nargs="+", default=[0], help="threads of an environment; 0: the kernel's choice")
-    parser.add_argument("--warps", type=int, nargs="+", default=[simulation.WARPS], help="most warps of a block")
-    parser.add_argument("--constraints", type=int, nargs="+", default=[0], help="constraint rows; 0: the kernel's choice")
+    for option, of in {"threads": "threads of an environment", "warps": "most warps of a block", "constraints": "rows"}.items():
+        parser.add_argument(f"--{option}", type=int, nargs="+", default=[0], help=f"{of}; 0: the kernel's choice")
     args = parser.parse_args()
-    chosen = simulation.threads_for
+    chosen, most = simulation.threads_for, simulation.WARPS
     print(f"{machine()}\n\n{HEAD}\n|{'---|' * 8}", flush=True)
     for name, varied in itertools.product(args.models, [[], args.varied] if args.varied else [[]]):
         model, substeps = load(name)
         native = measure(make_engine("native", model, substeps, varied=varied), model, FEW, len(varied))
         row = f"| {name} | {', '.join(varied)} |"
         print(f"{row} native | {FEW} | {native[0]:,.0f} | {native[1]:.1f} | | |", flush=True)
-        for path, threads, simulation.WARPS, rows in itertools.product(args.paths, args.threads, args.warps, args.constraints):
-            simulation.threads_for = functools.partial(threads_of, threads, chosen)
+        for path, threads, warps, rows in itertools.product(args.paths, args.threads, args.warps, args.constraints):
+            if path == "graph" and (threads, warps) != (args.threads[0], args.warps[0]):
+                continue  # it reads neither
+            simulation.threads_for, simulation.WARPS = functools.partial(threads_of, threads, chosen), warps or most
             sizes = {"constraints": rows} if rows else {}
-            shown = (
-                f"{path}{f', {threads} threads' if threads else ''}, {simulation.WARPS} warps{f', {rows} rows' if rows else ''}"
-            )
+            given = {"rows": rows} if path == "graph" else {"threads": threads, "warps": warps, "rows": rows}
+            shown = ", ".join([path, *(f"{number} {what}" for what, number in given.items() if number)])
             try:
                 engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu, varied=varied, **sizes)
             except ValueError as error:

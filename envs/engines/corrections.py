@@ -48,7 +48,7 @@ class _Frame:
 
 
 def _frames(model: mujoco.MjModel, index: int) -> tuple[_Frame, _Frame]:
-    """Frames that an equality holds together. Those of a connect count only by their origins."""
+    """Frames that an equality holds together. A connect uses only their origins."""
     ids, numbers, identity = (int(model.eq_obj1id[index]), int(model.eq_obj2id[index])), model.eq_data[index], np.eye(4)[0]
     if model.eq_objtype[index] == int(mujoco.mjtObj.mjOBJ_SITE):
         first, second = (_Frame(model, int(model.site_bodyid[i]), model.site_pos[i], model.site_quat[i]) for i in ids)

@@ -190,30 +190,30 @@ class MjxEngine:
         check_shapes(self._mujoco_model, physics, controls, self._variation.size)
         data = _loaded(jax.tree.map(jnp.asarray, self._data), physics, controls)
         with jax.default_matmul_precision("highest"):
-            model = self._varied(physics)
-            data = self._with_equalities(model, data) if self._equalities else mjx.forward(model, data)
-            for read in (mjx.sensor_pos, mjx.sensor_vel, mjx.sensor_acc) if self._equalities else ():
-                data = read(model, data)
-            return data.sensordata.astype(jnp.float32)
+            return self._forward(self._varied(physics), data).sensordata.astype(jnp.float32)
 
     def check(self) -> None:
         pass  # there is memory for all contacts
 
     def _step(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        """Computes `mjx.step` with equalities and implicitfast corrected, without sensors."""
+        """Computes `mjx.step` with equalities and implicitfast corrected."""
         integrator = mujoco.mjtIntegrator(self._mujoco_model.opt.integrator)
         if integrator == mujoco.mjtIntegrator.mjINT_RK4:
             return mjx.step(model, data)
-        data = self._with_equalities(model, data) if self._equalities else mjx.forward(model, data)
+        data = self._forward(model, data)
         return (
             mjx.euler(model, data)
             if integrator == mujoco.mjtIntegrator.mjINT_EULER
             else implicit(self._mujoco_model, self._alone, model, data)
         )
 
-    def _with_equalities(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-        """Computes `mjx.forward` with equalities corrected, without sensors."""
-        data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
+    def _forward(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        """Computes `mjx.forward` with equalities corrected."""
+        if not self._equalities:
+            return mjx.forward(model, data)
+        data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+        data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
         shifts = [-row.bias(data) if isinstance(row, Equality) else jnp.zeros(row) for row in self._equalities]
         data = private_api.shift_reference_acceleration(data, jnp.concatenate(shifts))
-        return mjx.solve(model, mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data)))
+        data = mjx.solve(model, mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data)))
+        return mjx.sensor_acc(model, data)

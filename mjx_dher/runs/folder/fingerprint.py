@@ -39,7 +39,7 @@ REMOVED = {"learner_kernels": "auto"}  # a removed setting, which older digests 
 
 
 def settings(spec: RunSpec) -> dict[str, Any]:
-    """All settings of a run by name, without the seed."""
+    """All settings of a run by their names, without the seed."""
     parts = {field.name: getattr(spec, field.name) for field in dataclasses.fields(spec)}
     return {
         **{name: value for name, value in parts.items() if name not in ("config", "hparams", "seed")},
