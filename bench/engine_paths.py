@@ -101,14 +101,13 @@ def main() -> None:
             shown = ", ".join([path, *(f"{number} {what}" for what, number in given.items() if number)])
             try:
                 engine = make_engine("warp", model, substeps, path=path, allow_cpu=args.allow_cpu, varied=varied, **sizes)
-            except ValueError as error:
-                print(f"{row} {shown} | {error} | | | | |", flush=True)
-                continue
-            for num_envs in args.num_envs:
-                rate, compiled, qpos = measure(engine, model, num_envs, len(varied))
-                apart = np.abs(qpos - native[2]).max(axis=(1, 2))
-                distances = f"{np.median(apart):.1e} | {apart.max():.1e}"
-                print(f"{row} {shown} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
+                for num_envs in args.num_envs:
+                    rate, compiled, qpos = measure(engine, model, num_envs, len(varied))
+                    apart = np.abs(qpos - native[2]).max(axis=(1, 2))
+                    distances = f"{np.median(apart):.1e} | {apart.max():.1e}"
+                    print(f"{row} {shown} | {num_envs} | {rate:,.0f} | {compiled:.1f} | {distances} |", flush=True)
+            except (ValueError, RuntimeError) as error:  # a model that does not fit, or a kernel that a GPU cannot launch
+                print(f"{row} {shown} | {str(error).splitlines()[0]} | | | | |", flush=True)
 
 
 if __name__ == "__main__":
