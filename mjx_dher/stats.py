@@ -108,9 +108,11 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
       curves: curves [S, P].
 
     Raises:
-      ValueError: x is not [P], or `curves` is not [S, P].
+      ValueError: x is not [P], `curves` is not [S, P], or the threshold is NaN.
     """
     x, curves = _curves(x, curves)
+    if np.isnan(threshold):
+        raise ValueError("threshold must be a number; got nan")
     reached = curves >= threshold
     return np.where(reached.any(axis=1), x[reached.argmax(axis=1)], np.inf)
 

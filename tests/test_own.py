@@ -306,6 +306,16 @@ def test_a_module_that_exits_or_has_no_syntax_is_one_error_with_one_place(code, 
     assert capsys.readouterr().err == f"error: env '{file.stem}:Task': importing it failed: {end}\n"
 
 
+def test_a_task_that_exits_while_it_runs_is_an_error(monkeypatch, tmp_path, capsys):
+    (tmp_path / "leaves.py").write_text(
+        "import sys\nfrom docs.examples.point_mass import PointMass\n"
+        "class Leaves(PointMass):\n    def compute_reward(self, *states):\n        sys.exit('no reward')\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert cli.main(["--env", "leaves:Leaves", "--out", str(tmp_path / "run")]) == 2
+    assert capsys.readouterr().err.endswith("error: a task or a component has called sys.exit('no reward')\n")
+
+
 def test_nothing_is_assumed_of_the_length_of_its_episodes():
     short = RunSpec(env="point_mass:PointMass", config=Config(num_envs=8, replay_size=80, batch_size=16))
     spec.validate(short)

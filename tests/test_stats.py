@@ -92,6 +92,8 @@ def test_first_reach_and_those_that_never_do():
     low, high = stats.bootstrap_interval(reached, np.median, repeats=1000)
     assert (low, high) == (30, np.inf)
     np.testing.assert_array_equal(stats.first_reach([1], [[0.5]], 0.5), [1])
+    with refuses("threshold", "nan"):
+        stats.first_reach([1], [[0.5]], np.nan)
 
 
 def test_area_under_curve():

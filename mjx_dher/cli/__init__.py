@@ -76,6 +76,10 @@ TRAINING = ("train", "resume", "sweep")  # commands whose output is on disk, not
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
+class Answered(SystemExit):
+    """The end of a command by --help or invalid arguments, with its exit status."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line. Returns the exit status (2: invalid arguments)."""
     # Skips the final search for reference cycles, which takes half a second after a run.
@@ -87,8 +91,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     with signals.taken(), _guarded() as stream:
         try:
             ended = _run(name, argv)
-        except SystemExit as error:  # from --help, or invalid arguments
-            ended, trains = error.code if isinstance(error.code, int) else 1, False
+        except Answered as error:
+            ended, trains = int(error.code or 0), False
+        except SystemExit as error:
+            _print_error(f"a task or a component has called sys.exit({'' if error.code is None else repr(error.code)})")
+            ended = 2
         finally:
             lookup.trusts_files = False
         stream.flush()
@@ -154,7 +161,10 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
             raise ValueError(f"{flag} is called {name} here{comma}{rest}")
     command = kind.__name__.removesuffix("Args").lower()
     prog = lookup.command_name() + ("" if command == "train" else f" {command}")
-    args = tyro.cli(kind, prog=prog, args=argv, **options)
+    try:
+        args = tyro.cli(kind, prog=prog, args=argv, **options)
+    except SystemExit as error:
+        raise Answered(error.code if isinstance(error.code, int | None) else 1) from None
     lookup.trusts_files = getattr(args, "trust", False)
     return args
 
