@@ -189,7 +189,7 @@ class HandTask(MujocoTask):
         """State at a given start, for example from a recorded episode.
 
         Args:
-          qpos: [24] joint angles in rad, followed by an object's [7] position in m and orientation (w, x, y, z).
+          qpos: [24] joint angles in rad, followed by an object's [7] position in m and orientation (w, x, y, z) of any length.
           qvel: [24] rad/s, followed by an object's [6] velocity. Default: at rest.
 
         Raises:
@@ -197,10 +197,12 @@ class HandTask(MujocoTask):
         """
         start: Physics = jax.tree.map(jnp.asarray, self._rest)
         moving = jnp.zeros_like(start.qvel) if qvel is None else jnp.asarray(qvel, jnp.float32)
-        physics = start.replace(qpos=jnp.asarray(qpos, jnp.float32), qvel=moving)  # type: ignore[attr-defined]
-        check_shape("qpos", physics.qpos, start.qpos.shape)
-        check_shape("qvel", physics.qvel, start.qvel.shape)
-        return self.first_state(physics, desired_goal)
+        qpos = jnp.asarray(qpos, jnp.float32)
+        check_shape("qpos", qpos, start.qpos.shape)
+        check_shape("qvel", moving, start.qvel.shape)
+        rotation = qpos[27:]  # empty without an object
+        qpos = jnp.concatenate([qpos[:27], rotation / jnp.maximum(_norm(rotation), 1e-12)])
+        return self.first_state(start.replace(qpos=qpos, qvel=moving), desired_goal)  # type: ignore[attr-defined]
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
         return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)

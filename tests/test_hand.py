@@ -128,6 +128,11 @@ def test_goals_have_unit_quaternions_or_raise(block):
         block.init_state(jnp.zeros(7), goal)
     with refuses("qvel", "[6]", "[30]"):
         block.init_state(physics.qpos, goal, jnp.zeros(6))
+    with refuses("qpos", "quaternion"):
+        block.init_state(physics.qpos.at[27:].set(0.0), goal)
+    there = block.init_state(jnp.concatenate([physics.qpos[:24], goal]), goal)  # its quaternions have length 5
+    assert there.success == 1
+    np.testing.assert_allclose(there.obs["achieved_goal"], there.obs["desired_goal"], atol=1e-6)
 
 
 def test_fingertips_are_seen_one_timestep_late():
