@@ -3,6 +3,7 @@
     python bench/crl_rewards.py --out rewards --first-seed 20 --plan
     python bench/crl_rewards.py --out rewards --first-seed 20 --minutes 12   trains, plays and reports; run it again to resume
     python bench/crl_rewards.py --out toy --toy --seeds 2   the same on Reach, on a CPU
+    python bench/crl_rewards.py --out played --first-seed 20 --arms negative --tasks push slide   other tasks, without 0 and 1
 
 It is bench/bakeoff.py with other arms, and has its options. p is corrected over the HER arms of a task. When all runs have
 ended, it plays each policy for 500 episodes (rewards_played.csv) and writes rewards_curves.csv. Runs of --runs have no
@@ -79,10 +80,13 @@ ARMS = (Arm("negative", "negative"), Arm("positive", "positive"))
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Run of a setting of bench/crl.py with the arm's rewards, seed 0. `crl` reads no rewards, and is one run for both arms."""
+    """Run of a setting of bench/crl.py with the arm's rewards, seed 0.
+
+    `crl` reads no rewards, and tasks outside POSITIVE have only their own: one run for both arms.
+    """
     task = "reach" if toy else task
     run = crl.spec_of("equal", task, SETTINGS[learner], toy)
-    return dataclasses.replace(run, env=POSITIVE[task] if arm.name == "positive" and learner in HER else task)
+    return dataclasses.replace(run, env=POSITIVE.get(task, task) if arm.name == "positive" and learner in HER else task)
 
 
 def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
@@ -91,7 +95,8 @@ def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, 
     return sum(crl.minutes(("equal",), tasks, (SETTINGS[name],), seeds) for name in times)
 
 
-REWARDS = Experiment(ARMS, tuple(SETTINGS), ("arm_push_easy", "pick_and_place"), spec_of, minutes, "rewards.csv", len(HER))
+TASKS = ("arm_push_easy", "pick_and_place", *(task for task in crl.SIZES if task not in POSITIVE))
+REWARDS = Experiment(ARMS, tuple(SETTINGS), TASKS, spec_of, minutes, "rewards.csv", len(HER))
 
 
 class Played(NamedTuple):

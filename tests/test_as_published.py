@@ -49,7 +49,7 @@ def test_runs_with_both_reward_conventions_differ_in_the_rewards_alone(monkeypat
 
     from mjx_dher.envs import make
 
-    for task in crl_rewards.REWARDS.tasks:
+    for task in ("arm_push_easy", "pick_and_place"):
         runs = {name: [crl_rewards.spec_of(name, task, arm) for arm in crl_rewards.ARMS] for name in crl_rewards.SETTINGS}
         none, same = runs.pop("crl")
         assert none == same
