@@ -3,7 +3,7 @@
     python bench/fidelity_hand.py [--engines native] [--tasks block_rotate_xyz egg_rotate pen_rotate hand_reach]
 
 It replays the recorded actions from the recorded starts, without feedback, and prints a table. With all tasks on `native` it
-writes the table into docs/fidelity.md (whose rows of `jax` need `--engines native jax`). Tasks that an engine does not support
+writes the table into docs/fidelity.md (all of whose rows need `--engines native jax warp`). Tasks that an engine does not support
 are left out. `--episodes` and `--steps` shorten it, for `warp` on a CPU.
 
 `record` plays the episodes. `yardstick` replays them in the original itself, with the start moved by 0.1 mm (0.1 mrad without
