@@ -3,8 +3,8 @@
     python bench/fidelity_hand.py [--engines native] [--tasks block_rotate_xyz egg_rotate pen_rotate hand_reach]
 
 It replays the recorded actions from the recorded starts, without feedback, and prints a table. With all tasks on `native` it
-writes the table into docs/fidelity.md (all of whose rows need `--engines native jax warp`). Tasks that an engine does not support
-are left out. `--episodes` and `--steps` shorten it, for `warp` on a CPU.
+writes the table into docs/fidelity.md (all of whose rows need `--engines native jax warp`). Tasks that an engine does not
+support are left out. `--episodes` and `--steps` shorten it.
 
 `record` plays the episodes. `yardstick` replays them in the original itself, with the start moved by 0.1 mm (0.1 mrad without
 an object). Both need a separate virtual environment with an older MuJoCo:

@@ -89,6 +89,10 @@ def _cpu(env: str) -> Settings:
     return base
 
 
+def _cpu_push(env: str) -> Settings:
+    return _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=360_000, critic_lr=2e-3)
+
+
 def _gpu(env: str) -> Settings:
     config = Config(num_envs=2048, cycles_per_epoch=3, updates_per_cycle=1000, target_period=1, batch_size=1024)
     base = _with((config, _TUNED), total_steps=1_500_000, replay_size=2_000_000)
@@ -202,9 +206,7 @@ _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand_reach"): _Best(
         "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
     ),
-    ("cpu", "push"): _Best(
-        "td3", "mlp", lambda env: _small(_cpu(env), updates_per_cycle=64, policy_delay=2, total_steps=480_000, critic_lr=2e-3)
-    ),
+    ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),

@@ -104,8 +104,7 @@ def first_reach(x: ArrayLike, curves: ArrayLike, threshold: float) -> NDArray:
     """First point at which each curve is at or above a threshold, shape [S], or infinity if it never is.
 
     Args:
-      x: points [P].
-      curves: curves [S, P].
+      x, curves: points [P], and curves [S, P].
 
     Raises:
       ValueError: x is not [P], `curves` is not [S, P], or the threshold is NaN.
