@@ -108,8 +108,8 @@ def equalities_of(model: mujoco.MjModel) -> list[int | Equality]:
 def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Computes `mjx.implicit` with the parts of MuJoCo C's implicitfast that it omits.
 
-    An actuator at its force limit adds no damping. Damping that a control scales follows the clamped control. Free bodies
-    that stand alone are implicit in gyroscopic forces.
+    An actuator at its force limit adds no damping. Damping that a control scales follows the clamped control. Gyroscopic
+    forces of free bodies on their own are implicit.
 
     Args:
       fixed: MuJoCo's form of the model.
