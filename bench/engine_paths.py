@@ -82,8 +82,14 @@ def main() -> None:
     parser.add_argument("--paths", nargs="+", default=["fused", "graph"], choices=["fused", "graph"])
     parser.add_argument("--num-envs", type=int, nargs="+", default=[FEW], help=f"multiples of {FEW}")
     parser.add_argument("--varied", nargs="+", default=[], help='names of varied physics, such as "mass:object"')
-    for option, of in {"threads": "threads of an environment", "warps": "most warps of a block", "constraints": "rows"}.items():
-        parser.add_argument(f"--{option}", type=int, nargs="+", default=[0], help=f"{of}; 0: the kernel's choice")
+    tried: dict[str, tuple[str, Any]] = {
+        "threads": ("threads of an environment", (0, 1, 2, 4, 8, 16, 32)),
+        "warps": ("most warps of a block", range(33)),
+        "constraints": ("rows", None),  # make_engine checks them
+    }
+    for option, (of, allowed) in tried.items():
+        help = f"{of}; 0: the kernel's choice"
+        parser.add_argument(f"--{option}", type=int, nargs="+", default=[0], choices=allowed, metavar="N", help=help)
     args = parser.parse_args()
     chosen, most = simulation.threads_for, simulation.WARPS
     print(f"{machine()}\n\n{HEAD}\n|{'---|' * 8}", flush=True)
