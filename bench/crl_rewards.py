@@ -7,7 +7,7 @@
 
 It is bench/bakeoff.py with other arms, and has its options. p is corrected over the HER arms of a task. When all runs have
 ended, it plays each policy for 500 episodes (rewards_played.csv) and writes rewards_curves.csv. Runs of --runs have no
-policies. docs/experiments/crl.md has the plan.
+policies. docs/experiments/crl_rewards.md has the plan.
 """
 
 from __future__ import annotations

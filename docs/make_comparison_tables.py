@@ -67,7 +67,7 @@ PAGES = (
         pictures=False,
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
-    Page(REWARDS, EXPERIMENTS / "crl.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
+    Page(REWARDS, EXPERIMENTS / "crl_rewards.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
     Page(HANDS, EXPERIMENTS / "preset_hands.md", DOCS / "hands_runs.csv", "hands", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
