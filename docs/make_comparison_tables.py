@@ -28,8 +28,9 @@ from crl import CONTRASTIVE
 from crl_rewards import REWARDS
 from hands import HANDS
 from modern_critics import CRITICS
+from td_controls import CONTROLS
 
-EXPERIMENTS, IMAGES, SCRIPT, SEEDS = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py", 10
+EXPERIMENTS, IMAGES, SCRIPT = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py"
 COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
 
 
@@ -43,6 +44,7 @@ class Page(NamedTuple):
     claims: bool = False  # whether the page has the table of claims, in place of the whole one
     pictures: bool = True
     over_tasks: bool = False  # whether p is corrected over the tasks, too
+    seeds: int = 10  # of a complete arm
 
 
 def repeat(*names: str) -> Experiment:
@@ -68,6 +70,7 @@ PAGES = (
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
     Page(REWARDS, EXPERIMENTS / "crl_rewards.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
+    Page(CONTROLS, EXPERIMENTS / "as_published.md", DOCS / "td_controls_runs.csv", "td_controls", pictures=False, seeds=20),
     Page(HANDS, EXPERIMENTS / "preset_hands.md", DOCS / "hands_runs.csv", "hands", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )
@@ -80,7 +83,7 @@ def read(page: Page) -> list[Row]:
     for learner in experiment.learners:
         for task in experiment.tasks:
             scores = by_arm(run for run in runs if (run.learner, run.task) == (learner, task))
-            whole = {arm: own for arm, own in scores.items() if len(own.seeds) == SEEDS}
+            whole = {arm: own for arm, own in scores.items() if len(own.seeds) == page.seeds}
             if experiment.baseline in whole:
                 found += compare(learner, task, whole, experiment.arms, tests)
     if experiment.tests:  # over a task's learners

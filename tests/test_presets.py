@@ -104,6 +104,42 @@ def paired(file, task, arm, base):
     return gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
 
 
+def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
+    names = ("docs/experiments/as_published.md", "docs/what_helps.md", "README.md")
+    page, helps, readme = (" ".join((ROOT / name).read_text().split()) for name in names)
+    for arm, base in (
+        ("td_error", "more_updates"),
+        ("td_error", "transitions_alone"),
+        ("td_error_whole", "td_error"),
+        ("transitions_alone", "random_of_four"),
+        ("transitions_alone", "more_updates"),
+    ):
+        numbers = paired("td_controls_runs.csv", "pick_and_place", arm, base)
+        assert f"| `{arm}` less `{base}` | {{:+.3f}} ({{:+.3f}} to {{:+.3f}})".format(*numbers) in page
+        if (arm, base) == ("td_error", "more_updates"):
+            assert all("gains {:.3f} ({:.3f} to {:.3f})".format(*numbers) in text for text in (helps, readme))
+
+    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    with (ROOT / "docs" / "break_off.csv").open() as file:
+        for row in csv.DictReader(file):
+            shown = float(row["success_rate"]), float(row["priority_mean"])
+            curves.setdefault(row["sampler"], {}).setdefault(row["seed"], []).append(shown)
+    found = {
+        sampler: [np.array(curve)[:, 0] for curve in runs.values()] for sampler, runs in curves.items()
+    }  # success [29] of each seed
+    start = {s: [next((i for i, (_, p) in enumerate(c) if p >= 0.2), 29) for c in runs.values()] for s, runs in curves.items()}
+    assert sum(epoch < 29 for epoch in start["closest"]) == 4
+    after = {s: np.array([c[b : b + 10].mean() for c, b in zip(found[s], start[s])]) for s in found if s != "closest"}
+    for sampler, mean in after.items():
+        epochs = np.array(start[sampler]) + 1
+        row = f"| `{sampler}` | {np.median(epochs):.0f} ({min(epochs)} to {max(epochs)}) | "
+        if sampler != "future":
+            gains = (epochs - 1 - start["future"], mean - after["future"])
+            said = [(x.mean(), *scipy.stats.t.interval(0.95, 9, x.mean(), scipy.stats.sem(x))) for x in gains]
+            row += "{:+.1f} ({:+.1f} to {:+.1f}) | ".format(*said[0]) + "{:+.3f} ({:+.3f} to {:+.3f})".format(*said[1])
+        assert row in page
+
+
 def test_what_the_pages_say_of_hands_and_of_contrastive_rl():
     crl, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/experiments/crl.md", "README.md"))
     hands = " ".join((ROOT / "docs" / "experiments" / "preset_hands.md").read_text().split())
