@@ -39,7 +39,7 @@ def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
     if flags and not spec.ends:
         raise ValueError(f"spec: ends must be True, because the environment's state has {flags[0]}; got False")
     if spec.ends and not flags and not spec.ends_at_goal:
-        raise ValueError("spec: ends must be False for a state without done and terminal, unless ends_at_goal; got True")
+        raise ValueError("spec: ends must be False if a reset has no done or terminal, unless ends_at_goal; got True")
 
     def repeat(x: Any, times: int) -> Any:
         return jax.ShapeDtypeStruct((times, *x.shape), x.dtype)
@@ -108,9 +108,9 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
             raise ValueError(f"reset: {name} must be a real number; it is {value.dtype}")
     achieved, desired = (jnp.shape(state.obs[name])[len(leading) :] for name in ("achieved_goal", "desired_goal"))
     if len(achieved) != 1 or achieved != desired:
-        raise ValueError(
-            f"reset: achieved_goal and desired_goal must be vectors [G]; they have shapes {achieved} and {desired}"
-        )
+        raise ValueError(f"reset: achieved_goal and desired_goal must be vectors [G]; they are {achieved} and {desired}")
+    if not jax.tree.leaves(state.obs["observation"]):
+        raise ValueError("reset: observation must have at least one array; it has none")
 
 
 def check_with_goal(env: Any) -> None:

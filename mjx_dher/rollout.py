@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher import check, context
-from mjx_dher.contract import check_first, check_with_goal, env_spec
+from mjx_dher.contract import FLAGS, check_first, check_with_goal, env_spec
 from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
@@ -24,7 +24,7 @@ class Outcome(NamedTuple):
     success: Array  # 1.0 if the goal is reached at the last step
     reset_success: Array  # 1.0 if it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
-    valid: Array  # whether all observations, actions and rewards are finite and no state is `failed`, bool
+    valid: Array  # whether all numbers are finite, no state is `failed` and the reset is no end, bool
     bad_rewards: Array  # fraction of rewards outside the reward range
     length: Array  # steps that were played, int32
 
@@ -35,7 +35,7 @@ class _Playing(NamedTuple):
     state: PyTree  # of the environments
     over: Array  # [N] whether the episode has ended, bool
     length: Array  # [N] int32
-    failed: Array  # [N] whether a state so far is `failed`, bool
+    failed: Array  # [N] whether a state so far is `failed`, or the first one an end, bool
 
 
 def rollout(
@@ -94,8 +94,8 @@ def record_rollout(
         following, played = _step(env, spec, policy, playing, step_inputs)
         return following, (*played, record(playing.state))
 
-    none = jnp.zeros(num_envs, bool)
-    start = _Playing(first, none, jnp.zeros(num_envs, jnp.int32), none | getattr(first, "failed", False))
+    none, flags = jnp.zeros(num_envs, bool), (getattr(first, name, False) for name in FLAGS)  # no start may have one
+    start = _Playing(first, none, jnp.zeros(num_envs, jnp.int32), functools.reduce(jnp.logical_or, flags, none))
     end, played = jax.lax.scan(step, start, inputs, length=spec.episode_length)
     (observation, achieved_goal, action, reward, recorded), last = played, end.state
 

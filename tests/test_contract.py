@@ -14,6 +14,7 @@ from mjx_dher import context as context_lib
 from mjx_dher.components import COMPONENTS
 from mjx_dher.contract import env_spec, episode_template
 from mjx_dher.rollout import rollout
+from mjx_dher.runs.folder import loggers
 from mjx_dher.types import Batch, EnvSpec
 from probes import Corridor, Walk
 
@@ -225,6 +226,28 @@ class Wrong(Walk):
 def test_a_spec_that_disagrees_with_the_arrays_is_rejected_before_training(changes, field):
     with pytest.raises(ValueError, match=f"spec: {field}"):
         make_train(Wrong(**changes), Config())
+
+
+class Started(Corridor):
+    """A corridor in which every second start has ended."""
+
+    def reset(self, key):
+        state = super().reset(key)
+        return dataclasses.replace(state, terminal=jax.random.bernoulli(key))
+
+
+def test_starts_that_have_ended_are_no_episodes():
+    keys, actions = jax.random.split(jax.random.key(0), 32), jnp.zeros((5, 32, 1))
+    _, outcome = jax.jit(lambda: rollout(Started("trap"), lambda action, obs: action, keys, 32, actions))()
+    ended = np.asarray(jax.vmap(jax.random.bernoulli)(keys))
+    assert 0 < ended.sum() < 32
+    np.testing.assert_array_equal(outcome.valid, ~ended)
+
+
+def test_a_run_fails_when_half_of_its_rewards_leave_their_range():
+    fine = {"discarded_episodes": 0, "bad_success": 0, "no_goal_share": 0}
+    assert loggers.failure({**fine, "bad_rewards": 0.4}, configs.TINY, True) is None
+    assert "reward_range" in loggers.failure({**fine, "bad_rewards": 0.5}, configs.TINY, True)
 
 
 def test_a_spec_that_cannot_be_is_rejected():

@@ -179,11 +179,13 @@ def failure(metrics: Mapping[str, float], config: Config, finite: bool) -> str |
     episodes = config.num_envs * config.cycles_per_epoch
     if metrics["discarded_episodes"] >= episodes:
         return (
-            f"all {episodes} episodes were discarded, so nothing can be learned: the environment reports `failed`, or an"
-            " observation, a goal, an action or a reward is not finite"
+            f"all {episodes} episodes were discarded, so nothing can be learned: the environment reports `failed`, or `done` or"
+            " `terminal` at its reset, or an observation, a goal, an action or a reward is not finite"
         )
     if metrics["bad_success"] > 0:
         return f"success must be 0 or 1; in {metrics['bad_success']:.3g} of the episodes it is not"
+    if metrics["bad_rewards"] >= 0.5:
+        return f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range (EnvSpec.reward_range)"
     if metrics["no_goal_share"] >= 1:
         return "the sampler offers no hindsight goal for any transition: its weights are all 0, NaN or infinite"
     return None
@@ -194,10 +196,8 @@ def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
     episodes = config.num_envs * config.cycles_per_epoch
     sentences = {
         "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment"
-        " reports `failed`, or a number in them is not finite",
-        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the environment's reward range, which"
-        " bounds the learner's targets",
-        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel;"
-        " these keep their own",
+        " reports `failed`, or an end at its reset, or a number in them is not finite",
+        "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the reward range, which bounds the targets",
+        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}
