@@ -140,6 +140,20 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
         assert row in page
 
 
+def test_how_random_weighted_is_stands_in_a_file():
+    """Means over three seeds, and the first and last share that docs/results.md has."""
+    names = ("mean", "mean, softmax", "none", "none, softmax", "closest")
+    with (ROOT / "docs" / "randomness.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    page, shares = (ROOT / "docs" / "samplers.md").read_text(), []
+    for epoch in ("1", "3", "5", "8", "15"):
+        of = [row for row in rows if row["epoch"] == epoch]
+        shown = [np.mean([float(row[name]) for row in of]) for name in ("success_rate", "priority_mean", *names)]
+        assert f"| {int(of[0]['env_steps']):,} | {' | '.join(f'{value:.2f}' for value in shown)} |" in page
+        shares.append(shown[2])
+    assert f"rises from {shares[0]:.2f} to {max(shares):.2f} and" in (ROOT / "docs" / "results.md").read_text()
+
+
 def test_what_the_pages_say_of_hands_and_of_contrastive_rl():
     crl, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/experiments/crl.md", "README.md"))
     hands = " ".join((ROOT / "docs" / "experiments" / "preset_hands.md").read_text().split())

@@ -1,0 +1,86 @@
+"""How random `weighted` is while a run learns: the share of its draws that differ from `future`, epoch by epoch.
+
+    python bench/randomness.py --out randomness.csv [--env push] [--preset cpu] [--seeds 3] [--first-seed 0]
+
+Trains with `weighted` and measures readings of it on the steps of each epoch's newest episodes. The share is the total
+variation between the probabilities of the reading and of `future`: 0 is `future`, and for `closest` it is near 1. The paper
+says that the sampler gives "a direction early on in training, while becoming more and more random as the network learns".
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from timing import print_table
+
+from mjx_dher import envs, learners, presets, samplers
+from mjx_dher.config import HParams
+from mjx_dher.contract import env_spec
+from mjx_dher.replay import ReplayState
+from mjx_dher.trainer import make_train
+from mjx_dher.types import Array
+
+READINGS = {
+    "mean": samplers.make("weighted"),
+    "mean, softmax": samplers.make("weighted", "softmax"),
+    "none": samplers.make("weighted", normalization="none"),
+    "none, softmax": samplers.make("weighted", "softmax", normalization="none"),
+    "closest": samplers.make("closest"),
+}
+FIELDS = ("seed", "epoch", "env_steps", "success_rate", "priority_mean", *READINGS)
+
+
+def shares(ring: ReplayState, newest: int, hparams: HParams) -> dict[str, Array]:
+    """Mean share [] of draws that differ from `future`, over all steps of the `newest` episodes but the last two steps."""
+    rows = (ring.cursor - 1 - jnp.arange(newest)) % ring.priority.shape[0]
+    achieved, desired = ring.episodes.achieved_goal[rows], ring.episodes.desired_goal[rows]
+    steps = jnp.arange(achieved.shape[1] - 3)
+
+    def share(reading: samplers.Sampler, achieved: Array, desired: Array, step: Array) -> Array:
+        chosen = jax.nn.softmax(reading.log_weights(achieved, desired, step, hparams))
+        return 0.5 * jnp.sum(jnp.abs(chosen - jax.nn.softmax(samplers.future(achieved, desired, step, hparams))))
+
+    def mean(reading: samplers.Sampler) -> Array:
+        of_steps = jax.vmap(lambda a, d: jax.vmap(lambda step: share(reading, a, d, step))(steps))
+        return jnp.mean(of_steps(achieved, desired))
+
+    return {name: mean(reading) for name, reading in READINGS.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--env", default="push")
+    parser.add_argument("--preset", default="cpu")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=0)
+    args = parser.parse_args()
+    spec = presets.preset(args.preset, args.env)
+    env = envs.make(args.env)
+    learner = learners.make(spec.learner, spec.config, env_spec(env), spec.networks)
+    program = make_train(env, spec.config, sampler=samplers.make("weighted"), learner=learner)
+    epoch, measure = jax.jit(program.epoch, donate_argnums=0), jax.jit(shares, static_argnums=1)
+    each = spec.config.num_envs * env.episode_length * spec.config.cycles_per_epoch
+    rows = []
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
+        state = jax.jit(program.init)(jax.random.key(seed), spec.hparams)
+        for number in range(1, spec.config.total_steps // each + 1):
+            state, metrics = epoch(state)
+            found = measure(state.replay, spec.config.num_envs * spec.config.cycles_per_epoch, state.hparams)
+            shown = (metrics["success_rate"], metrics["priority_mean"], *(found[name] for name in READINGS))
+            rows.append((seed, number, number * each, *(round(float(value), 4) for value in shown)))
+            print(seed, number, rows[-1][3:], flush=True)
+        with args.out.open("w", newline="") as file:
+            csv.writer(file).writerows([FIELDS, *rows])
+    table = np.array(rows, float)
+    means = [table[table[:, 1] == number][:, 1:].mean(0) for number in sorted(set(table[:, 1]))]
+    print_table(FIELDS[1:], [(f"{row[0]:.0f}", f"{row[1]:,.0f}", *(f"{value:.2f}" for value in row[2:])) for row in means])
+
+
+if __name__ == "__main__":
+    main()
