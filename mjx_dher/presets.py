@@ -179,8 +179,7 @@ def _cpu_slide(env: str) -> Settings:
 
 
 def _cpu_pick_and_place(env: str) -> Settings:
-    # One cycle per epoch: on two cores it takes some ten seconds.
-    return _kept(_small(_entropy(env), cycles_per_epoch=1, policy_delay=2), 1_024_000)
+    return _kept(_gpu_pick_and_place(env), 1_024_000)
 
 
 def _gpu_pick_and_place(env: str) -> Settings:
