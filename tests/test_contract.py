@@ -252,6 +252,7 @@ def test_starts_that_have_ended_are_no_episodes():
 def test_a_run_fails_when_half_of_its_rewards_leave_their_range():
     fine = {"discarded_episodes": 0, "bad_success": 0, "no_goal_share": 0}
     assert loggers.failure({**fine, "bad_rewards": 0.4}, configs.TINY, True) is None
+    assert loggers.warnings({**fine, "bad_rewards": 0.4}, configs.TINY).keys() == {"bad_rewards"}
     assert "reward_range" in loggers.failure({**fine, "bad_rewards": 0.5}, configs.TINY, True)
 
 
