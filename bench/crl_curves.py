@@ -267,6 +267,7 @@ def main() -> None:
         check_writable(out.parent)
     except FolderError as error:
         parser.error(str(error))
+    out.parent.mkdir(parents=True, exist_ok=True)
     known = {(row["who"], row["task"], int(row["seed"])) for row in _rows(out)}
     if twice := known & {(args.what, task, seed) for task in args.tasks for seed in seeds}:
         parser.error(f"{out} already has {', '.join(map(str, sorted(twice)))}; choose other seeds, tasks or another file")

@@ -3,25 +3,29 @@
     python bench/randomness.py --out randomness.csv [--env push] [--preset cpu] [--seeds 3] [--first-seed 0]
 
 Trains with `weighted` and measures readings of it on the steps of each epoch's newest episodes. The share is the total
-variation between the probabilities of the reading and of `future`: 0 is `future`, and for `closest` it is near 1. The paper
+variation between the probabilities of the reading and of `future`: 0 means the same draws, 1 none in common. The paper
 says that the sampler gives "a direction early on in training, while becoming more and more random as the network learns".
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
+import dataclasses
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from bakeoff_runs import save
 from timing import print_table
 
-from mjx_dher import envs, learners, presets, samplers
-from mjx_dher.config import HParams
+from mjx_dher import envs, learners, presets, priorities, samplers
+from mjx_dher.cli.settings import check_writable
+from mjx_dher.config import HParams, num_epochs, steps_per_epoch
 from mjx_dher.contract import env_spec
 from mjx_dher.replay import ReplayState
+from mjx_dher.spec import validate
+from mjx_dher.system.files import FolderError
 from mjx_dher.trainer import make_train
 from mjx_dher.types import Array
 
@@ -42,8 +46,8 @@ def shares(ring: ReplayState, newest: int, hparams: HParams) -> dict[str, Array]
     steps = jnp.arange(achieved.shape[1] - 3)
 
     def share(reading: samplers.Sampler, achieved: Array, desired: Array, step: Array) -> Array:
-        chosen = jax.nn.softmax(reading.log_weights(achieved, desired, step, hparams))
-        return 0.5 * jnp.sum(jnp.abs(chosen - jax.nn.softmax(samplers.future(achieved, desired, step, hparams))))
+        own, base = (sample(achieved, desired, step, hparams) for sample in (reading.log_weights, samplers.future))
+        return 0.5 * jnp.sum(jnp.abs(samplers.probabilities(own) - samplers.probabilities(base)))
 
     def mean(reading: samplers.Sampler) -> Array:
         of_steps = jax.vmap(lambda a, d: jax.vmap(lambda step: share(reading, a, d, step))(steps))
@@ -60,23 +64,35 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
-    spec = presets.preset(args.preset, args.env)
+    if args.seeds < 1:
+        parser.error(f"--seeds is 1 or more; got {args.seeds}")
+    if args.out.is_dir():
+        parser.error(f"--out must be a file; {args.out} is a folder")
+    try:
+        check_writable(args.out.resolve().parent)
+        spec = presets.preset(args.preset, args.env)
+        for seed in (args.first_seed, args.first_seed + args.seeds - 1):
+            validate(dataclasses.replace(spec, seed=seed))
+    except (FolderError, ValueError) as error:
+        parser.error(str(error))
+    args.out.resolve().parent.mkdir(parents=True, exist_ok=True)
     env = envs.make(args.env)
     learner = learners.make(spec.learner, spec.config, env_spec(env), spec.networks)
-    program = make_train(env, spec.config, sampler=samplers.make("weighted"), learner=learner)
+    priority = priorities.make(spec.priority)
+    program = make_train(env, spec.config, sampler=READINGS["mean"], priority=priority, learner=learner)
     epoch, measure = jax.jit(program.epoch, donate_argnums=0), jax.jit(shares, static_argnums=1)
-    each = spec.config.num_envs * env.episode_length * spec.config.cycles_per_epoch
+    newest = spec.config.num_envs * spec.config.cycles_per_epoch
+    each = steps_per_epoch(spec.config, env.episode_length)
     rows = []
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         state = jax.jit(program.init)(jax.random.key(seed), spec.hparams)
-        for number in range(1, spec.config.total_steps // each + 1):
+        for number in range(1, num_epochs(spec.config, env.episode_length) + 1):
             state, metrics = epoch(state)
-            found = measure(state.replay, spec.config.num_envs * spec.config.cycles_per_epoch, state.hparams)
+            found = measure(state.replay, newest, state.hparams)
             shown = (metrics["success_rate"], metrics["priority_mean"], *(found[name] for name in READINGS))
             rows.append((seed, number, number * each, *(round(float(value), 4) for value in shown)))
             print(seed, number, rows[-1][3:], flush=True)
-        with args.out.open("w", newline="") as file:
-            csv.writer(file).writerows([FIELDS, *rows])
+        save(args.out, rows, FIELDS)
     table = np.array(rows, float)
     means = [table[table[:, 1] == number][:, 1:].mean(0) for number in sorted(set(table[:, 1]))]
     print_table(FIELDS[1:], [(f"{row[0]:.0f}", f"{row[1]:,.0f}", *(f"{value:.2f}" for value in row[2:])) for row in means])

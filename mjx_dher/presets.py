@@ -178,10 +178,6 @@ def _cpu_slide(env: str) -> Settings:
     return _kept(base, 1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
-def _cpu_pick_and_place(env: str) -> Settings:
-    return _kept(_gpu_pick_and_place(env), 1_024_000)
-
-
 def _gpu_pick_and_place(env: str) -> Settings:
     return _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
 
@@ -206,7 +202,9 @@ _LEARNERS = {  # by preset, and environment or robot
         "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
     ),
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
-    ("cpu", "pick_and_place"): _Best("tqc", "layer_norm", _cpu_pick_and_place, {"priority": "energy"}),
+    ("cpu", "pick_and_place"): _Best(
+        "tqc", "layer_norm", lambda env: _kept(_gpu_pick_and_place(env), 1_024_000), {"priority": "energy"}
+    ),
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),

@@ -24,7 +24,7 @@ class Outcome(NamedTuple):
     success: Array  # 1.0 if the goal is reached at the last step
     reset_success: Array  # 1.0 if it was reached at the reset, before any action
     ret: Array  # undiscounted sum of rewards
-    valid: Array  # whether all numbers are finite, no state is `failed` and the reset is no end, bool
+    valid: Array  # whether all numbers are finite, no state is `failed`, and the first has not ended, bool
     bad_rewards: Array  # fraction of rewards outside the reward range
     length: Array  # steps that were played, int32
 
@@ -35,7 +35,7 @@ class _Playing(NamedTuple):
     state: PyTree  # of the environments
     over: Array  # [N] whether the episode has ended, bool
     length: Array  # [N] int32
-    failed: Array  # [N] whether a state so far is `failed`, or the first one an end, bool
+    failed: Array  # [N] whether a state so far is `failed`, or the first has ended, bool
 
 
 def rollout(
@@ -94,8 +94,9 @@ def record_rollout(
         following, played = _step(env, spec, policy, playing, step_inputs)
         return following, (*played, record(playing.state))
 
-    none, flags = jnp.zeros(num_envs, bool), (getattr(first, name, False) for name in FLAGS)  # no start may have one
-    start = _Playing(first, none, jnp.zeros(num_envs, jnp.int32), functools.reduce(jnp.logical_or, flags, none))
+    none = jnp.zeros(num_envs, bool)
+    unusable = functools.reduce(jnp.logical_or, (getattr(first, flag, none) for flag in FLAGS))  # no start may have a flag
+    start = _Playing(first, none, jnp.zeros(num_envs, jnp.int32), unusable)
     end, played = jax.lax.scan(step, start, inputs, length=spec.episode_length)
     (observation, achieved_goal, action, reward, recorded), last = played, end.state
 

@@ -132,7 +132,7 @@ class EnvState(Protocol):
     Optional fields, all [] bool:
 
     - `failed`: the simulation diverged. Nothing is learned from the episode.
-    - `done`: the episode ends here (needs `EnvSpec.ends`).
+    - `done`: the episode ends here (needs `EnvSpec.ends`). Nothing is learned from one that ends at its reset.
     - `terminal`: the episode ends here without a future for any goal, as after an object was dropped (needs `EnvSpec.ends`).
     """
 

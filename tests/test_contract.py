@@ -12,7 +12,7 @@ import pytest
 from mjx_dher import Config, HParams, learners, make_train, priorities, relabel, replay, samplers
 from mjx_dher import context as context_lib
 from mjx_dher.components import COMPONENTS
-from mjx_dher.contract import env_spec, episode_template
+from mjx_dher.contract import check_first, env_spec, episode_template
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import loggers
 from mjx_dher.types import Batch, EnvSpec
@@ -20,6 +20,7 @@ from probes import Corridor, Walk
 
 HP = HParams(gamma=0.9)
 T = 12
+VALUES = [name for name in COMPONENTS["learner"] if name != "crl"]  # its values are not returns, and it reads no discounts
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["ends", "ends_at_goal"])
@@ -156,7 +157,7 @@ def test_a_priority_does_not_see_the_padding(walk, name):
     np.testing.assert_allclose(weight(whole), weight(cut), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", [name for name in COMPONENTS["learner"] if name != "crl"])  # it reads no discounts
+@pytest.mark.parametrize("name", VALUES)
 def test_nothing_follows_a_terminal_transition(name):
     """With a discount of 0, an update does not depend on the next observation; with any other, it does."""
     config = Config(hidden_sizes=(8,), num_quantiles=3, dropped_quantiles=1)
@@ -183,11 +184,10 @@ def test_nothing_follows_a_terminal_transition(name):
 KNOWN = {"trap": (9.0, -1.75), "goal": (3.0, -1.5), "clock": (9.0, -2.0)}
 
 
-LEARNERS = [("ddpg", 1), ("ddpg", 2)]
-OTHERS = [(name, n_step) for name in ("td3", "sac", "redq", "tqc", "dtqc", "ctd3", "csac") for n_step in (1, 3)]
+OTHERS = [pytest.param(name, n_step, marks=pytest.mark.slow) for name in VALUES if name != "ddpg" for n_step in (1, 3)]
 
 
-@pytest.mark.parametrize(("learner", "n_step"), LEARNERS + [pytest.param(*each, marks=pytest.mark.slow) for each in OTHERS])
+@pytest.mark.parametrize(("learner", "n_step"), [("ddpg", 1), ("ddpg", 2), *OTHERS])
 @pytest.mark.parametrize("kind", KNOWN)
 def test_values_are_known(kind, learner, n_step):
     """Truncated is not terminal; a trap is, for every goal; a goal that is reached is, for itself."""
@@ -265,3 +265,10 @@ def test_a_spec_that_cannot_be_is_rejected():
     walk.spec = "mine"
     with pytest.raises(ValueError, match="spec"):
         env_spec(walk)
+
+
+def test_an_observation_has_an_array():
+    state = Walk().reset(jax.random.key(0))
+    check_first(state, ())
+    with pytest.raises(ValueError, match="observation must have at least one array"):
+        check_first(dataclasses.replace(state, obs={**state.obs, "observation": {}}), ())

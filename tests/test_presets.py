@@ -100,7 +100,11 @@ def paired(file, task, arm, base):
         for row in csv.DictReader(rows):
             if row["task"] == task:
                 runs.setdefault(row["arm"], {})[row["seed"]] = float(row["mean_success"])
-    gains = np.array([x - runs[base][seed] for seed, x in runs[arm].items()])
+    return interval(np.array([x - runs[base][seed] for seed, x in runs[arm].items()]))
+
+
+def interval(gains):
+    """Mean of paired gains [S], and its 95 % interval by Student's t."""
     return gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
 
 
@@ -124,9 +128,7 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
         for row in csv.DictReader(file):
             shown = float(row["success_rate"]), float(row["priority_mean"])
             curves.setdefault(row["sampler"], {}).setdefault(row["seed"], []).append(shown)
-    found = {
-        sampler: [np.array(curve)[:, 0] for curve in runs.values()] for sampler, runs in curves.items()
-    }  # success [29] of each seed
+    found = {s: [np.array(curve)[:, 0] for curve in runs.values()] for s, runs in curves.items()}  # success [29] of each seed
     start = {s: [next((i for i, (_, p) in enumerate(c) if p >= 0.2), 29) for c in runs.values()] for s, runs in curves.items()}
     assert sum(epoch < 29 for epoch in start["closest"]) == 4
     after = {s: np.array([c[b : b + 10].mean() for c, b in zip(found[s], start[s])]) for s in found if s != "closest"}
@@ -135,8 +137,8 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
         row = f"| `{sampler}` | {np.median(epochs):.0f} ({min(epochs)} to {max(epochs)}) | "
         if sampler != "future":
             gains = (epochs - 1 - start["future"], mean - after["future"])
-            said = [(x.mean(), *scipy.stats.t.interval(0.95, 9, x.mean(), scipy.stats.sem(x))) for x in gains]
-            row += "{:+.1f} ({:+.1f} to {:+.1f}) | ".format(*said[0]) + "{:+.3f} ({:+.3f} to {:+.3f})".format(*said[1])
+            row += "{:+.1f} ({:+.1f} to {:+.1f}) | ".format(*interval(gains[0]))
+            row += "{:+.3f} ({:+.3f} to {:+.3f})".format(*interval(gains[1]))
         assert row in page
 
 

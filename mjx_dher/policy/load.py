@@ -52,7 +52,10 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     if spec is None:
         raise FolderError(f"{path} is the policy of a custom learner or custom networks: pass its run folder instead")
     if use:
-        raise ValueError(f"{use} needs built-in parts and vectors as observations; not {spec.learner!r}, {spec.networks!r}")
+        raise ValueError(
+            f"{use} needs a policy of linear layers and ReLU for one vector of observations;"
+            f" {spec.learner!r} with {spec.networks!r} has another here"
+        )
     from mjx_dher.policy.learner_policy import from_arrays as from_state
 
     with reading.checked(path, "cannot be played"):

@@ -196,8 +196,9 @@ def warnings(metrics: Mapping[str, float], config: Config) -> dict[str, str]:
     episodes = config.num_envs * config.cycles_per_epoch
     sentences = {
         "discarded_episodes": f"{metrics['discarded_episodes']:.0f} of {episodes} episodes were discarded: the environment"
-        " reports `failed`, or an end at its reset, or a number in them is not finite",
+        " reports `failed`, or has ended at its reset, or a number in them is not finite",
         "bad_rewards": f"{metrics['bad_rewards']:.3g} of the rewards lie outside the reward range, which bounds the targets",
-        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel",
+        "no_goal_share": f"the sampler offers no goal for {metrics['no_goal_share']:.3g} of the transitions to relabel;"
+        " these keep their own",
     }
     return {name: text for name, text in sentences.items() if metrics[name] > 0}
