@@ -60,13 +60,9 @@ PAGES = (
     Page(CRITICS, EXPERIMENTS / "ablation.md", DOCS / "modern_critics_runs.csv", "modern_critics", pictures=False),
     Page(BAKEOFF, EXPERIMENTS / "bakeoff.md", DOCS / "bakeoff_runs.csv", "bakeoff", claims=True),
     Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
-    Page(PUBLISHED["cher"], EXPERIMENTS / "as_published.md", DOCS / "as_published_cher_runs.csv", "cher", pictures=False),
-    Page(
-        PUBLISHED["next_future"],
-        EXPERIMENTS / "as_published.md",
-        DOCS / "as_published_next_future_runs.csv",
-        "next_future",
-        pictures=False,
+    *(
+        Page(PUBLISHED[part], EXPERIMENTS / "as_published.md", DOCS / f"as_published_{part}_runs.csv", part, pictures=False)
+        for part in ("cher", "next_future", "ebp")
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
     Page(REWARDS, EXPERIMENTS / "crl_rewards.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),

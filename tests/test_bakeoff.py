@@ -190,9 +190,9 @@ def test_runs_that_are_kept_are_those_of_the_arms_as_they_are(arms, ablation):
     import as_published
     import bakeoff_runs
 
-    ours, parts, cher = arms.BAKEOFF, ablation.ABLATION, as_published.EXPERIMENTS["cher"]
-    of_ours = [(name, ours) for name in ("bakeoff", "bakeoff_repeat", "bakeoff_third")]
-    for name, experiment in [*of_ours, ("ablation", parts), ("as_published_cher", cher)]:
+    ours = [(name, arms.BAKEOFF) for name in ("bakeoff", "bakeoff_repeat", "bakeoff_third")]
+    published = [(f"as_published_{name}", as_published.EXPERIMENTS[name]) for name in ("cher", "next_future", "ebp")]
+    for name, experiment in [*ours, *published, ("ablation", ablation.ABLATION)]:
         assert bakeoff_runs.load(ROOT / "docs" / f"{name}_runs.csv", experiment)
 
 
