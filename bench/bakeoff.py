@@ -46,7 +46,7 @@ def parse(
 ) -> argparse.Namespace:
     """Checked arguments. Unusable ones end the program with status 2 and an error message."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    learners, tasks, names = experiment.learners, experiment.tasks, [arm.name for arm in experiment.arms]
+    learners, tasks, names = experiment.learners, experiment.tasks, [arm.name for arm in experiment.arms if arm.group]
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps and of the report")
     parser.add_argument("--learners", nargs="+", choices=learners, default=learners)
     parser.add_argument("--tasks", nargs="+", choices=tasks, default=tasks)

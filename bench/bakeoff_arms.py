@@ -22,7 +22,7 @@ class Arm:
 
     name: str
     # Arms of a group share a program. Arms that evaluate the learner on the whole ring each cycle, and arms that draw four
-    # times as many transitions, would slow down the others.
+    # times as many transitions, would slow down the others. Empty: commit `former` ran it, and it is no longer in the library.
     group: str
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
@@ -62,7 +62,7 @@ class Experiment:
     @property
     def groups(self) -> tuple[str, ...]:
         """Groups of the arms, in order."""
-        return tuple(dict.fromkeys(arm.group for arm in self.arms))
+        return tuple(dict.fromkeys(arm.group for arm in self.arms if arm.group))
 
 
 ARMS = (
@@ -155,7 +155,14 @@ ARMS = (
     ),
     Arm("velocity", "plain", {"sampler": "weighted", "metric": "velocity"}, claim=OURS),
     Arm("resting_point", "plain", {"sampler": "weighted", "metric": "resting_point"}, claim=OURS),
-    Arm("time_to_goal", "learner", {"sampler": "weighted", "metric": "time_to_goal"}, claim=OURS),
+    Arm(
+        "time_to_goal",
+        "",
+        {"sampler": "weighted", "metric": "time_to_goal"},
+        claim=OURS,
+        departs="removed since",
+        former="e1afdfa",
+    ),
 )
 
 

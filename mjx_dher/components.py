@@ -90,7 +90,6 @@ _TABLE = {
         "velocity": Component("contrib.metrics", "distance in position and velocity to rest at the goal"),
         "resting_point": Component("contrib.metrics", "distance from the point where Slide's puck would come to rest"),
         "resting_point_rough": Component("contrib.metrics", "the same with the friction of Push's and PickAndPlace's block"),
-        "time_to_goal": Component("contrib.metrics", "steps to the goal as estimated by the learner's critic"),
     },
     "priority": {
         "eventful": Component("priorities", "episodes whose last achieved goal was not yet reached at their start"),

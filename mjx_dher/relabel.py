@@ -30,8 +30,7 @@ def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HP
     """Draws an achieved goal for each transition. `relabel` has first given the sampler the environment's goal distance.
 
     Args:
-      sample: transitions [B]. Samplers that use goals of other episodes need `sample.pool`, and samplers with a score need
-        `sample.score` (see `add_choices`).
+      sample: transitions [B]. Samplers that use goals of other episodes need `sample.pool` (see `add_pool`).
       sampler: a `Sampler`, or a function like `Sampler.log_weights`.
 
     Raises:
@@ -42,12 +41,12 @@ def hindsight_goals(sample: Sample, sampler: Sampler | LogWeightsFn, hparams: HP
     goals, length = sample.episode_goals, sample.length
     if sampler.cross_episode:
         if sample.pool is None:
-            raise ValueError("pool is missing: this sampler uses goals of other episodes (relabel.add_choices)")
+            raise ValueError("pool is missing: this sampler uses goals of other episodes (relabel.add_pool)")
         goals, length = _from_pool(sampler, sample, hparams)
     weigh = functools.partial(samplers.weigh, sampler)
-    axes = (0, 0, 0, None, None if sample.score is None else 0, 0 if sample.ends else None)
+    axes = (0, 0, 0, None, 0 if sample.ends else None)
     last = length if sample.ends else None
-    log_weights = jax.vmap(weigh, in_axes=axes)(goals, sample.desired_goal, sample.step, hparams, sample.score, last)
+    log_weights = jax.vmap(weigh, in_axes=axes)(goals, sample.desired_goal, sample.step, hparams, last)
     index = samplers.draw(key, log_weights)
     offered = index < goals.shape[1]
     chosen = goals[jnp.arange(batch_size), index]
@@ -71,14 +70,11 @@ def _keys(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey]:
     return coin_key, pool_key, draw_key
 
 
-def add_choices(ring: ReplayState, sample: Sample, sampler: Sampler, scores: Array | None, key: PRNGKey) -> Sample:
-    """Adds goals of other episodes and scores to a sample, if the sampler uses them.
-
-    `scores` has shape [E, T+1] (`samplers.score_episodes`), or None. Pass the same `key` to `relabel`.
-    """
-    if sampler.cross_episode:
-        sample = dataclasses.replace(sample, pool=replay.sample_pool(ring, _keys(key)[1], sample.step.shape[0]))
-    return sample if scores is None else dataclasses.replace(sample, score=scores[sample.row])
+def add_pool(ring: ReplayState, sample: Sample, sampler: Sampler, key: PRNGKey) -> Sample:
+    """Adds goals of other episodes to a sample, if the sampler uses them. Pass the same `key` to `relabel`."""
+    if not sampler.cross_episode:
+        return sample
+    return dataclasses.replace(sample, pool=replay.sample_pool(ring, _keys(key)[1], sample.step.shape[0]))
 
 
 class Relabelled(NamedTuple):
@@ -139,7 +135,6 @@ def draw_batches(
     context: Context,
     weights: Cumulative,
     n_step: int = 1,
-    scores: Array | None = None,
     priority: Priority | None = None,
 ) -> Batch:
     """Draws and relabels transitions for the learner.
@@ -151,7 +146,6 @@ def draw_batches(
       context: reward function and numbers. Its `hparams.priority_fraction` is the fraction drawn by priority.
       weights: `replay.cumulative(ring)`.
       n_step: steps of a return (`look_ahead`).
-      scores: scores [E, T+1] of the ring's episodes, for a sampler with a score.
       priority: priority. If it chooses among transitions, several candidates are drawn for each.
     """
     number, sampler = math.prod(shape), samplers.make(sampler)
@@ -160,7 +154,7 @@ def draw_batches(
         row_key, sample_key, relabel_key = jax.random.split(key, 3)
         rows = replay.draw_rows(ring, row_key, count, context.hparams.priority_fraction, weights)
         sample = replay.sample(ring, sample_key, count, rows)
-        sample = add_choices(ring, sample, sampler, scores, relabel_key)
+        sample = add_pool(ring, sample, sampler, relabel_key)
         return sample, relabel(sample, sampler, context, relabel_key).batch
 
     if priority is None or priority.choose is None:

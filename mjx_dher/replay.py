@@ -50,7 +50,6 @@ class Sample:
     length: Array  # [B] steps of the episode, int32
     terminal: Array  # [B] whether no future follows this transition, for any goal, bool
     pool: Pool | None = None  # goals of other episodes, if the sampler uses them
-    score: Array | None = None  # [B, T+1] scores of `episode_goals`, if the sampler has a score
     ends: bool = struct.field(pytree_node=False, default=False)  # whether episodes can be shorter than T
 
 

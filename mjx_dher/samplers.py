@@ -22,10 +22,10 @@ from flax import struct
 
 from mjx_dher import check, components, lookup
 from mjx_dher.config import HParams
-from mjx_dher.context import Context, euclidean, of_each_episode, one_of
-from mjx_dher.types import Array, DistanceFn, Episode, PRNGKey
+from mjx_dher.context import euclidean, one_of
+from mjx_dher.types import Array, DistanceFn, PRNGKey
 
-# log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]; with a score, (..., hparams, score [T+1])
+# log_weights(achieved [T+1, G], desired [G], step [], hparams) -> [T+1]
 LogWeightsFn = Callable[..., Array]
 # metric(achieved [T+1, G], desired [G]) -> [T+1], finite and not negative
 MetricFn = Callable[[Array, Array], Array]
@@ -33,8 +33,6 @@ MetricFn = Callable[[Array, Array], Array]
 KernelFn = Callable[[Array, Array | float], Array]
 # normalization(distance [T+1], candidates [T+1] bool, scale [] in metres) -> relative distance [T+1]
 NormalizationFn = Callable[[Array, Array, Array | float], Array]
-# score(episode, context) -> [T+1]
-ScoreFn = Callable[[Episode, Context], Array]
 
 
 @struct.dataclass
@@ -44,17 +42,8 @@ class Sampler:
     log_weights: LogWeightsFn = struct.field(pytree_node=False)
     # Whether goals come from any episode instead of the transition's own. A function of HParams if traced (`join`).
     cross_episode: bool | Callable[[HParams], Array] = struct.field(pytree_node=False, default=False)
-    # Scores of each stored episode's goals, computed once per cycle and passed to `log_weights` as its last argument.
-    score: ScoreFn | None = struct.field(pytree_node=False, default=None)
     # The sampler for another goal distance. None unless it measures by the environment's (`of_distance`).
     measure_by: "Callable[[DistanceFn], Sampler] | None" = struct.field(pytree_node=False, default=None, kw_only=True)
-
-
-@struct.dataclass
-class LearnedMetric:
-    """A distance computed by the learner, between an episode's achieved goals and its desired goal. Finite and not negative."""
-
-    score: ScoreFn = struct.field(pytree_node=False)
 
 
 def position(achieved: Array, desired: Array) -> Array:
@@ -115,7 +104,7 @@ def __getattr__(name: str) -> Any:
 def make(
     name: str | Sampler | LogWeightsFn,
     kernel: str | KernelFn = "linear",
-    metric: str | MetricFn | LearnedMetric = "position",
+    metric: str | MetricFn = "position",
     normalization: str | NormalizationFn = "mean",
     goal_distance: DistanceFn | None = None,
 ) -> Sampler:
@@ -145,7 +134,10 @@ def make(
         return _to_sampler(sampler)
     if weighs:
         sampler = functools.partial(sampler, kernel=kernel, normalization=normalization)
-    by = functools.partial(_by_metric, sampler)
+
+    def by(metric: MetricFn) -> Sampler:
+        return Sampler(functools.partial(sampler, metric=metric))
+
     made = by(make_metric(metric, goal_distance or euclidean))
     if metric != "position" or goal_distance is not None:
         return made
@@ -157,51 +149,24 @@ def of_distance(sampler: Sampler, goal_distance: DistanceFn) -> Sampler:
     return sampler if sampler.measure_by is None or goal_distance is euclidean else sampler.measure_by(goal_distance)
 
 
-def make_metric(metric: Any, goal_distance: DistanceFn = euclidean) -> MetricFn | LearnedMetric:
+def make_metric(metric: Any, goal_distance: DistanceFn = euclidean) -> MetricFn:
     """Loads a metric. `make` documents its values."""
     if metric == "position" and goal_distance is not euclidean:
         return lambda achieved, desired: goal_distance(achieved, jnp.broadcast_to(desired, achieved.shape))
-    value = components.load("metric", metric)
-    if isinstance(value, LearnedMetric):
-        lookup.check_function("metric: score", value.score, ("episode", "context"))
-        return value
-    return lookup.check_function("metric", value, ("achieved", "desired"))
-
-
-def _by_metric(log_weights: LogWeightsFn, metric: MetricFn | LearnedMetric) -> Sampler:
-    if not isinstance(metric, LearnedMetric):
-        return Sampler(functools.partial(log_weights, metric=metric))
-
-    def by_score(
-        achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array, length: Array | None = None
-    ) -> Array:
-        return log_weights(achieved, desired, step, hparams, metric=lambda achieved, desired: score, length=length)
-
-    return Sampler(by_score, score=metric.score)
+    return components.load("metric", metric, "achieved", "desired")
 
 
 def _to_sampler(sampler: Any) -> Sampler:
     if not isinstance(sampler, Sampler):
         sampler = Sampler(sampler)
-    parameters = ("achieved", "desired", "step", "hparams")
-    lookup.check_function("sampler", sampler.log_weights, parameters if sampler.score is None else (*parameters, "score"))
-    if sampler.score is not None:
-        lookup.check_function("sampler: score", sampler.score, ("episode", "context"))
-        if sampler.cross_episode is True:
-            raise ValueError("cross_episode of a sampler with a score must be False; got True")
+    lookup.check_function("sampler", sampler.log_weights, ("achieved", "desired", "step", "hparams"))
     if not (isinstance(sampler.cross_episode, bool) or callable(sampler.cross_episode)):
         raise ValueError(f"cross_episode of a sampler must be True, False or a function; got {sampler.cross_episode!r}")
     return sampler
 
 
 def weigh(
-    sampler: Sampler,
-    achieved: Array,
-    desired: Array,
-    step: Array,
-    hparams: HParams,
-    score: Array | None = None,
-    length: Array | None = None,
+    sampler: Sampler, achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None
 ) -> Array:
     """Log weights [T+1] of the goals of one episode.
 
@@ -209,31 +174,15 @@ def weigh(
       achieved: achieved goals [T+1, G] to choose from.
       desired: desired goal [G] of the episode.
       step: index [] of the transition.
-      score: scores [T+1] of the goals, for a sampler with a score.
       length: index [] of the episode's last goal. Default: T. Goals after it get no weight.
 
     Raises:
-      ValueError: the sampler does not return floats [T+1], or `score` is missing.
+      ValueError: the sampler does not return floats [T+1].
     """
-    if sampler.score is not None and score is None:
-        raise ValueError("score is missing: this sampler needs Sample.score (samplers.score_episodes)")
-    more = () if sampler.score is None else (score,)
     takes_length = length is not None and "length" in inspect.signature(sampler.log_weights).parameters
-    value = sampler.log_weights(achieved, desired, step, hparams, *more, **({"length": length} if takes_length else {}))
+    value = sampler.log_weights(achieved, desired, step, hparams, **({"length": length} if takes_length else {}))
     value = check.array("sampler: log weights [T+1]", value, achieved.shape[:1])
     return value if length is None else jnp.where(jnp.arange(achieved.shape[0]) <= length, value, -jnp.inf)
-
-
-def score_episodes(sampler: Sampler, episodes: Episode, context: Context) -> Array | None:
-    """Scores [E, T+1] of episodes (leaves lead with [E]), or None if the sampler has no score."""
-    if sampler.score is None:
-        return None
-    return of_each_episode(lambda episode: _score(sampler, episode, context), episodes)
-
-
-def _score(sampler: Sampler, episode: Episode, context: Context) -> Array:
-    shape = episode.achieved_goal.shape[:1]
-    return jnp.zeros(shape) if sampler.score is None else check.array("score [T+1]", sampler.score(episode, context), shape)
 
 
 def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
@@ -244,19 +193,15 @@ def join(choices: Sequence[Sampler | LogWeightsFn]) -> Sampler:
     samplers = [make(choice) for choice in choices]
     if len(samplers) == 1:
         return samplers[0]
-    score = one_of([functools.partial(_score, sampler) for sampler in samplers], "choice")
     weighs = one_of([functools.partial(weigh, sampler) for sampler in samplers], "choice")
     crosses = one_of([lambda hparams, own=sampler.cross_episode: own for sampler in samplers], "choice")
 
-    def log_weights(
-        achieved: Array, desired: Array, step: Array, hparams: HParams, score: Array | None = None, length: Array | None = None
-    ) -> Array:
-        return weighs(achieved, desired, step, hparams, score, length)
+    def log_weights(achieved: Array, desired: Array, step: Array, hparams: HParams, length: Array | None = None) -> Array:
+        return weighs(achieved, desired, step, hparams, length)
 
     return Sampler(
         log_weights,
         cross_episode=crosses if any(sampler.cross_episode for sampler in samplers) else False,
-        score=score if any(sampler.score for sampler in samplers) else None,
         measure_by=lambda distance: join([of_distance(sampler, distance) for sampler in samplers]),
     )
 

@@ -24,7 +24,7 @@ from mjx_dher.learners import Learner
 from mjx_dher.parallel import split
 from mjx_dher.parallel.split import AxisName
 from mjx_dher.priorities import Priority, PriorityFn
-from mjx_dher.relabel import add_choices, draw_batches, relabel
+from mjx_dher.relabel import add_pool, draw_batches, relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
@@ -86,8 +86,7 @@ class Loop:
 
     @property
     def uses_values(self) -> bool:
-        generator = getattr(self.generator, "uses_values", False)
-        return self.sampler.score is not None or self.priority.uses_values or generator
+        return self.priority.uses_values or getattr(self.generator, "uses_values", False)
 
     @property
     def updates_per_round(self) -> int:
@@ -276,8 +275,7 @@ def _update_normalizers(
     fresh = replay.add(replay.init(loop.template, num_new, loop.spec.ends), episodes, valid=valid)
     sample_key, relabel_key = jax.random.split(key)
     sample = replay.sample(fresh, sample_key, num_new * num_steps)
-    scores = samplers.score_episodes(loop.sampler, fresh.episodes, context)
-    sample = add_choices(fresh, sample, loop.sampler, scores, relabel_key)
+    sample = add_pool(fresh, sample, loop.sampler, relabel_key)
     batch, no_goal_share = relabel(sample, loop.sampler, context, relabel_key)
     if loop.spec.ends:  # not what follows the end
         valid = valid[:, None] & (jnp.arange(num_steps + 1) <= episodes.length[:, None])
@@ -299,12 +297,11 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
     On a GPU, drawing one batch takes twice as long as learning from it, and drawing 40 takes hardly longer.
     """
     config, weights = loop.config, replay.cumulative(ring)
-    scores = samplers.score_episodes(loop.sampler, ring.episodes, context)
     shape = (loop.rounds_per_draw, loop.updates_per_round, config.batch_size)
     update = functools.partial(learners.update_round, loop.learner, config.target_period, context.hparams)
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
-        batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, scores, loop.priority)
+        batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, loop.priority)
         return jax.lax.scan(update, learner, batches)
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))

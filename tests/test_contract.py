@@ -106,7 +106,7 @@ def test_transitions_are_those_of_a_plain_loop(walk, name, n_step):
 def test_weights_of_weighted_are_over_the_played_goals_alone():
     """Distances 1, 2, 3 after the step, then padding: the mean is 2, weights 2 - r = 1.5, 1, 0.5."""
     achieved = jnp.array([0.0, 1.0, 2.0, 3.0, 3.0, 3.0])[:, None]
-    weigh = lambda name, length: samplers.weigh(samplers.make(name), achieved, jnp.zeros(1), jnp.int32(0), HP, None, length)  # noqa: E731
+    weigh = lambda name, length: samplers.weigh(samplers.make(name), achieved, jnp.zeros(1), jnp.int32(0), HP, length)  # noqa: E731
     found = samplers.probabilities(weigh("weighted", jnp.int32(3)))
     np.testing.assert_allclose(found, [0, 1.5 / 3, 1 / 3, 0.5 / 3, 0, 0], atol=1e-6)
     np.testing.assert_allclose(samplers.probabilities(weigh("final", jnp.int32(3))), [0, 0, 0, 1, 0, 0])

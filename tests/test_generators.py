@@ -12,12 +12,10 @@ from mjx_dher import HParams, RunSpec, learners, make_train, priorities, replay,
 from mjx_dher.components import COMPONENTS
 from mjx_dher.context import Context
 from mjx_dher.contract import env_spec
-from mjx_dher.contrib import generators, goals, metrics
+from mjx_dher.contrib import generators, goals
 from mjx_dher.priorities import Priority
 from mjx_dher.rollout import rollout
 from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.loop import state_template
-from mjx_dher.samplers import LearnedMetric
 from mjx_dher.testing import ComponentError
 from point_mass import PointMass
 from probes import Walk
@@ -125,12 +123,7 @@ def test_what_asks_the_learner_needs_one_that_answers():
     silent = dataclasses.make_dataclass("Silent", [])()
     for name in (method for method in vars(learners.Learner) if not method.startswith("_")):
         object.__setattr__(silent, name, getattr(made, name))
-    parts = (
-        {"priority": priorities.make("td_error")},
-        {"generator": generators.make("hgg")},
-        {"sampler": samplers.make("closest", metric="time_to_goal")},
-    )
-    for part in parts:
+    for part in {"priority": priorities.make("td_error")}, {"generator": generators.make("hgg")}:
         with pytest.raises(ValueError, match="value"):
             make_train(ENV, SMALL, learner=silent, **part)
         make_train(ENV, SMALL, **part)
@@ -168,15 +161,6 @@ def _candidates(ring):
     return draw(ring)
 
 
-def test_a_score_of_the_wrong_kind_is_refused():
-    sampler = samplers.make("weighted", metric=LearnedMetric(lambda episode, context: jnp.zeros(3)))
-    program = make_train(ENV, SMALL, sampler=sampler)
-    with pytest.raises(ValueError, match=r"score \[T\+1\] .*\[11\]"):
-        jax.eval_shape(program.epoch, state_template(program))
-    with pytest.raises(ValueError, match="cross_episode"):
-        samplers.make(samplers.Sampler(lambda *five: five[0], True, metrics.time_to_goal.score))
-
-
 def test_trials_name_what_is_wrong():
     trial = TRIAL
     for wrong, message in (
@@ -194,13 +178,13 @@ def test_trials_name_what_is_wrong():
     with pytest.raises(ComponentError, match="indices"):
         testing.check_priority(Priority(choose=lambda key, sample, batch, number, context: 99 + jnp.arange(number)), trial)
     with pytest.raises(ComponentError, match="negative"):
-        testing.check_metric(LearnedMetric(lambda episode, context: -jnp.ones(11)), trial)
+        testing.check_metric(lambda achieved, desired: -jnp.ones(11), trial)
 
 
 def test_built_in_parts_pass_their_trials():
     trial = TRIAL
     assert "chosen" in testing.check_priority("td_error", trial)
-    assert "goals of the past never" in testing.check_sampler(samplers.make("weighted", metric="time_to_goal"), trial)
+    assert "goals of the past never" in testing.check_sampler(samplers.make("weighted", metric="velocity"), trial)
 
 
 def test_a_task_that_changes_more_than_the_goal_is_named():

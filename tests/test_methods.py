@@ -73,17 +73,6 @@ VALUES = Values(lambda observation, goal: jnp.zeros((*observation.shape[:-1], 2)
 CONTEXT = Context(REWARD, HP._replace(priority_fraction=1.0), values=VALUES)
 
 
-def test_time_to_goal_is_minus_the_learner_s_value():
-    episode = episode_of([[0.0, 0], [0.2, 0], [0.6, 0]], [0.5, 0])
-    np.testing.assert_allclose(metrics.time_to_goal.score(episode, CONTEXT), [5.0, 3.0, 1.0], rtol=1e-5)
-    sampler = samplers.make("closest", metric="time_to_goal")
-    (score,) = samplers.score_episodes(sampler, jax.tree.map(lambda x: x[None], episode), CONTEXT)
-    log_weights = samplers.weigh(sampler, episode.achieved_goal, episode.desired_goal, jnp.int32(0), HP, score)
-    np.testing.assert_array_equal(log_weights, [-jnp.inf, -jnp.inf, 0.0])
-    with pytest.raises(ValueError, match="score"):
-        samplers.weigh(sampler, episode.achieved_goal, episode.desired_goal, jnp.int32(0), HP)
-
-
 def test_energy_counts_what_was_gained():
     lifted = episode_of([[0, 0, 0.4], [0, 0, 0.4], [0, 0, 0.5], [0, 0, 0.5]])
     # 0.1 m in a step is 2.5 m/s: 0.981 + 3.125 J a kg gained at once; its loss when it stops does not count.

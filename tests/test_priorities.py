@@ -159,11 +159,9 @@ def test_distances_whose_sum_overflows_offer_no_goal(normalization):
 def test_methods_that_ask_a_learner_name_the_values_that_they_lack():
     ring = replay.add(replay.init(jax.tree.map(lambda x: x[0], EPISODES), 3), EPISODES)
     obs = {"observation": PATHS[:, 0], "achieved_goal": PATHS[:, 0], "desired_goal": EPISODES.desired_goal}
-    sampler = samplers.make("weighted", metric="time_to_goal")
     for act in (
         lambda: priorities.renew(priorities.td_error, ring, CONTEXT),
         lambda: generators.make("hgg")(jax.random.key(0), obs, ring, CONTEXT),
-        lambda: samplers.score_episodes(sampler, EPISODES, CONTEXT),
     ):
         with refuses("values", "uses_values"):
             act()

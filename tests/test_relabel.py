@@ -10,7 +10,7 @@ from mjx_dher import replay, samplers
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
-from mjx_dher.relabel import add_choices, draw_batches, hindsight_goals, look_ahead, relabel
+from mjx_dher.relabel import add_pool, draw_batches, hindsight_goals, look_ahead, relabel
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Batch, Episode
 from probes import Clock
@@ -43,7 +43,7 @@ def index_of(goal, episode_goals):
 
 
 def goals_of(ring, sample, sampler, hparams, key):
-    draw = lambda ring, sample, key: hindsight_goals(add_choices(ring, sample, sampler, None, key), sampler, hparams, key)  # noqa: E731
+    draw = lambda ring, sample, key: hindsight_goals(add_pool(ring, sample, sampler, key), sampler, hparams, key)  # noqa: E731
     return jax.jit(draw)(ring, sample, key).goals
 
 

@@ -154,7 +154,7 @@ def test_relabel(name):
     @typed
     def relabelled(ring: Ring, sample: Sample, key: Key[Array, ""]) -> tuple[Drawn, Float[Array, "B G"]]:
         sampler = samplers.make(name)
-        drawn = relabel.add_choices(to_ring(ring), to_sample(sample), sampler, None, key)
+        drawn = relabel.add_pool(to_ring(ring), to_sample(sample), sampler, key)
         goals = relabel.hindsight_goals(drawn, sampler, HP, key).goals
         return fields(relabel.relabel(drawn, sampler, CONTEXT, key).batch), goals
 

@@ -9,11 +9,10 @@ import functools
 
 import jax.numpy as jnp
 
-from mjx_dher.context import Context
 from mjx_dher.contract import STEP_SECONDS
 from mjx_dher.priorities import GRAVITY, displacements
-from mjx_dher.samplers import LearnedMetric, position
-from mjx_dher.types import Array, Episode
+from mjx_dher.samplers import position
+from mjx_dher.types import Array
 
 _SPEED_STEPS = 5.0  # weight of the velocity, in steps
 
@@ -43,12 +42,3 @@ def _resting(achieved: Array, desired: Array, friction: float) -> Array:
 
 resting_point = functools.partial(_resting, friction=0.1)  # Slide's puck on its table
 resting_point_rough = functools.partial(_resting, friction=1.0)  # the cube of Push and PickAndPlace
-
-
-def _steps_left(episode: Episode, context: Context) -> Array:
-    """-V(s_i, g) [T+1], at least 0. With rewards of -1 per step it is the discounted number of steps to the goal."""
-    goals = jnp.broadcast_to(episode.desired_goal[None], episode.achieved_goal.shape)
-    return jnp.maximum(-context.learner_values().of_state(episode.observation, goals), 0.0)
-
-
-time_to_goal = LearnedMetric(_steps_left)

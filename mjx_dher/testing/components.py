@@ -25,7 +25,7 @@ from mjx_dher.lookup import is_import_path
 from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, PriorityFn
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
-from mjx_dher.samplers import KernelFn, LearnedMetric, LogWeightsFn, MetricFn, NormalizationFn, Sampler
+from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, NormalizationFn, Sampler
 from mjx_dher.spec import RunSpec, custom_components
 from mjx_dher.testing.env import check_env
 from mjx_dher.testing.learner import check_learner
@@ -64,26 +64,22 @@ def check_components(env: Env, spec: RunSpec, with_env: bool = True) -> Iterator
         yield f"learner {spec.learner}, networks {spec.networks}: as they should be, in one update"
 
 
-def check_sampler(
-    sampler: str | Sampler | LogWeightsFn, env: Env | Trial, hparams: HParams | None = None, learner: Learner | None = None
-) -> str:
+def check_sampler(sampler: str | Sampler | LogWeightsFn, env: Env | Trial, hparams: HParams | None = None) -> str:
     """Checks the log weights at every step of random episodes.
 
     They must be floats [T+1], below +inf, not NaN, not all -inf at every step, and equal in a second call and under `jax.vmap`.
     """
-    made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, learner)
+    made, trial = attempt("sampler", samplers.make, sampler), trial_of(env, hparams, None)
     episodes, numbers = trial.episodes, trainer.as_arrays(trial.hparams)
-    steps, score = jnp.arange(episodes.action.shape[1]), jnp.zeros(episodes.achieved_goal.shape[:2])
-    if made.score is not None:
-        score = attempt("sampler: score", samplers.score_episodes, made, episodes, trial.context)
+    steps = jnp.arange(episodes.action.shape[1])
 
-    def of_step(achieved: Any, desired: Any, score: Any, length: Any, step: Any) -> Any:
-        return samplers.weigh(made, achieved, desired, step, numbers, score, length if ends else None)
+    def of_step(achieved: Any, desired: Any, length: Any, step: Any) -> Any:
+        return samplers.weigh(made, achieved, desired, step, numbers, length if ends else None)
 
     ends = env_spec(trial.env).ends
-    of_episode = jax.vmap(of_step, in_axes=(None, None, None, None, 0))
-    asked = episodes.achieved_goal, episodes.desired_goal, score, episodes.length
-    log_weights = run("sampler", jax.vmap(of_episode, in_axes=(0, 0, 0, 0, None)), *asked, steps)
+    of_episode = jax.vmap(of_step, in_axes=(None, None, None, 0))
+    asked = episodes.achieved_goal, episodes.desired_goal, episodes.length
+    log_weights = run("sampler", jax.vmap(of_episode, in_axes=(0, 0, 0, None)), *asked, steps)
     alone = attempt("sampler, alone,", jax.jit(of_step), *(x[0] for x in asked), steps[-1])
     played = np.asarray(steps < episodes.length[:, None])
     return _check_log_weights(np.asarray(log_weights), np.asarray(alone), played)
@@ -113,15 +109,11 @@ def _weights(log_weights: NDArray) -> NDArray:
     return np.exp(log_weights - np.where(np.isfinite(largest), largest, 0.0))
 
 
-def check_metric(metric: str | MetricFn | LearnedMetric, env: Env | Trial, learner: Learner | None = None) -> str:
+def check_metric(metric: str | MetricFn, env: Env | Trial) -> str:
     """Checks distances of random episodes' goals: [T+1], finite, not negative and not all equal."""
-    made, trial = attempt("metric", samplers.make_metric, metric), trial_of(env, None, learner)
-    if isinstance(made, LearnedMetric):
-        sampler = samplers.make("closest", metric=made)
-        distances = np.asarray(attempt("metric", samplers.score_episodes, sampler, trial.episodes, trial.context))
-    else:
-        compute = jax.vmap(functools.partial(samplers.measure, made))
-        distances = np.asarray(run("metric", compute, trial.episodes.achieved_goal, trial.episodes.desired_goal))
+    made, trial = attempt("metric", samplers.make_metric, metric), trial_of(env, None, None)
+    compute = jax.vmap(functools.partial(samplers.measure, made))
+    distances = np.asarray(run("metric", compute, trial.episodes.achieved_goal, trial.episodes.desired_goal))
     text = expect_range("metric: distances", distances)
     expect(distances.min() < distances.max(), f"metric: it tells no goals apart: all distances are {distances.min():.3g}")
     return f"metric as it should be: distances {text}"
