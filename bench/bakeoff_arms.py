@@ -22,7 +22,7 @@ class Arm:
 
     name: str
     # Arms of a group share a program. Arms that evaluate the learner on the whole ring each cycle, and arms that draw four
-    # times as many transitions, would slow down the others. Empty: commit `former` ran it, and it is no longer in the library.
+    # times as many transitions, would slow down the others. Empty: it is no longer in the library, and so only reported.
     group: str
     parts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # fields of RunSpec
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)  # fields of HParams
@@ -160,8 +160,7 @@ ARMS = (
         "",
         {"sampler": "weighted", "metric": "time_to_goal"},
         claim=OURS,
-        departs="removed since",
-        former="e1afdfa",
+        departs="in the library until commit e1afdfa",
     ),
 )
 
