@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from conftest import ROOT
+from scipy.spatial import cKDTree
 
 from mjx_dher import envs
 from mjx_dher.envs import arms
@@ -47,6 +49,24 @@ def test_actions_are_targets_of_four_joints_and_the_gripper(push):
     ):
         controls = push.controls(start, jnp.full(5, action))
         np.testing.assert_allclose(controls.ctrl, [*joints, fingers, fingers], rtol=1e-5)
+
+
+def test_the_arm_at_rest_is_near_half_of_the_goals_of_arm_reach():
+    """Some servos' gain is below their stiffness, as in JaxGCRL: they rest at gain / stiffness of their targets."""
+    env, rng = envs.make("arm_reach", engine="native"), np.random.default_rng(0)
+    share = env.model.actuator_gainprm[:, 0] / -env.model.actuator_biasprm[:, 1]
+    np.testing.assert_allclose(share[[0, 1, 3, 5]], [1, 1, 4 / 7, 1 / 2])
+    start, actions = jax.tree.map(jnp.asarray, env._rest), rng.uniform(-1, 1, (40_000, 4)).astype(np.float32)
+    inputs = np.asarray(jax.vmap(lambda action: env.controls(start, action).ctrl)(actions))
+    data, ends = mujoco.MjData(env.model), []
+    for ctrl in inputs:
+        data.qpos[:] = share * ctrl
+        mujoco.mj_kinematics(env.model, data)
+        ends.append(data.body("link7").xpos.copy())
+    goals = rng.uniform(env.goal.low, env.goal.high, (2_000, 3))
+    near = (cKDTree(ends).query(goals)[0] < env.goal.threshold).mean()
+    assert abs(near - 0.5) < 0.03
+    assert f"of {near:.1f} of the goals" in (ROOT / "docs" / "environments.md").read_text()
 
 
 @pytest.mark.parametrize(
