@@ -11,7 +11,7 @@ from mjx_dher.sweeps import grid, tables
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("group", ["plain", "learner", "transitions", "errors"])
+@pytest.mark.parametrize("group", ["plain", "transitions", "errors"])
 def test_arms_learn_to_reach(monkeypatch, tmp_path, group):
     """In 16,000 steps, as the preset does: 1.000 over 500 episodes with each of three seeds (README.md)."""
     monkeypatch.syspath_prepend(ROOT / "bench")
