@@ -7,14 +7,11 @@ with the current learner.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import HParams
 from mjx_dher.contract import STEP_SECONDS, step_seconds
 from mjx_dher.types import Array, Batch, DistanceFn, PyTree, ReachedFn, RewardFn
-
-_ROWS_AT_ONCE = 256  # episodes per step of `of_each_episode`, to limit memory
 
 
 def euclidean(achieved: Array, desired: Array) -> Array:
@@ -106,12 +103,6 @@ def pick(results: Sequence[Any], number: Array) -> Array:
     for index, result in enumerate(results[1:], 1):
         kept = jnp.where(number == index, result, kept)
     return kept
-
-
-def of_each_episode(function: Callable[[Any], Array], episodes: Any) -> Array:
-    """Maps `function` over episodes (leaves lead with [E]), a few hundred at a time."""
-    number = jax.tree.leaves(episodes)[0].shape[0]
-    return jax.lax.map(function, episodes, batch_size=min(number, _ROWS_AT_ONCE))
 
 
 def one_of(functions: Sequence[Callable[..., Any]], index: str) -> Callable[..., Array]:

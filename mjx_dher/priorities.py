@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher import check, components, lookup, replay
-from mjx_dher.context import Context, of_each_episode, one_of
+from mjx_dher.context import Context, one_of
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
 
 CANDIDATES = 4  # transitions drawn per transition that `choose` keeps
 GRAVITY = 9.81  # m/s^2
+_ROWS_AT_ONCE = 256  # episodes whose errors are computed at a time, to limit memory
 
 # priority(episode, context) -> weight [], 0 or more
 PriorityFn = Callable[[Episode, Context], Array]
@@ -247,7 +248,7 @@ def _mean_error(ring: ReplayState, context: Context) -> Array:
         played = step < episode.length
         return jnp.sum(jnp.where(played, size, 0.0)) / jnp.maximum(episode.length, 1).astype(size.dtype)
 
-    return of_each_episode(of_episode, ring.episodes)
+    return jax.lax.map(of_episode, ring.episodes, batch_size=min(replay.capacity(ring), _ROWS_AT_ONCE))
 
 
 # Luu & Yoo 2021 ("HGR"): episodes by their mean error, then hindsight goals by theirs.
