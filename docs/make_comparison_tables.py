@@ -103,7 +103,7 @@ def whole_table(page: Page, rows: Sequence[Row]) -> str:
     several, lines, before = len(page.experiment.learners) > 1, [], None
     for row in rows:
         family = (row.learner, row.task)
-        names = [NAMES.get(row.task, row.task.capitalize()), *([f"`{row.learner}`"] if several else [])]
+        names = [NAMES.get(row.task, f"`{row.task}`"), *([f"`{row.learner}`"] if several else [])]
         lines.append([*(names if family != before else [""] * len(names)), *cells(row)])
         before = family
     return table(f"task | {'learner | ' if several else ''}arm | {COLUMNS}", lines)

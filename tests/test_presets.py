@@ -112,20 +112,25 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
     names = ("docs/experiments/as_published.md", "docs/what_helps.md", "README.md")
     page, helps, readme = (" ".join((ROOT / name).read_text().split()) for name in names)
     for arm, base, tasks in (
-        ("td_error", "more_updates", 2),
+        ("td_error", "more_updates", 3),
         ("td_error", "transitions_alone", 2),
         ("transitions_alone", "more_updates", 2),
-        ("td_error_whole", "td_error", 1),
-        ("transitions_alone", "random_of_four", 1),
+        ("td_error_whole", "td_error", 2),
+        ("td_error_whole", "more_updates", 2),
+        ("transitions_alone", "random_of_four", 2),
+        ("random_of_four", "uniform", 2),
     ):
-        numbers = [paired("td_controls_runs.csv", task, arm, base) for task in ("pick_and_place", "slide")[:tasks]]
+        of = ("pick_and_place", "slide", "block_rotate_z")[:tasks]
+        numbers = [paired("td_controls_runs.csv", task, arm, base) for task in of]
         shown = ["{:+.3f} ({:+.3f} to {:+.3f})".format(*found) for found in numbers]
-        row = page.partition(f"| `{arm}` less `{base}` |")[2].split("|")[:4]
+        row = page.partition(f"| `{arm}` less `{base}` |")[2].split("|")[:6]
         assert [cell.strip().partition(", p")[0] for cell in row[: 2 * tasks : 2]] == shown
         if (arm, base) == ("td_error", "more_updates"):
-            (gain, low, high), (loss, *bounds) = numbers
-            shown = f"gains {gain:.3f} ({low:.3f} to {high:.3f})", f"loses {-loss:.3f} ({-bounds[1]:.3f} to {-bounds[0]:.3f})"
+            (gain, low, high), *losses = numbers
+            losses = [f"{-loss:.3f} ({-bounds[1]:.3f} to {-bounds[0]:.3f})" for loss, *bounds in losses]
+            shown = f"gains {gain:.3f} ({low:.3f} to {high:.3f})", f"loses {losses[0]}"
             assert all(part in text for part in shown for text in (helps, readme))
+            assert f"loses {losses[0]} on Slide and {losses[1]} on `block_rotate_z`" in helps
 
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with (ROOT / "docs" / "break_off.csv").open() as file:
