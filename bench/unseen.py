@@ -1,10 +1,10 @@
-"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609 (Block Z: 610 to 619).
+"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609 (or 610 to 619).
 
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --minutes 9
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --report
 
 It is bench/bakeoff.py with a preset in place of a learner and one arm, and has its options. The report's unseen_runs.csv has
-one row per seed. docs/experiments/presets.md has the order of the runs.
+one row per seed. docs/experiments/presets.md has the table.
 """
 
 from __future__ import annotations

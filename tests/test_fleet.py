@@ -181,6 +181,9 @@ def test_the_sweep_without_ray_removes_chunks_whose_runs_have_ended(tmp_path, mo
     run(tmp_path, [waiting])
     assert sweep._end(args, [ended, waiting], [waiting], 0, Console()) == 0
     assert not (tmp_path / "unfinished").exists()
+    storage.parent.mkdir()  # left empty by a driver that has cleared its own storage
+    assert sweep._end(args, [ended, waiting], [], 0, Console()) == 0
+    assert not (tmp_path / "unfinished").exists()
 
 
 def test_chunks_that_had_not_ended_come_first_as_they_were(tmp_path):

@@ -86,7 +86,7 @@ def in_c(model, flat, rng):
 
 def in_the_kernel(model, pos, mat, collide):
     """Number [NUM] of contacts, and distance, place and normal [NUM, slots, 7]."""
-    *_, contacts, _, layout = simulation._structs(model, 10**6)
+    *_, contacts, _, layout = simulation.structs_of(model, 10**6)
     memory = [wp.zeros((NUM, layout.size), dtype=float), wp.zeros(1, dtype=int)]
     found = [wp.zeros((NUM, contacts.slots), dtype=dtype) for dtype in (float, wp.vec3, wp.vec3)]
     number = wp.zeros(NUM, dtype=int)

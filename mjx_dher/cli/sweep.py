@@ -243,10 +243,12 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: in
             f"{args.out}: another process is training {len(left)} of the {len(trials)} runs, which are not in the tables;"
             " run the same command again when it has ended"
         )
-    for storage in (args.out / "unfinished").glob("fleet-*"):  # a driver that still trains holds the lock
+    unfinished = args.out / "unfinished"
+    for storage in unfinished.glob("fleet-*"):  # a driver that still trains holds the lock
         with contextlib.suppress(OSError, files.FolderError), files.lock(args.out):
             chunks.clear(storage, args.out)
-            storage.parent.rmdir()
+    with contextlib.suppress(OSError):  # it does not exist, or has storages
+        unfinished.rmdir()
     return 0
 
 
