@@ -28,6 +28,7 @@ def bodies_computed_once() -> Iterator[None]:
     Private: `mujoco.mjx._src.scan.body_tree`, which is replaced during the block, for every thread.
     Why: XLA's fusion emitters fuse MJX's walk along the arm into one loop that repeats all ancestors for every use of them:
       0.7 s instead of 0.9 ms for the kinematics of 16 environments on 2 cores. A barrier after each level ends the fusion.
+      On an AMD EPYC the emitters are off by default (2026-11-28), and barriers make no difference.
     Needed by: mujoco-mjx 3.17.0 with jaxlib 0.10.2. The same slowdown is reported, since JAX 0.7, in
       https://github.com/google-deepmind/mujoco/issues/2957 and https://github.com/jax-ml/jax/issues/33761 (both closed).
     """
