@@ -64,7 +64,8 @@ _PASSES = (
 )
 _FLAGS += f" --xla_cpu_parallel_codegen_split_count=1 --xla_disable_hlo_passes={','.join(_PASSES)}"
 if importlib.metadata.version("jaxlib").startswith("0.10."):
-    _FLAGS += " --xla_cpu_use_fusion_emitters=false"
+    # The newer scheduler can lose a task of an MJX program, and the test then waits for ever: see settle_compiler.
+    _FLAGS += " --xla_cpu_use_fusion_emitters=false --xla_cpu_enable_concurrency_optimized_scheduler=false"
 os.environ.setdefault("XLA_FLAGS", _FLAGS)
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(EXAMPLES), str(ROOT / "docs")]
 

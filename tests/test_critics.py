@@ -178,14 +178,14 @@ def test_layers_that_sum_by_products_have_the_gradients_of_flax(dtype):
             return networks._mlp(x, (8,), 2, jnp.dtype(dtype), Style(layer_norm=True))
 
     x, target = jax.random.normal(KEY, (3, 5, 16, 4)), jax.random.normal(jax.random.key(1), (3, 5, 16, 2))
-    params = jax.vmap(Ours().init, (None, 0))(KEY, x)
-    theirs = jax.vmap(Flax().init, (None, 0))(KEY, x)
+    params = jax.jit(jax.vmap(Ours().init, (None, 0)))(KEY, x)
+    theirs = jax.eval_shape(jax.vmap(Flax().init, (None, 0)), KEY, x)
     assert jax.tree.structure(params) == jax.tree.structure(theirs)
-    params = jax.tree.map(lambda p: p + 0.1 * jax.random.normal(KEY, p.shape), params)
+    params = jax.jit(lambda params: jax.tree.map(lambda p: p + 0.1 * jax.random.normal(KEY, p.shape), params))(params)
 
     def gradients(module):
         loss = lambda p, x, target: jnp.mean((module.apply(p, x) - target) ** 2)  # noqa: E731
-        return jax.vmap(jax.value_and_grad(loss))(params, x, target)
+        return jax.jit(jax.vmap(jax.value_and_grad(loss)))(params, x, target)
 
     tolerance = {"float32": 1e-6, "bfloat16": 0.02}[dtype]
     for own, flax in zip(jax.tree.leaves(gradients(Ours())), jax.tree.leaves(gradients(Flax()))):
@@ -205,7 +205,8 @@ def test_layers_have_the_second_derivatives_of_flax(shape):
         output = lambda x: modules[1].apply(params[1], modules[0].apply(params[0], x))  # noqa: E731
         return jnp.sum(jax.grad(lambda x: jnp.sum(jnp.tanh(output(x))))(x) ** 2)
 
-    for a, b in zip(*(jax.tree.leaves(jax.grad(penalty)(params, modules)) for modules in (own, flax))):
+    gradients = jax.jit(jax.grad(penalty), static_argnums=1)
+    for a, b in zip(*(jax.tree.leaves(gradients(params, modules)) for modules in (own, flax))):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * float(jnp.abs(b).max()))
 
 

@@ -133,7 +133,7 @@ def test_the_ring_holds_them_and_the_normalizers_have_seen_them():
 def test_the_ring_takes_episodes_without_length_and_terminal():
     train = trainer.make_train(Ending(), TINY, priority=lambda episode, context: episode.length)
     episodes = dataclasses.replace(played(), length=None, terminal=None)
-    state = train.add(train.init(jax.random.key(0), HParams()), episodes)
+    state = jax.jit(train.add)(jax.jit(train.init)(jax.random.key(0), HParams()), episodes)
     np.testing.assert_array_equal(state.replay.priority, [10.0] * 6 + [0.0] * 2)
 
 

@@ -277,7 +277,8 @@ def ring(episodes):
 def test_transitions_without_a_goal_keep_their_own_and_are_counted(ring):
     sample = replay.sample(ring, jax.random.key(2), 400)
     for sampler in (mistakes.nothing, mistakes.infinite, mistakes.nan_late, within):
-        made = relabel.relabel(sample, sampler, Context(ENV.compute_reward, HParams(her_k=1e9)), jax.random.key(3))
+        context = Context(ENV.compute_reward, HParams(her_k=1e9))
+        made = jax.jit(relabel.relabel, static_argnums=(1, 2))(sample, sampler, context, jax.random.key(3))
         log_weights = jax.vmap(sampler, (0, 0, 0, None))(sample.episode_goals, sample.desired_goal, sample.step, HParams())
         offered = np.asarray(jnp.isfinite(jnp.max(log_weights, axis=1)))
         kept = np.all(np.asarray(made.batch.desired_goal) == np.asarray(sample.desired_goal), axis=1)

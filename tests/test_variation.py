@@ -116,7 +116,7 @@ class Cart(MujocoTask):
 def test_each_reset_draws_factors_and_all_else_as_without():
     plain, varied = Cart("native"), Cart("native", varied="mass:cart=0.5-2, gain:push=0.25-0.5")
     keys = jax.random.split(jax.random.key(0), 64)
-    without, states = jax.vmap(plain.reset)(keys), jax.vmap(varied.reset)(keys)
+    without, states = jax.jit(jax.vmap(plain.reset))(keys), jax.jit(jax.vmap(varied.reset))(keys)
     factors = np.asarray(states.physics.factors)
     assert factors.shape == (64, 2)
     for column, (low, high) in zip(factors.T, ((0.5, 2), (0.25, 0.5))):
