@@ -209,8 +209,8 @@ def report(args: argparse.Namespace, console: Console) -> int:
     console.print(f"wrote {args.out / args.experiment.runs}, {len(runs)} runs")
     with files.atomic_write(args.out / args.experiment.table) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(Row._fields)
-        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+        writer.writerow(Row._fields[:-1])  # without the seeds' differences, which `runs` has
+        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row[:-1]] for row in rows)
     console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
         if shown := [row for row in rows if row.task == task]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from bakeoff_arms import Arm
@@ -49,9 +49,11 @@ class Row(NamedTuple):
     better_high: float
     p_value: float
     p_corrected: float  # by Holm's method, over all arms of a learner and task; the p of one that has not been run counts as 1
+    p_joint: float  # by joint flips (`stats.westfall_young`), over all arms that have been run; decides nothing
     smallest_effect: float  # that would be seen four times in five, for this spread of the differences
     claim: str
     source: str
+    each: Mapping[int, float]  # differences of mean success, by seed
 
 
 def smallest_effect(spread: float, seeds: int, tests: int) -> float:
@@ -95,13 +97,17 @@ def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[A
 def corrected(rows: Sequence[Row], tests: int) -> list[Row]:
     """The rows with p corrected over `tests` comparisons together (`stats.holm`)."""
     tested = [number for number, row in enumerate(rows) if not math.isnan(row.p_value)]
-    by_row = dict(zip(tested, stats.holm([rows[number].p_value for number in tested], tests)))
-    return [row._replace(p_corrected=by_row[n]) if n in by_row else row for n, row in enumerate(rows)]
+    alone = stats.holm([rows[number].p_value for number in tested], tests)
+    seeds = sorted({seed for number in tested for seed in rows[number].each})
+    each = [[rows[number].each.get(seed, math.nan) for seed in seeds] for number in tested]
+    by_row = dict(zip(tested, zip(alone, stats.westfall_young(each) if each else [])))
+    return [row._replace(p_corrected=by_row[n][0], p_joint=by_row[n][1]) if n in by_row else row for n, row in enumerate(rows)]
 
 
 def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: int) -> Row:
     common = [seed for seed in own.seeds if seed in base.seeds]
-    nan, paired = math.nan, {}
+    nan = math.nan
+    paired: dict[str, Any] = {}
     if own is not base and len(common) > 1:
         mine, theirs = ([scores.seeds.index(seed) for seed in common] for scores in (own, base))
         difference = own.area[mine] - base.area[theirs]
@@ -115,10 +121,11 @@ def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: in
             "better": stats.probability_of_improvement(own.area, base.area),
             "better_low": better_low,
             "better_high": better_high,
+            "each": dict(zip(common, difference.tolist())),
             "p_value": stats.paired_p_value(own.area[mine], base.area[theirs]),
             "smallest_effect": smallest_effect(float(difference.std(ddof=1)), len(common), max(tests, 1)),
         }
-    empty = dict.fromkeys(
+    empty: dict[str, Any] = dict.fromkeys(
         ("difference", "low", "high", "final_difference", "better", "better_low", "better_high", "p_value", "smallest_effect"),
         nan,
     )
@@ -132,9 +139,10 @@ def _row(learner: str, task: str, arm: Arm, own: Scores, base: Scores, tests: in
         final=float(own.final.mean()),
         steps_to_threshold=float(np.median(own.steps)),
         p_corrected=nan,
+        p_joint=nan,
         claim=arm.claim,
         source=arm.source,
-        **(empty | paired),
+        **({"each": {}} | empty | paired),
     )
 
 

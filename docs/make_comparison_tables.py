@@ -31,7 +31,9 @@ from modern_critics import CRITICS
 from td_controls import CONTROLS
 
 EXPERIMENTS, IMAGES, SCRIPT = DOCS / "experiments", DOCS / "images", "docs/make_comparison_tables.py"
-COLUMNS = "mean success | difference | 95 % interval | p | p, corrected | the last policy | could be seen | verdict"
+COLUMNS = (
+    "mean success | difference | 95 % interval | p | p, corrected | p, joint flips | the last policy | could be seen | verdict"
+)
 
 
 class Page(NamedTuple):
@@ -91,10 +93,10 @@ def cells(row: Row) -> list[str]:
     """The cells of an arm, from its name on."""
     start = [f"`{row.arm}`", f"{row.mean_success:.3f}"]
     if math.isnan(row.difference):
-        return [*start, "", "", "", "", f"{row.final:.3f}", "", ""]
+        return [*start, "", "", "", "", "", f"{row.final:.3f}", "", ""]
     interval = f"{row.low:+.3f} to {row.high:+.3f}"
     said = verdict(row.low, row.high, row.p_corrected)
-    found = [f"{row.difference:+.3f}", interval, number(row.p_value), number(row.p_corrected)]
+    found = [f"{row.difference:+.3f}", interval, number(row.p_value), number(row.p_corrected), number(row.p_joint)]
     return [*start, *found, f"{row.final:.3f}", f"{row.smallest_effect:.2f}", said]
 
 

@@ -3,7 +3,7 @@
     python docs/make_preference_figure.py
 
 The strength is the share of draws that differ from `future` on the way to a goal (docs/samplers.md). The loss is of mean
-success over 30 epochs of Push with one cycle per epoch, paired over ten seeds.
+success over 30 epochs of Push, paired over ten seeds (with the paper's cycles, `weighted` over twenty).
 """
 
 from __future__ import annotations
@@ -20,6 +20,12 @@ from mjx_dher import samplers
 
 PICTURE = DOCS / "images" / "preference.png"
 EPOCHS, EPSILONS = 30, (0.1, 0.2, 0.3, 0.5)
+# Sweeps with the paper's cycles, for those with one cycle per epoch; readings of `weighted` have the same settings.
+OWN = {
+    ("samplers", "weighted"): ("own_push", "weighted"),
+    ("samplers", "closest"): ("own_methods", "closest"),
+    ("samplers", "epsilon_closest, epsilon 0.2"): ("own_methods", "epsilon_closest"),
+}
 BELOW = {"sum": -13, "far": 1, "mean, softmax": -16, "minmax": -6, "closest": -10}  # points from a dot to its label
 
 
@@ -31,8 +37,8 @@ class Point(NamedTuple):
     gain: Difference
 
 
-def points() -> list[Point]:
-    """The thirteen settings on Push that choose goals by distance, by share."""
+def points(own: bool = False) -> list[Point]:
+    """The thirteen settings on Push that choose goals by distance, by share; or the ten that have the paper's `own` cycles."""
     way, push = SITUATIONS["on the way"], paper_set.load_set(paper_set.FOLDER)["push"]
     made = {("samplers", "closest"): ("closest", total_variation(samplers.make("closest"), way))}
     for epsilon in EPSILONS:  # draws at random differ from nothing
@@ -49,9 +55,11 @@ def points() -> list[Point]:
             share,
         )
     found = []
-    for name, (label, share) in made.items():
-        base = with_seeds(push["samplers", "future"], push[name].seeds)
-        found.append(Point(label, share, difference(area(push[name], EPOCHS), area(base, EPOCHS))))
+    for long, (label, share) in made.items():
+        name = OWN.get(long, (long[0].replace("readings_", "readings_own_"), long[1])) if own else long
+        if own == ("own" in name[0]):
+            base = with_seeds(push["own_push" if own else "samplers", "future"], push[name].seeds)
+            found.append(Point(label, share, difference(area(push[name], EPOCHS), area(base, EPOCHS))))
     return sorted(found, key=lambda point: point.share)
 
 
@@ -68,6 +76,8 @@ def draw(path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")
+    shares, gains = zip(*((point.share, point.gain.mean) for point in points(own=True)))
+    axis.plot(shares, gains, "x", color="#5b6671", label="with the paper's cycles")
     for point in points():
         away = point.name == "far"
         around = [[point.gain.mean - point.gain.low], [point.gain.high - point.gain.mean]]
@@ -80,6 +90,7 @@ def draw(path: Path) -> None:
     axis.set(xlim=(-0.03, 1.08), xlabel="share of draws that differ from future, on the way to a goal")
     axis.set(ylabel="mean success less future's", title="Push: the stronger the preference for near goals, the slower")
     axis.spines[["top", "right"]].set_visible(False)
+    axis.legend(frameon=False, loc="lower left")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -87,7 +98,7 @@ def draw(path: Path) -> None:
 def main() -> None:
     """Writes the figure, and prints the correlation."""
     draw(PICTURE)
-    print(f"Spearman {correlation(points()):.2f}")
+    print(f"Spearman {correlation(points()):.2f}, with the paper's cycles {correlation(points(own=True)):.2f}")
 
 
 if __name__ == "__main__":

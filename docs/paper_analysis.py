@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -139,12 +139,16 @@ def number(p: float) -> str:
     return f"{p:.2f}" if p >= 0.095 else f"{p:.2g}"
 
 
-def of(scores: NDArray, digits: int = 3, statistic: Callable[..., float] = stats.interquartile_mean) -> str:
-    """Statistic of scores [S] with its bootstrap interval; "never" for an infinite epoch."""
-    values = (statistic(scores), *stats.bootstrap_interval(scores, statistic))
-    middle, low, high = (
-        f"{value:.{digits}f}" if digits else ("never" if math.isinf(value) else f"{value:g}") for value in values
-    )
+def mean_of(scores: NDArray) -> str:
+    """Mean of scores [S] with its Student's t interval at 95 %."""
+    half = t.ppf(0.975, len(scores) - 1) * scores.std(ddof=1) / math.sqrt(len(scores))
+    return f"{scores.mean():.3f} ({scores.mean() - half:.3f} to {scores.mean() + half:.3f})"
+
+
+def median_of(epochs: NDArray) -> str:
+    """Median of epochs [S], some of which may be infinite ("never"), with its bootstrap interval."""
+    values = (np.median(epochs), *stats.bootstrap_interval(epochs, np.median))
+    middle, low, high = ("never" if math.isinf(value) else f"{value:g}" for value in values)
     return f"{middle} ({low} to {high})" if middle != "never" or low != "never" else "never"
 
 

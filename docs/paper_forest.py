@@ -94,11 +94,11 @@ def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
 
 
 def _short(result: Compared) -> str:
-    """Name of a comparison in the picture: its setting, and its baseline unless that is `future`."""
+    """Name of a comparison in the picture: its setting, and its baseline unless that is the set's `future`."""
     setting, against = (result.comparison.setting, (result.comparison.against or ("", ""))[1])
     for name, word in WORDS.items():
         setting, against = setting.replace(name, word), against.replace(name, word)
-    return f"{setting}, against {against}" if against else setting
+    return f"{setting}, paper's cycles" if against == "future" else f"{setting}, against {against}" if against else setting
 
 
 def _panel(ax, lines: list[Line]) -> None:

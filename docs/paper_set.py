@@ -97,7 +97,8 @@ FAMILIES: dict[str, list[Comparison]] = {
     "eventful": [Comparison(task, f"eventful_{task}", "future, priority_fraction 0.5") for task in NAMES],
 }
 HEAD = (
-    "question | task | setting | against | epochs | mean success | 95 % interval | p | p, corrected | p, joint flips | verdict"
+    "question | task | setting | against | epochs | mean success | 95 % interval | p | p, corrected | p, joint flips"
+    " | spread | could be seen | verdict"
 )
 
 
@@ -162,7 +163,10 @@ def rows(data: Mapping[str, Sweeps], own_cycles: bool = False) -> list[list[str]
     for family, results in ((name, results) for name, results in compared(data).items() if name in wanted):
         for c, d, epochs, p, joint in results:
             cells = [NAMES[c.task], f"`{c.setting}`", f"`{_baseline(c)[1]}`", str(epochs), *signed(d)]
-            found.append([family, *cells, number(p), number(joint), verdict(d.low, d.high, p)])
+            spread = float(d.each.std(ddof=1))
+            seen = detectable(spread, len(d.each), 0.05 / len(FAMILIES[family]))
+            cells += [number(p), number(joint), f"{spread:.3f}", f"{seen:.3f}"]
+            found.append([family, *cells, verdict(d.low, d.high, p)])
     return found
 
 

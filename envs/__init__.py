@@ -98,8 +98,12 @@ _WRAPPERS = {
 
 def takes_engine(env: str | Callable[..., Any]) -> bool:
     """Whether the constructor of an environment, or of the one of this name, has the argument `engine`."""
-    parameters = inspect.signature(load("env", env)).parameters.values()
-    return any(parameter.name == "engine" or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    constructor = load("env", env)
+    parameters = inspect.signature(constructor).parameters
+    if "engine" in parameters or not any(one.kind is one.VAR_KEYWORD for one in parameters.values()):
+        return "engine" in parameters
+    bases = constructor.__mro__[1:-1] if inspect.isclass(constructor) else ()  # to which a class passes its **options
+    return not bases or any("engine" in inspect.signature(base).parameters for base in bases)
 
 
 def __getattr__(name: str) -> Any:

@@ -27,6 +27,11 @@ Positive = Annotated[float, Number("[1e-37, 3e38]")]
 NotNegative = Annotated[float, Number("[0, 3e38]")]  # programs compute in float32
 
 
+def plain(value: Any) -> Any:
+    """A scalar of NumPy or JAX as Python's, and any other value as it is."""
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Sizes that shape the compiled program. Runs with equal Configs can share one compilation.
@@ -84,6 +89,10 @@ class Config:
     renewable priorities that weigh each episode alone: of the built-in ones, td_error."""
     eval_episodes: Count = 100
     """Episodes of the deterministic evaluation after each epoch."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():  # run folders take no scalars of NumPy
+            object.__setattr__(self, name, tuple(map(plain, value)) if isinstance(value, tuple) else plain(value))
 
 
 class HParams(NamedTuple):

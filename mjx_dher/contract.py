@@ -55,7 +55,7 @@ def spec_and_template(env: Env) -> tuple[EnvSpec, Episode]:
 
 
 def _say(leaf: Any) -> Any:
-    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") else leaf
+    return leaf if hasattr(leaf, "item") or not hasattr(leaf, "shape") else f"{leaf.dtype}{list(leaf.shape)}"
 
 
 def episode_template(env: Env) -> Episode:
@@ -78,7 +78,6 @@ def check_env_parts(env: Any) -> None:
 def step_seconds(env: Any) -> float:
     """Seconds per step of `env`: its `dt`, or 0.04. Raises ValueError if `dt` is out of range."""
     dt: Any = getattr(env, "dt", STEP_SECONDS)
-    dt = dt.item() if getattr(dt, "shape", None) == () else dt  # a scalar of NumPy or JAX
     check_number("dt", dt, "(0, 3600]", float)
     return float(dt)
 
@@ -109,8 +108,9 @@ def check_first(state: Any, leading: tuple[int, ...]) -> None:
     achieved, desired = (jnp.shape(state.obs[name])[len(leading) :] for name in ("achieved_goal", "desired_goal"))
     if len(achieved) != 1 or achieved != desired:
         raise ValueError(f"reset: achieved_goal and desired_goal must be vectors [G]; they are {achieved} and {desired}")
-    if not jax.tree.leaves(state.obs["observation"]):
-        raise ValueError("reset: observation must have at least one array; it has none")
+    leaves = jax.tree.leaves(state.obs["observation"])
+    if not leaves or any(0 in jnp.shape(leaf) for leaf in leaves):
+        raise ValueError(f"reset: observation must have at least one array, and none that is empty; it is {leaves}")
 
 
 def check_with_goal(env: Any) -> None:

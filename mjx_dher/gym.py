@@ -325,7 +325,7 @@ def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:
         raise ValueError(f"action must have shape {space.shape}; got {actions.shape}")
     if not np.all(np.isfinite(actions)):
         raise ValueError(f"action must be finite; got {actions}")
-    return actions
+    return np.clip(actions, -1.0, 1.0)
 
 
 def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[int | None]:

@@ -51,8 +51,10 @@ def _update(
 ) -> NormalizerState | None:
     if state is None:
         return None
-    shape, ndim = state.mean.shape, values.ndim - state.mean.ndim
+    shape, ndim = state.mean.shape, _batch_axes(state, values)
     valid = jnp.ones((), bool) if valid is None else valid
+    if valid.dtype != bool:
+        raise ValueError(f"valid must be bool; it is {valid.dtype}")
     mask = jnp.broadcast_to(jnp.expand_dims(valid, range(valid.ndim, ndim)), values.shape[:ndim])
     mask = mask.reshape(-1, *(1,) * len(shape))
     values = jnp.clip(values.astype(state.mean.dtype), -clip, clip).reshape(-1, *shape)
@@ -70,6 +72,13 @@ def _update(
     )
 
 
+def _batch_axes(state: NormalizerState, values: Array) -> int:
+    shape, axes = state.mean.shape, values.ndim - state.mean.ndim
+    if axes < 0 or values.shape[axes:] != shape:
+        raise ValueError(f"values must have the moments' shape {list(shape)} in their last axes; got {list(values.shape)}")
+    return axes
+
+
 def normalize(state: PyTree, values: PyTree, eps: Array | float, clip: Array | float, input_clip: Array | float) -> PyTree:
     """Normalizes values: clips them to +- `input_clip`, subtracts the mean, divides by max(std, eps) and clips to +- `clip`.
 
@@ -81,7 +90,7 @@ def normalize(state: PyTree, values: PyTree, eps: Array | float, clip: Array | f
         if state is None:
             return values
         values = jnp.clip(values, -input_clip, input_clip)
-        leading = range(values.ndim - state.mean.ndim)
+        leading = range(_batch_axes(state, values))
         mean, std = (jnp.expand_dims(x, leading) for x in (state.mean, jnp.maximum(jnp.sqrt(state.var), eps)))
         return jnp.clip((values - mean) / std, -clip, clip)
 

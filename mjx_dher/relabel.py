@@ -15,6 +15,7 @@ from mjx_dher.priorities import Priority
 from mjx_dher.replay import Cumulative, Pool, ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey
+from mjx_dher.validation import check_count
 
 _CHOOSE = 0x43686F69  # folded into the key that chooses among transitions; no index of `jax.random.split`
 
@@ -148,6 +149,7 @@ def draw_batches(
       n_step: steps of a return (`look_ahead`).
       priority: priority. If it chooses among transitions, several candidates are drawn for each.
     """
+    check_count("n_step", n_step)
     number, sampler = math.prod(shape), samplers.make(sampler)
 
     def draw(count: int) -> tuple[Sample, Batch]:

@@ -199,4 +199,6 @@ def _with_goals(env: Any, first: Any, goals: Array) -> Any:
 def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
     """Splits one key, or keeps `num_envs` given ones. A raw key of `jax.random.PRNGKey` is two numbers."""
     one = 0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1
+    if key.ndim > one and len(key) != num_envs:
+        raise ValueError(f"key must be one key or [{num_envs}], one for each environment; got [{len(key)}]")
     return key if key.ndim > one else jax.random.split(key, num_envs)

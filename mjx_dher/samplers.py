@@ -124,12 +124,13 @@ def make(
     Raises:
       ValueError: an argument is unknown or invalid. The message suggests the nearest name.
     """
-    if not isinstance(name, str):
-        return _to_sampler(name)
-    sampler, row = components.load("sampler", name), components.COMPONENTS["sampler"].get(name)
+    sampler = components.load("sampler", name)
+    row = components.COMPONENTS["sampler"].get(name) if isinstance(name, str) else None
     if (weighs := row is not None and "weight_kernel" in row.reads) or (kernel, normalization) != ("linear", "mean"):
         kernel = components.load("weight_kernel", kernel, "relative", "temperature")
         normalization = components.load("weight_normalization", normalization, "distance", "candidates", "scale")
+    if metric != "position":
+        metric = components.load("metric", metric, "achieved", "desired")
     if row is None or "metric" not in row.reads:
         return _to_sampler(sampler)
     if weighs:

@@ -165,8 +165,8 @@ def _to_text(value: Argument) -> str:
 
 
 def _to_argument(value: str) -> Argument:
-    if value in ("true", "false"):
-        return value == "true"
+    if value.lower() in ("true", "false"):
+        return value.lower() == "true"
     if value.startswith('"') and value.endswith('"'):
         with contextlib.suppress(ValueError):
             return str(json.loads(value))
@@ -227,7 +227,7 @@ def _checks(spec: RunSpec, episode_length: Any) -> list[tuple[Any, ...]]:
     return [
         (to_arguments, spec.env_kwargs),
         (validation.validate, spec.config, spec.hparams, episode_length),
-        (validation.check_number, "seed", spec.seed, "[0, 4294967295]"),
+        (validation.check_seed, spec.seed),
         (check_name, "engine", spec.engine, ENGINES),
     ]
 

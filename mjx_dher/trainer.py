@@ -21,6 +21,7 @@ from mjx_dher.config import Config, HParams
 from mjx_dher.context import Context
 from mjx_dher.contract import check_with_goal, spec_and_template
 from mjx_dher.learners import Learner
+from mjx_dher.lookup import check_function
 from mjx_dher.parallel import split
 from mjx_dher.parallel.split import AxisName
 from mjx_dher.priorities import Priority, PriorityFn
@@ -149,6 +150,7 @@ def make_train(
     if problem := validation.delay_problem(config, learners.policy_delay(loop.learner)):
         raise ValueError(problem)
     if generator is not None:
+        check_function("generator", generator, ("key", "obs", "ring", "context"))
         check_with_goal(env)
     if loop.uses_values:
         learners.check_values(loop.learner)

@@ -92,8 +92,8 @@ class EnvSpec:
     def __post_init__(self) -> None:
         for name in ("goal_size", "action_size", "episode_length"):
             check_size(name, getattr(self, name))
-        low, high = self.reward_range
-        if not low < high:
+        bounds = self.reward_range
+        if not (isinstance(bounds, tuple) and len(bounds) == 2 and bounds[0] < bounds[1]):
             raise ValueError(f"reward_range must be (low, high) with low < high; got {self.reward_range}")
         if self.ends_at_goal and not self.ends:
             raise ValueError("ends must be True if ends_at_goal is True; got False")

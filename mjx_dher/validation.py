@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from mjx_dher.config import Config, HParams, Number, episodes_capacity, metadata, num_epochs, steps_per_epoch
+from mjx_dher.config import Config, HParams, Number, episodes_capacity, metadata, num_epochs, plain, steps_per_epoch
 from mjx_dher.lookup import check_name
 
 _INT32_MAX = 2**31 - 1  # counters on the device are int32
@@ -77,6 +77,11 @@ def check_count(field: str, value: Any) -> None:
     check_number(field, value, "[1, 1000000]")
 
 
+def check_seed(seed: Any) -> None:
+    """Raises ValueError unless `seed` is one of a random key, 32 bits."""
+    check_number("seed", seed, "[0, 4294967295]")
+
+
 def validate(config: Config, hparams: HParams, episode_length: int) -> None:
     """Checks sizes and numbers of a run. Arrays of numbers, one per seed, are not checked. Raises ValueError with each invalid
     field, its value and the allowed values.
@@ -112,7 +117,9 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
                 yield f"{name} must be 1 to 100 integers in {number.interval}; got {value!r}"
             else:
                 yield from filter(None, (_number_problem(name, size, number, int) for size in value))
-        elif not hasattr(value, "dtype") and (problem := _number_problem(name, value, number, hints[name])):
+        elif hasattr(value, "at") or getattr(value, "ndim", None):  # of JAX, perhaps traced, or one number for each run
+            continue
+        elif problem := _number_problem(name, value, number, hints[name]):
             yield problem
     for name, hint in hints.items():
         if get_origin(hint) is Literal:
@@ -123,6 +130,7 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
+    value = plain(value)
     allowed = (int,) if kind is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, allowed):
         what = "an integer" if kind is int else "a number"

@@ -341,8 +341,8 @@ def test_a_fault_is_told_when_any_copy_restarts(monkeypatch):
     many.reset(seed=0)
     checks = Counter()
     monkeypatch.setattr(many._compiled.env, "check", lambda: checks.update(made=1), raising=False)
-    one_ends = np.array([[1.5, 0.0], [0.0, 0.0]])
-    assert many.step(one_ends)[3].tolist() == [True, False]
+    many.step(one_moves := np.array([[0.75, 0.0], [0.0, 0.0]]))
+    assert many.step(one_moves)[3].tolist() == [True, False]
     assert not checks
     many.step(np.zeros((2, 2)))
     assert checks["made"] == 1

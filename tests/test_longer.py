@@ -2,6 +2,7 @@
 
 import json
 import sys
+from unittest.mock import Mock
 
 import pytest
 from configs import SHORT, flags
@@ -11,7 +12,7 @@ from test_driver import result_of, rows_of
 
 import mjx_dher
 from mjx_dher import Options, RunSpec, cli
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import loggers, run_folder
 from point_mass import PointMass
 
 FLAGS = [*flags(SHORT), "--final-episodes", "4", "--no-curve"]
@@ -50,6 +51,16 @@ def test_no_more_steps_are_nothing_to_go_on_for(kept, more, capsys):
     assert cli.main(["resume", str(kept), *more]) == 2
     assert "has ended after 200 environment steps; total_steps must be larger to resume it" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
+
+
+def test_a_log_that_cannot_start_leaves_a_run_as_it_was(kept, tmp_path, monkeypatch, capsys):
+    before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
+    monkeypatch.setattr(loggers, "TensorBoardSink", Mock(side_effect=ValueError("log tensorboard cannot start")))
+    assert cli.main(["resume", str(kept), "--total-steps", "240", "--log", "tensorboard"]) == 2
+    assert "log tensorboard cannot start" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before
+    assert cli.main([*FLAGS, "--log", "tensorboard", "--out", str(tmp_path / "new")]) == 2
+    assert cli.main([*FLAGS, "--total-steps", "40", "--out", str(tmp_path / "new")]) == 0  # the folder is free
 
 
 def test_a_run_that_kept_nothing_says_how_to_train_a_longer_one(tmp_path, capsys):

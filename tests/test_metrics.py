@@ -13,7 +13,7 @@ from conftest import refuses
 from mjx_dher import HParams, Options, RunSpec, spec, trainer
 from mjx_dher.context import Context
 from mjx_dher.runs import loop
-from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.folder import loggers, results, run_folder
 from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass
@@ -38,6 +38,23 @@ def test_csv_goes_on_after_the_epochs_that_had_ended(tmp_path):
     assert path.read_bytes() == in_one_go
     with path.open() as file:
         assert [r["epoch"] for r in csv.DictReader(file)] == ["1", "2", "3", "4"]
+
+
+def test_csv_has_every_metric_of_a_learner_that_was_changed(tmp_path):
+    path = tmp_path / "metrics.csv"
+    sink = loggers.CsvSink(path, digest="before")
+    for epoch in (1, 2):
+        sink.write(row(epoch, old_loss=0.5))
+    sink.close()
+    for _ in range(2):  # it goes on from the first epoch twice
+        sink = loggers.CsvSink(path, epochs=1, digest="after")
+        sink.write(row(2, new_loss=0.25))
+        sink.close()
+        first, second = results.read_rows(path)
+        assert (first["old_loss"], first["digest"], second["new_loss"], second["digest"]) == (0.5, "before", 0.25, "after")
+        assert math.isnan(first["new_loss"])
+        assert math.isnan(second["old_loss"])
+        assert list(first)[-1] == "digest"
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[:-20], lambda b: b.replace(b"\n2,", b"\n7,"), lambda b: b""])

@@ -103,6 +103,15 @@ def test_tables_of_comparisons_are_those_of_their_reports(page):
     assert {row.seeds for row in rows} == {page.seeds}
 
 
+def test_the_verdicts_that_joint_flips_would_change_are_named():
+    page = " ".join((ROOT / "docs" / "what_helps.md").read_text().split())
+    rows = [row for page in make_comparison_tables.PAGES for row in make_comparison_tables.read(page)]
+    changed = [row for row in rows if row.p_value == row.p_value and (row.p_corrected < 0.05) != (row.p_joint < 0.05)]
+    shown = {"not_misleading": "PickAndPlace", "energy": "Slide", "tqc_k4": "Push", "k1": "hand_reach", "k8": "hand_reach"}
+    assert {row.arm: make_comparison_tables.NAMES.get(row.task, row.task) for row in changed} == shown
+    assert all(f"({row.p_joint:.3f})" in page for row in changed)
+
+
 def test_a_page_without_one_place_for_a_table_is_refused():
     for page in ("", "<!-- a: docs/x.py -->\n", 2 * "<!-- a: docs/x.py -->\n<!-- end of a -->\n"):
         with refuses("a"):
@@ -132,7 +141,10 @@ def test_loss_grows_with_the_preference_for_near_goals():
     found = make_preference_figure.points()
     assert len(found) == 13
     page = (ROOT / "docs" / "results.md").read_text()
-    assert f"Spearman {make_preference_figure.correlation(found):.2f}" in page
+    own = make_preference_figure.points(own=True)
+    assert len(own) == 10
+    for points in (found, own):
+        assert f"Spearman {make_preference_figure.correlation(points):.2f}" in page
     ranks = [np.argsort(np.argsort(values)) for values in ([p.share for p in found], [p.gain.mean for p in found])]
     assert np.corrcoef(*ranks)[0, 1] < -0.85  # ties, of `max` and `minmax`, apart
     push = paper_set.load_set(paper_set.FOLDER)["push"]

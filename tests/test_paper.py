@@ -141,12 +141,12 @@ def test_verdicts_by_hand(tmp_path):
     assert rows[1][5] == "+0.010"
     assert rows[2][5] == "-0.100"
     # No family is whole. What has not been run counts as 1: of 2/1024, 2/1024 and 1, and of 2/1024 and 1.
-    assert [[row[8], row[10]] for row in rows] == [["0.0059", "better"], ["0.0059", "better"], ["0.0039", "worse"]]
+    assert [[row[8], row[-1]] for row in rows] == [["0.0059", "better"], ["0.0059", "better"], ["0.0039", "worse"]]
     assert [row[9] for row in rows] == ["0.002"] * 3  # all flips but two are less extreme, for both comparisons together
     write_curves(tmp_path, "pick_and_place", {("pick_and_place", name): 0.5 for name in ("future", "weighted")})
     rows = paper_set.rows(paper_set.load_set(tmp_path))
     # Of 2/1024, 2/1024 and 1: Holm gives 6/1024, 6/1024 and 1.
-    assert [(row[1], row[8], row[10]) for row in rows[:3]] == [
+    assert [(row[1], row[8], row[-1]) for row in rows[:3]] == [
         ("Push", "0.0059", "better"),
         ("PickAndPlace", "1.00", "alike"),
         ("Slide", "0.0059", "better"),

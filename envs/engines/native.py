@@ -131,7 +131,7 @@ class Simulator:
         """State `substeps` timesteps later, under `ctrl` [nu] if given.
 
         As in `mj_step`, derived fields describe the state before the last timestep; `forward` updates them. A simulation that
-        diverges is not reset: its numbers are no longer finite.
+        diverges is not reset: its numbers are no longer finite, nor are they under a control that is NaN or above 1e10.
 
         Raises:
           ValueError: a field does not have the model's shape.
@@ -202,6 +202,8 @@ class Simulator:
         if lost := chosen.lost():
             self._note_lost(lost)
         chosen.read(results)
+        if function == "step" and not (good := np.abs(rows[:, self._layout.places["ctrl"][0]]) <= mujoco.mjMAXVAL).all():
+            results[~good.all(axis=1)] = math.nan  # MuJoCo takes 0 for all controls if one is NaN or too large, and only warns
         seconds = time.perf_counter() - begun
         if chosen.seconds:  # a call that waited for other processes does not count
             seconds = min(seconds, 1.1 * chosen.seconds)

@@ -19,13 +19,13 @@ from mjx_dher.policy import bundled
 from mjx_dher.runs.folder import reading, run_folder
 from mjx_dher.spec import ENGINES, RunSpec, to_arguments, to_texts
 from mjx_dher.system.machine import check_platform, keep_compiled_programs
-from mjx_dher.validation import check_count, check_number
+from mjx_dher.validation import check_count, check_seed
 
 
 def check_play(seed: int, engine: str | None, episodes: int = 1, env_kwargs: Sequence[str] = ()) -> None:
     """Raises ValueError for an invalid option of a command that plays episodes."""
     check_count("episodes", episodes)
-    check_number("seed", seed, "[0, 4294967295]")
+    check_seed(seed)
     if engine is not None:
         check_name("engine", engine, ENGINES)
     to_arguments(env_kwargs)

@@ -15,7 +15,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from mjx_dher.parallel.split import AxisName
 from mjx_dher.types import PRNGKey
-from mjx_dher.validation import check_devices
+from mjx_dher.validation import check_count, check_devices
 
 LANES, DATA = "lanes", "data"
 
@@ -94,6 +94,7 @@ def most_lanes(lanes: int | None, devices: Sequence[Any]) -> int | None:
     number = max(1, len(devices))
     if lanes is None:
         return number if jax.default_backend() == "cpu" else None
+    check_count("lanes", lanes)
     if lanes % number and number % lanes:
         fewer = [str(n) for n in range(1, number) if number % n == 0]
         raise ValueError(f"lanes must be a multiple of {number}, the devices, or {', '.join(fewer)}; got {lanes}")

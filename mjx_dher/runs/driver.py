@@ -7,7 +7,7 @@ Runs that differ only in `spec._LANE_FIELDS` are *lanes* of one vmapped program.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,7 +128,7 @@ def train_runs(
         `stop_at` or `keep_end` is given for several runs.
       FolderError: a run has ended, another process trains it, or its folder is not writable, in a run's checkpoints, or moved.
     """
-    options = options or Options()
+    options, folders = options or Options(), [Path(folder) for folder in folders]
     _check_runs(env, specs, folders, options, sweep)
     placed_on = mesh.find(devices)
     shared = folders[0].parent / "unfinished" if shared is None else shared
@@ -141,7 +141,7 @@ def train_runs(
         return []
     if len(waiting) == 1 and not sweep:  # before compilation
         saved = [run_folder.epoch_of(path) for path in run_folder.checkpoints(waiting[0][1])]
-        _refuse_ended(specs[0], saved, config_lib.num_epochs(specs[0].config, env.episode_length))
+        loop.refuse_ended(specs[0].config, env.episode_length, saved)
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
         program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
@@ -196,16 +196,14 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     num_epochs = config_lib.num_epochs(specs[0].config, session.env.episode_length)
     will_save = 0 < options.checkpoint_every < num_epochs
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
-    _refuse_ended(specs[0], [start.epoch], num_epochs)
-    for folder in folders if processes.leads() else ():  # before any file that a result describes changes
-        (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
-        files.flush(folder)
+    loop.refuse_ended(specs[0].config, session.env.episode_length, [start.epoch])
     report_once = functools.cache(session.report)
     watch = _Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
-        own = zip(ended, specs, folders, runs) if processes.leads() else ()
-        logs = [_open(stack, session, program.lanes, *run) for run in own]
+        own = [*zip(ended, specs, folders, runs)] if processes.leads() else []
+        with _kept_unless_opened(folders if own else ()):
+            logs = [_open(stack, session, program.lanes, *run) for run in own]
         success = processes.broadcast(lambda: _success_rates(folders[0], start.epoch))  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
         for progress in loop.run(session.env, specs[0].config, program.compiled, start):
@@ -250,13 +248,20 @@ def _success_rates(folder: Path, ended: int) -> list[float]:
     return [row["success_rate"] for row in results.read_metrics(folder)]
 
 
-def _refuse_ended(spec: RunSpec, ended: Sequence[int], num_epochs: int) -> None:
-    """Raises ValueError if all epochs of `total_steps` had `ended` at each checkpoint, of which the newest may be damaged."""
-    if ended and min(ended) >= num_epochs:
-        raise ValueError(
-            f"nothing is left to train: {max(ended)} epochs have ended, and total_steps {spec.config.total_steps} takes"
-            f" {num_epochs}"
-        )
+@contextlib.contextmanager
+def _kept_unless_opened(folders: Sequence[Path]) -> Iterator[None]:
+    """Removes results, because what they describe will change. If an exception ends the block, the folders are as before."""
+    names = (run_folder.RESULT_FILE, run_folder.CONFIG_FILE, run_folder.METRICS_FILE)
+    before = {path: path.read_bytes() if path.exists() else None for folder in folders for path in map(folder.joinpath, names)}
+    try:
+        for folder in folders:
+            (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
+            files.flush(folder)
+        yield
+    except Exception:
+        for path, content in before.items():
+            path.unlink(missing_ok=True) if content is None else files.write(path, content)
+        raise
 
 
 def _open(

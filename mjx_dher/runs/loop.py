@@ -3,7 +3,7 @@
 import concurrent.futures
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -75,10 +75,13 @@ def train(
       **parts: sampler, priority and learner, as in `make_train`.
 
     Raises:
-      ValueError: invalid Config or HParams, too little memory, missing devices, or an error of `env.check`.
+      ValueError: invalid Config, HParams or seed, nothing left to train, too little memory, missing devices, or an error of
+        `env.check`.
     """
     hparams = HParams() if hparams is None else hparams
     validation.validate(config, hparams, env.episode_length)
+    validation.check_seed(seed)
+    refuse_ended(config, env.episode_length, [] if start is None else [start.epoch])
     layout = mesh.arrange(mesh.find(devices), 1)
     validation.check_plan(config, env.episode_length, layout.shards)
     program = make_train(env, config_lib.of_one_device(config, layout.shards), axis_name=layout.axis_name, **parts)
@@ -89,6 +92,14 @@ def train(
     check_steps(env)
     for progress in run(env, config, compiled, start or Start(compiled.init(key, hparams))):
         yield progress._replace(metrics={name: float(f"{x:.6g}") for name, x in progress.metrics.items()})
+
+
+def refuse_ended(config: Config, episode_length: int, ended: Sequence[int]) -> None:
+    """Raises ValueError if all epochs of `total_steps` had `ended` at each checkpoint, of which the newest may be damaged."""
+    if ended and min(ended) >= (num_epochs := config_lib.num_epochs(config, episode_length)):
+        raise ValueError(
+            f"nothing is left to train: {max(ended)} epochs have ended, and total_steps {config.total_steps} takes {num_epochs}"
+        )
 
 
 def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[Progress]:

@@ -1,6 +1,7 @@
 """A run's metrics: failures and warnings that they show, and loggers (CSV, JSON lines, TensorBoard, Weights & Biases)."""
 
 import csv
+import io
 import json
 import math
 import os
@@ -24,28 +25,25 @@ DIGEST = "digest"  # the last column of metrics.csv
 class CsvSink:
     """metrics.csv, with one line per epoch, written before the next epoch begins. The last column is the run's digest.
 
-    If a run resumes after some epochs, later lines are removed. Raises FolderError if the file lacks lines of these epochs.
+    If a run resumes after some epochs, later lines are removed. Metrics that its learner did not report then get columns, and
+    those that it no longer reports are nan. Raises FolderError if the file lacks lines of these epochs.
     """
 
     def __init__(self, path: Path, epochs: int = 0, digest: str = ""):
         self._writer: csv.DictWriter[str] | None = None
-        self._digest = digest
-        kept: list[str] = []
+        self._path, self._digest = path, digest
+        self._kept: list[str] = []
         if epochs:
             from mjx_dher.runs.folder import results
 
             if (whole := len(results.read_rows(path))) < epochs:
                 raise FolderError(f"{path} is damaged: {epochs} epochs had ended, but it has complete lines of only {whole}")
-            kept = results.whole_lines(path)[: 1 + epochs]
-        files.write(path, "".join(kept).encode())
-        self._file = path.open("a", newline="", encoding="utf-8")
-        if kept:
-            self._writer = self._make_writer(kept[0].strip().split(","))
+            self._kept = results.whole_lines(path)[: 1 + epochs]
+        self._write_all("".join(self._kept))
 
     def write(self, row: dict[str, Any]) -> None:
         if self._writer is None:
-            self._writer = self._make_writer([*FIRST_COLUMNS, *(name for name in row if name not in FIRST_COLUMNS), DIGEST])
-            self._writer.writeheader()
+            self._writer = self._begin(row)
         values = {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
         self._writer.writerow({**values, DIGEST: self._digest})
         self._file.flush()
@@ -53,8 +51,23 @@ class CsvSink:
     def close(self) -> None:
         self._file.close()
 
-    def _make_writer(self, columns: Sequence[str]) -> "csv.DictWriter[str]":
-        return csv.DictWriter(self._file, columns, extrasaction="ignore")  # a resumed run keeps its file's columns
+    def _write_all(self, lines: str) -> None:
+        files.write(self._path, lines.encode())
+        self._file = self._path.open("a", newline="", encoding="utf-8")
+
+    def _begin(self, row: dict[str, Any]) -> "csv.DictWriter[str]":
+        """Writes the head, and the lines of a resumed run again if `row` has other metrics."""
+        kept, lines = csv.DictReader(self._kept), io.StringIO(newline="")
+        columns = list(kept.fieldnames or (*FIRST_COLUMNS, DIGEST))
+        new = [name for name in row if name not in columns]
+        if new or not self._kept:
+            columns[-1:] = *new, columns[-1]
+            writer = csv.DictWriter(lines, columns, restval="nan")
+            writer.writeheader()
+            writer.writerows(kept)
+            self._file.close()
+            self._write_all(lines.getvalue())
+        return csv.DictWriter(self._file, columns, restval="nan", extrasaction="ignore")  # older files have no digest
 
 
 class JsonlSink:

@@ -1,0 +1,172 @@
+"""Numbers of the tables in docs/results.md and docs/what_helps.md from the committed files, by scipy and plain loops."""
+
+import csv
+import itertools
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from conftest import ROOT
+
+THRESHOLD = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
+LAST = {"push": 10, "pick_and_place": 10, "slide": 20}
+NAMES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide"}
+
+
+@pytest.fixture(scope="module")
+def curves():
+    """Success [epochs] by task, sweep, setting and seed."""
+    found = {}
+    for task in NAMES:
+        with (ROOT / "docs" / "paper" / f"{task}_curves.csv").open() as file:
+            for row in csv.DictReader(file):
+                by_seed = found.setdefault((task, row["sweep"], row["setting"]), {})
+                by_seed.setdefault(int(row["seed"]), []).append(float(row["success_rate"]))
+    return found
+
+
+def rows_of(page, name):
+    """Cells of a table between its comments. Empty first cells are those of the line above."""
+    text = (ROOT / "docs" / page).read_text().partition(f"<!-- {name}: ")[2].partition(f"<!-- end of {name} -->")[0]
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[1:] if line.startswith("|")]
+    for before, row in itertools.pairwise(found):
+        row[0] = row[0] or before[0]
+    return found[2:]
+
+
+def area(curve):
+    return np.trapezoid(curve) / (len(curve) - 1)
+
+
+def epoch_of(curve, threshold):
+    return next((epoch for epoch, success in enumerate(curve, 1) if success >= threshold), math.inf)
+
+
+def said(values):
+    """Mean and Student's t interval, as the pages write them."""
+    low, high = scipy.stats.t.interval(0.95, len(values) - 1, np.mean(values), scipy.stats.sem(values))
+    return f"{np.mean(values):.3f} ({low:.3f} to {high:.3f})"
+
+
+def p_of(differences):
+    """Two-sided, by flips of signs: all of them with ten seeds, and 30,000 with twenty."""
+    flips = np.inf if len(differences) <= 10 else 30_000
+    test = scipy.stats.permutation_test((differences,), np.mean, permutation_type="samples", n_resamples=flips, rng=0)
+    return float(test.pvalue)
+
+
+def by_holm(p_values):
+    """By Holm's procedure, step by step."""
+    found, least = {}, 0.0
+    for rank, at in enumerate(np.argsort(p_values)):
+        found[at] = least = max(least, min(1.0, (len(p_values) - rank) * p_values[at]))
+    return [found[at] for at in range(len(p_values))]
+
+
+def test_the_table_of_samplers(curves):
+    rows = rows_of("results.md", "samplers")
+    assert len(rows) == 8
+    for task, sampler, late, mean, epochs, there, better in rows:
+        name = next(task_name for task_name, shown in NAMES.items() if shown == task)
+        sweep = "own_methods" if "closest" in sampler else f"own_{name}"
+        own, base = list(curves[name, sweep, sampler.strip("`")].values()), list(curves[name, f"own_{name}", "future"].values())
+        assert late == said([np.mean(curve[-LAST[name] :]) for curve in own])
+        assert mean == said([area(curve) for curve in own])
+        reached = [epoch_of(curve, THRESHOLD[name]) for curve in own]
+        assert epochs.startswith(f"{np.median(reached):g} (")
+        assert there == f"{np.isfinite(reached).sum()} of {len(own)}"
+        u = scipy.stats.mannwhitneyu([area(curve) for curve in own], [area(curve) for curve in base]).statistic
+        assert better == ("" if sampler == "`future`" else f"{u / len(own) / len(base):.2f}")
+
+
+def test_the_table_of_single_pairs(curves):
+    for task, least, sooner, later, same in rows_of("results.md", "lottery"):
+        name = next(task_name for task_name, shown in NAMES.items() if shown == task)
+        weighted, future = (
+            [epoch_of(curve, 0.9) for curve in curves[name, f"own_{name}", setting].values()]
+            for setting in ("weighted", "future")
+        )
+        gains = [theirs - own for own in weighted for theirs in future]
+        assert sooner == f"{sum(gain >= int(least) for gain in gains)} of {len(gains)}"
+        assert later == f"{sum(gain <= -int(least) for gain in gains)} of {len(gains)}"
+        others = [b - a for i, a in enumerate(future) for j, b in enumerate(future) if i != j]
+        assert same == f"{sum(gain >= int(least) for gain in others)} of {len(others)}"
+
+
+# claim of the verdicts' table, its family of (task, sweep and setting, baseline's), and its place there
+FAMILIES = [
+    [(task, (f"own_{task}", "weighted"), (f"own_{task}", "future")) for task in NAMES],
+    [("push", ("own_methods", name), ("own_push", "future")) for name in ("closest", "epsilon_closest")],
+    [(task, (f"k_{task}", "future, her_k 16"), (f"k_{task}", "future, her_k 8")) for task in NAMES],
+]
+CLAIMS = {
+    "Push: `weighted` converges sooner": (0, 0),
+    "PickAndPlace: `weighted` converges sooner": (0, 1),
+    "Slide: no noticeable difference": (0, 2),
+    "Push: `epsilon_closest` is behind `future`": (1, 1),
+    "Push: k 16 is worse": (2, 0),
+    "PickAndPlace: k 16 is worse": (2, 1),
+    "Slide: k 16 is worse": (2, 2),
+}
+
+
+def gains_of(curves, task, own, base):
+    a, b = curves[task, *own], curves[task, *base]
+    epochs = min(len(curve) for curve in (*a.values(), *b.values()))
+    return np.array([area(a[seed][:epochs]) - area(b[seed][:epochs]) for seed in a])
+
+
+def test_the_table_of_verdicts(curves):
+    rows = {row[0]: row for row in rows_of("results.md", "verdicts")}
+    for claim, (family, place) in CLAIMS.items():
+        (row,) = (row for name, row in rows.items() if name.startswith(claim))
+        gains = [gains_of(curves, *comparison) for comparison in FAMILIES[family]]
+        own = gains[place]
+        low, high = scipy.stats.t.interval(0.95, len(own) - 1, own.mean(), scipy.stats.sem(own))
+        assert row[3:5] == [f"mean success {own.mean():+.3f}", f"{low:+.3f} to {high:+.3f}"]
+        assert row[1] == str(len(own))
+        corrected = by_holm([p_of(each) for each in gains])[place]
+        assert float(row[5]) == pytest.approx(corrected, rel=0.05)
+        worst = claim.startswith("Slide: no") or max(abs(low), abs(high)) > 0.02
+        shown = ("not shown" if worst else "**alike**") if corrected >= 0.05 else "**"
+        assert row[6].startswith(shown)
+
+
+def test_the_epochs_that_weighted_is_sooner(curves):
+    shown = [row for row in rows_of("results.md", "verdicts") if row[0].startswith("...")]
+    levels = [("push", 0.2), ("push", 0.9), ("pick_and_place", 0.2), ("pick_and_place", 0.9)]
+    for row, (task, level) in zip(shown, levels, strict=True):
+        own, base = curves[task, f"own_{task}", "weighted"], curves[task, f"own_{task}", "future"]
+        sooner = [epoch_of(base[seed], level) - epoch_of(own[seed], level) for seed in own]
+        low, high = scipy.stats.t.interval(0.95, len(sooner) - 1, np.mean(sooner), scipy.stats.sem(sooner))
+        assert row[3:5] == [f"{np.mean(sooner):+.1f} epochs sooner", f"{low:+.1f} to {high:+.1f}"]
+
+
+def test_effects_of_what_helps(curves):
+    """Differences of mean success of ten pairs, as its table of effects has them."""
+    text = (ROOT / "docs" / "what_helps.md").read_text()
+    cells = {line.split("|")[1].strip(): line.split("|")[2:5] for line in text.splitlines() if line.startswith("| ")}
+    of_paper = {
+        "k 8 in place of 4, one cycle per epoch": ("k_{}", "future, her_k 8", None),
+        "k 16 in place of 4 (over 30 epochs +0.094 and +0.059)": ("k_{}", "future, her_k 16", None),
+        "k 16 in place of 4, paper's cycles": ("k_own_{}", "future, her_k 16", "own_{}"),
+        "`closest` in place of `future`, paper's cycles, ten pairs": ("own_methods", "closest", "own_{}"),
+    }
+    for change, (sweep, setting, base) in of_paper.items():
+        for task, cell in zip(NAMES, cells[change]):
+            if cell.strip().startswith(("+", "-")):
+                former = base.format(task) if base else {"push": "samplers"}.get(task, task)
+                gains = gains_of(curves, task, (sweep.format(task), setting), (former, "future"))
+                assert cell.strip() == f"{gains.mean():+.3f}", (change, task)
+    runs = {}
+    with (ROOT / "docs" / "ablation_runs.csv").open() as file:
+        for row in csv.DictReader(file):
+            runs.setdefault((row["task"], row["arm"]), {})[row["seed"]] = float(row["mean_success"])
+    arms = {"half of the updates, preset `gpu`": "half_updates", "half of the batch": "half_batch"}
+    arms |= {"half of the width": "half_width", "returns of one step in place of three": "one_step"}
+    for change, arm in arms.items():
+        for task, cell in zip(NAMES, cells[change]):
+            if cell.strip().startswith(("+", "-")):
+                gains = [runs[task, arm][seed] - runs[task, "preset"][seed] for seed in runs[task, arm]]
+                assert cell.strip() == f"{np.mean(gains):+.3f}", (change, task)
