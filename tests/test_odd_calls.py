@@ -16,6 +16,7 @@ from mjx_dher.envs import Simulator
 from mjx_dher.parallel import mesh
 from mjx_dher.rollout import rollout
 from mjx_dher.runs import loop
+from mjx_dher.runs.folder import results
 from mjx_dher.types import EnvSpec
 from point_mass import PointMass
 
@@ -137,6 +138,12 @@ def test_one_key_or_one_for_each_environment():
 def test_lanes_are_a_number_of_runs(lanes):
     with refuses("lanes", lanes):
         mesh.most_lanes(lanes, ())
+
+
+@pytest.mark.parametrize(("placed", "episodes"), [({}, 5), ({"devices": 2, "lanes": 1}, 6), ({"devices": 4, "lanes": 2}, 6)])
+def test_devices_that_share_a_run_evaluate_as_many_episodes_each(placed, episodes, tmp_path):
+    spec = RunSpec(config=Config(eval_episodes=5))
+    assert results.Record(tmp_path, placed, spec, [], {}).eval_episodes == episodes
 
 
 def test_names_and_numbers_of_parts_are_checked_at_once():

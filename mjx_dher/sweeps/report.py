@@ -74,7 +74,7 @@ def _numbers(curve: Record) -> Iterator[tuple[str, str]]:
         yield f"success of {result['episodes']} episodes (95 % interval {interval})", f"{result['success_rate']:.3f}"
         yield "already at the reset", f"{result['reset_success_rate']:.3f}"
     elif last:
-        yield f"success of the last evaluation ({curve.spec.config.eval_episodes} episodes)", f"{last['success_rate']:.3f}"
+        yield f"success of the last evaluation ({curve.eval_episodes} episodes)", f"{last['success_rate']:.3f}"
     if last:
         yield "environment steps", f"{last['env_steps']:,}"
         yield "updates", f"{last['updates']:,}"

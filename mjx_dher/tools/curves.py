@@ -79,7 +79,7 @@ def draw_curve(curve: Record) -> Any:
 
 def _draw_success(axis: Any, curve: Record, steps: NDArray) -> None:
     """Draws the success of evaluation, exploration, final evaluation and resets."""
-    rates, episodes = curve.column("success_rate"), curve.spec.config.eval_episodes
+    rates, episodes = curve.column("success_rate"), curve.eval_episodes
     bounds = [wilson_interval(round(rate * episodes), episodes) if np.isfinite(rate) else (0.0, 1.0) for rate in rates]
     low, high = np.reshape(bounds, (-1, 2)).T
     axis.fill_between(steps, low, high, color="#000000", alpha=0.13, linewidth=0)

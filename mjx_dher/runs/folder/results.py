@@ -135,6 +135,12 @@ class Record(NamedTuple):
         """Finished, failed or not ended."""
         return str(self.result.get("status", "not ended"))
 
+    @property
+    def eval_episodes(self) -> int:
+        """Episodes of an evaluation. Each of the devices that share a run plays as many."""
+        sharers = max(1, self.content.get("devices", 1) // self.content.get("lanes", 1))
+        return math.ceil(self.spec.config.eval_episodes / sharers) * sharers
+
     def column(self, name: str) -> NDArray:
         """A metric of all epochs, shape [P]; NaN if an epoch lacks it."""
         return np.array([row.get(name, math.nan) for row in self.rows], float)
