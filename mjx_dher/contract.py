@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mjx_dher.config import plain
 from mjx_dher.types import Env, EnvSpec, Episode, check_size
 from mjx_dher.validation import check_number
 
@@ -77,7 +78,7 @@ def check_env_parts(env: Any) -> None:
 
 def step_seconds(env: Any) -> float:
     """Seconds per step of `env`: its `dt`, or 0.04. Raises ValueError if `dt` is out of range."""
-    dt: Any = getattr(env, "dt", STEP_SECONDS)
+    dt = plain(getattr(env, "dt", STEP_SECONDS))
     check_number("dt", dt, "(0, 3600]", float)
     return float(dt)
 

@@ -86,7 +86,7 @@ def validate(config: Config, hparams: HParams, episode_length: int) -> None:
     """Checks sizes and numbers of a run. Arrays of numbers, one per seed, are not checked. Raises ValueError with each invalid
     field, its value and the allowed values.
     """
-    check_count("episode_length", episode_length)
+    check_count("episode_length", plain(episode_length))
     problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
     problems += _field_problems(hparams)
     if problems:
@@ -119,7 +119,7 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
                 yield from filter(None, (_number_problem(name, size, number, int) for size in value))
         elif hasattr(value, "at") or getattr(value, "ndim", None):  # of JAX, perhaps traced, or one number for each run
             continue
-        elif problem := _number_problem(name, value, number, hints[name]):
+        elif problem := _number_problem(name, plain(value), number, hints[name]):
             yield problem
     for name, hint in hints.items():
         if get_origin(hint) is Literal:
@@ -130,7 +130,6 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
-    value = plain(value)
     allowed = (int,) if kind is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, allowed):
         what = "an integer" if kind is int else "a number"

@@ -1,7 +1,6 @@
 """Calls from Python with values that are nearly right: NumPy's scalars, other shapes, names, and too many or too few."""
 
 import dataclasses
-import json
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +11,28 @@ from configs import TINY
 from conftest import refuses
 
 from mjx_dher import Config, HParams, RunSpec, contract, envs, gym, normalizer, relabel, samplers, trainer, validation
+from mjx_dher import spec as spec_lib
 from mjx_dher.envs import Simulator
 from mjx_dher.parallel import mesh
 from mjx_dher.rollout import rollout
 from mjx_dher.runs import loop
-from mjx_dher.runs.folder import results
+from mjx_dher.runs.folder import reading, results, run_folder
 from mjx_dher.types import EnvSpec
 from point_mass import PointMass
 
 
-def test_numbers_of_numpy_are_checked_and_kept_as_python_s():
+def test_numbers_of_numpy_are_checked_and_kept_as_python_s(tmp_path):
     config = Config(num_envs=np.int64(2), hidden_sizes=(np.int32(8),))
-    assert json.dumps(dataclasses.asdict(config))
+    hparams = HParams(her_k=np.int64(8), gamma=np.float32(0.5))
+    run_folder.write_config(tmp_path / "run", RunSpec(config=config, hparams=hparams), "native", {})
+    assert reading.read_spec(tmp_path / "run").hparams.her_k == 8
     assert config == Config(num_envs=2, hidden_sizes=(8,))
     for bad in ({"gamma": np.float64(5)}, {"her_k": np.float32("nan")}, {"her_k": np.float64(-0.5)}):
         with refuses(*bad):
             validation.validate(TINY, HParams(**bad), 10)
     validation.validate(TINY, HParams(gamma=np.float32(0.9), her_k=np.int64(4)), np.int64(10))
     validation.validate(TINY, HParams(gamma=np.array([0.9, 5])), 10)  # one for each run
+    jax.eval_shape(lambda gamma: validation.validate(TINY, HParams(gamma=gamma), 10), 0.9)
     for field in ("cycles_per_epoch", "n_step"):
         with refuses(field, 1.5):
             validation.validate(dataclasses.replace(TINY, **{field: np.float64(1.5)}), HParams(), 10)
@@ -42,10 +45,12 @@ def test_a_flag_of_an_environment_is_one_however_it_is_written(text, value):
     assert RunSpec(env_kwargs=run.env_kwargs) == run
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32, 1.5, True])
+@pytest.mark.parametrize("seed", [-1, 2**32, 1.5, True, np.float32(3)])
 def test_seeds_have_32_bits(seed):
     with refuses("seed", seed):
         next(loop.train(PointMass(), TINY, seed=seed))
+    with refuses("seed", seed):
+        spec_lib.validate(RunSpec(env="reach", seed=seed))
 
 
 def test_a_start_at_the_end_leaves_nothing_to_train():

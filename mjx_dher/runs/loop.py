@@ -80,7 +80,7 @@ def train(
     """
     hparams = HParams() if hparams is None else hparams
     validation.validate(config, hparams, env.episode_length)
-    validation.check_seed(seed)
+    validation.check_seed(config_lib.plain(seed))
     refuse_ended(config, env.episode_length, [] if start is None else [start.epoch])
     layout = mesh.arrange(mesh.find(devices), 1)
     validation.check_plan(config, env.episode_length, layout.shards)
