@@ -14,6 +14,8 @@ from mjx_dher.envs.engines.fields import LATE
 
 EXACT = ("time", "history")  # float64 between steps too, because a float32 time would stop advancing
 FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+BAD_CTRL = int(mujoco.mjtWarning.mjWARN_BADCTRL)
+_NONE = np.empty(0, np.intp)
 _KEPT = 8  # batches to keep, of the last sizes
 _Place = tuple[slice, slice]  # in rows
 _FEW = 64  # most simulations that one thread may step faster than several, which must wake up
@@ -97,15 +99,15 @@ class Rows:
         if self._exact:
             self._known = self._exact_bytes(results)
 
-    def lost(self) -> int:
-        """Timesteps that left out contacts since the last call."""
+    def read_warnings(self) -> tuple[int, np.ndarray]:
+        """Timesteps that left out contacts since the last call, and the simulations that had a control that is no number."""
         warning = self.batch.warning
         if warning.tobytes() == self._warned:
-            return 0
-        lost = int((warning[:, FULL, 1] - 1).sum())
+            return 0, _NONE
+        lost, bad = int((warning[:, FULL, 1] - 1).sum()), np.flatnonzero(warning[:, BAD_CTRL, 1] > 1)
         warning[..., 1] = 1
         self._warned = warning.tobytes()
-        return lost
+        return lost, bad
 
     def _exact_bytes(self, rows: np.ndarray) -> list[bytes]:
         return [rows[place].tobytes() for place in self._exact_places]

@@ -199,11 +199,12 @@ class Simulator:
                 chosen.batch.forward()
             else:
                 chosen.batch.step(nstep=self._substeps)
-        if lost := chosen.lost():
+        lost, bad = chosen.read_warnings()
+        if lost:
             self._note_lost(lost)
         chosen.read(results)
-        if function == "step" and not (good := np.abs(rows[:, self._layout.places["ctrl"][0]]) <= mujoco.mjMAXVAL).all():
-            results[~good.all(axis=1)] = math.nan  # MuJoCo takes 0 for all controls if one is NaN or too large, and only warns
+        if len(bad):  # MuJoCo takes 0 for all controls if one is NaN or too large, and only warns
+            results[bad] = math.nan
         seconds = time.perf_counter() - begun
         if chosen.seconds:  # a call that waited for other processes does not count
             seconds = min(seconds, 1.1 * chosen.seconds)
