@@ -158,9 +158,9 @@ class ArmTargets(Control):
         fixed = controls.ctrl.at[:7].set(jnp.zeros(7, jnp.float32)).at[6].set(_WRIST)
         return dataclasses.replace(controls, ctrl=fixed.at[np.array(_DRIVEN)].set(targets))
 
-    def rest(self, ctrl: np.ndarray) -> np.ndarray:
-        action = (ctrl[list(_DRIVEN)] - 0.5 * (_LOW + _HIGH)) / (0.5 * (_HIGH - _LOW))
-        return np.clip(action, -1.0, 1.0).astype(np.float32)
+    def rest(self, ctrl: Array) -> Array:
+        action = (ctrl[np.array(_DRIVEN)] - 0.5 * (_LOW + _HIGH)) / (0.5 * (_HIGH - _LOW))
+        return jnp.clip(action, -1.0, 1.0)
 
     low: np.ndarray
     high: np.ndarray
@@ -179,8 +179,8 @@ class OpenOrClosed(Control):
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
         return dataclasses.replace(controls, ctrl=controls.ctrl.at[7:].set(jnp.where(action > 0.0, 0.0, _OPEN)))
 
-    def rest(self, ctrl: np.ndarray) -> np.ndarray:
-        return np.full(1, -1.0, np.float32)
+    def rest(self, ctrl: Array) -> Array:
+        return jnp.full(1, -1.0)
 
 
 class Gripped(Goal):

@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+import warnings
 from typing import Any, Self
 
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply, quat_to_matrix
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.kinematics import Numbered, Place, names_of, pick, to_quat
+from mjx_dher.envs.kinematics import Numbered, Place, names_of, pick, rounded, to_quat
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -46,16 +46,16 @@ class Control:
         """
         raise NotImplementedError
 
-    def rest(self, ctrl: np.ndarray) -> np.ndarray:
-        """Action [size] that holds the start, whose inputs are `ctrl` [nu]."""
-        return np.zeros(self.size, np.float32)
+    def rest(self, ctrl: Array) -> Array:
+        """Action [size] that holds a configuration, whose inputs are `ctrl` [nu]."""
+        return jnp.zeros(self.size, jnp.float32)
 
     def describe(self) -> dict[str, Any]:
         """Kind, names of the moved parts, numbers of the action, scale, gear and limits, as JSON."""
         about: dict[str, Any] = {"kind": type(self).__name__, "moves": list(self.moved), "size": self.size}
         for name in ("scale", "turn", "gear", "offset", "low", "high"):
             if name in vars(self):
-                about[name] = np.round(np.asarray(vars(self)[name], float), 6).tolist()
+                about[name] = rounded(vars(self)[name])
         return about
 
 
@@ -89,9 +89,9 @@ class Actuators(Control):
         ctrl = 0.5 * (self.high + self.low) + 0.5 * (self.high - self.low) * action
         return dataclasses.replace(controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(ctrl))
 
-    def rest(self, ctrl: np.ndarray) -> np.ndarray:
+    def rest(self, ctrl: Array) -> Array:
         middle, half = 0.5 * (self.high + self.low), np.maximum(0.5 * (self.high - self.low), 1e-12)
-        action = np.clip((ctrl[self.indices] - middle) / half, -1.0, 1.0).astype(np.float32)
+        action = jnp.clip((ctrl[np.array(self.indices)] - middle) / half, -1.0, 1.0)
         return action.mean(keepdims=True) if self.together else action
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
@@ -140,7 +140,7 @@ class JointDelta(JointPosition):
             controls, ctrl=controls.ctrl.at[np.array(self.indices)].set(jnp.clip(target, self.low, self.high))
         )
 
-    def rest(self, ctrl: np.ndarray) -> np.ndarray:
+    def rest(self, ctrl: Array) -> Array:
         return Control.rest(self, ctrl)
 
     def _suits(self, model: mujoco.MjModel, index: int) -> bool:
@@ -172,7 +172,7 @@ class Mocap(Control):
 
     def bind(self, model: mujoco.MjModel) -> Self:
         check_number("scale of control", self.scale, "(0, inf)", float)
-        check_number("turn of control", self.turn, "[0, inf)", float)
+        check_number("turn of control", self.turn, "[0, 3.15]", float)
         bound = copy.copy(self)
         mocap = {name: i for i, name in enumerate(names_of(model, "body")) if model.body_mocapid[i] >= 0}
         check_name("mocap body", self.body, mocap)
@@ -198,8 +198,10 @@ class Mocap(Control):
         pos, mat = self.place.pose(physics.qpos)
         mocap, target = controls.mocap, pos + self.scale * action[:3]
         if self.turn:
-            half = jnp.concatenate([jnp.ones(1, jnp.float32), 0.5 * self.turn * action[3:]])
-            turned = quat_multiply(half, to_quat(mat))
+            half = 0.5 * self.turn * action[3:]
+            length = jnp.sqrt(jnp.sum(jnp.square(half)) + 1e-12)
+            turn = jnp.concatenate([jnp.cos(length)[None], half * jnp.sin(length) / length])
+            turned = quat_multiply(turn, to_quat(mat))
             turned = turned / jnp.sqrt(jnp.sum(jnp.square(turned)))
             mat = quat_to_matrix(turned)
             if self._relative[0] < 1.0:
@@ -264,16 +266,19 @@ class Holding:
             lines[:, i] = *_holding(model, i), *(ends if is_limited else (-np.inf, np.inf))
             if (activation := int(model.actuator_actadr[i])) >= 0:
                 self._owners[activation], held[activation] = i, 1.0
-        self._arrays = data.qpos.copy(), data.actuator_length.copy(), moments, lines, inputs, held
+        sizes = np.array([3, 0, 1, 1])[model.jnt_type]  # free (its position), ball, slide, hinge
+        starts = zip(model.jnt_qposadr, model.jnt_dofadr, sizes)
+        places = [(at + n, dof + n) for at, dof, size in starts for n in range(size)]
+        self._at, dofs = np.reshape(places, (-1, 2)).astype(int).T
+        self.servos = inputs.astype(bool)
+        self._arrays = data.qpos[self._at], data.actuator_length.copy(), moments[:, dofs], lines, inputs, held
 
-    def at(self, drawn: Sequence[Any], qpos: Array, xp: Any = jnp) -> tuple[Array, Array]:
-        """Inputs and activations that hold `qpos`, which differs in the ranges `drawn`. Lengths of spatial tendons and sites
-        are to first order. `xp` is NumPy or jax.numpy.
+    def at(self, qpos: Array, xp: Any = jnp) -> tuple[Array, Array]:
+        """Inputs and activations that hold `qpos`. Lengths of spatial tendons and sites are to first order, and turns of balls
+        and free bodies are left out. `xp` is NumPy or jax.numpy.
         """
         nominal, lengths, moments, lines, inputs, held = (xp.asarray(array, qpos.dtype) for array in self._arrays)
-        for at, dof, low, _ in drawn:
-            part = moments[:, dof : dof + len(low)] * (qpos - nominal)[at : at + len(low)]
-            lengths = lengths + xp.sum(part, axis=1)
+        lengths = lengths + xp.sum(moments * (qpos[self._at] - nominal), axis=1)
         targets = xp.clip(lines[0] * lengths + lines[1], lines[2], lines[3])
         return inputs * targets, held * targets[self._owners]
 
@@ -300,11 +305,15 @@ def _range(model: mujoco.MjModel, index: int) -> Any:
     """Lowest and highest input of an actuator."""
     joint = _joint(model, index)
     ends = np.array([-np.inf, np.inf])
-    if model.actuator_ctrllimited[index]:
-        ends = model.actuator_ctrlrange[index]
-    elif is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
+    if of_joint := is_servo(model, index) and joint >= 0 and model.jnt_limited[joint]:
         slope, offset = _holding(model, index)
         ends = np.sort(slope * model.actuator_gear[index, 0] * model.jnt_range[joint] + offset)
+    if model.actuator_ctrllimited[index]:
+        if of_joint and np.ptp(model.actuator_ctrlrange[index]) > 3 * np.ptp(ends):
+            name = model.actuator(index).name or f"actuator_{index}"
+            given = f"{model.actuator_ctrlrange[index]}, and its joint's range is {ends}"
+            warnings.warn(f"actuator {name!r} has the ctrlrange {given}; are both in the same unit?", stacklevel=2)
+        ends = model.actuator_ctrlrange[index]
     if (abs(ends) <= mujoco.mjMAXVAL).all():  # MuJoCo replaces larger inputs by 0
         return ends
     name = model.actuator(index).name or (names_of(model, "joint")[joint] if joint >= 0 else f"actuator_{index}")

@@ -12,7 +12,7 @@ import numpy as np
 from mjx_dher.context import euclidean
 from mjx_dher.envs.arm_kinematics import quat_to_matrix
 from mjx_dher.envs.engines import Physics
-from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of, pick
+from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of, pick, rounded
 from mjx_dher.types import Array, PRNGKey
 from mjx_dher.validation import check_number
 
@@ -52,7 +52,7 @@ class Goal:
         if self.place is not None:
             about["of"] = self.place.name
         ends = {name: getattr(self, name) for name in ("low", "high")}
-        return about | {name: np.round(np.asarray(end, float), 6).tolist() for name, end in ends.items() if end is not None}
+        return about | {name: rounded(end) for name, end in ends.items() if end is not None}
 
     def marks(self, model: mujoco.MjModel, qpos: np.ndarray, goal: np.ndarray) -> list[Mark]:
         """Marks that show a goal: balls, and bodies as ghosts. By default none.

@@ -30,6 +30,14 @@ def names_of(model: Any, kind: str) -> list[str]:
     return [getattr(model, kind)(i).name or Numbered(f"{kind}_{i}") for i in range(count)]
 
 
+def rounded(values: Any) -> Any:
+    """Numbers for a file, to six decimals, or to six digits if they are so small that decimals would change them."""
+    array = np.asarray(values, float)
+    short = np.round(array, 6)
+    digits = [float(f"{x:.6g}") for x in array.ravel()]
+    return np.where(abs(short - array) <= 1e-3 * abs(array), short, np.reshape(digits, array.shape)).tolist()
+
+
 def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     """Indices whose name in one of the columns matches a pattern, such as "j1 finger*", each once.
 
@@ -38,7 +46,8 @@ def pick(what: str, patterns: str, *columns: Sequence[str]) -> list[int]:
     pattern. The message lists the names.
     """
     chosen: dict[int, None] = {}
-    given = str(patterns)
+    if not isinstance(given := patterns, str):
+        raise ValueError(f"{what} must be one text, with spaces between names; got {patterns!r}")
     for pattern in [given] if any(given in names for names in columns) else given.split() or [""]:
         matches = [{i for i, name in enumerate(names) if name and _fits(name, pattern)} for names in columns]
         plain = not set(pattern) & set("*?")  # then a name of the first column comes before an equal one of the second

@@ -24,7 +24,9 @@ class Entry:
     def __init__(self, model: mujoco.MjModel, text: str):
         if not isinstance(text, str):
             raise ValueError(f"an observation must be a name, such as 'qpos:*'; got {text!r}")
-        self._parts = [_Part(model, part.strip()) for part in text.split(" - ")]
+        names = {name for kind in ("site", "body", "joint", "sensor") for name in names_of(model, kind)}
+        whole = text.partition(":")[2] in names  # which may have " - "
+        self._parts = [_Part(model, part.strip()) for part in ([text] if whole else text.split(" - "))]
         sizes = [part.size for part in self._parts]
         if len(set(sizes)) > 1:
             raise ValueError(f"observation {text!r} must subtract entries of equal sizes; got {sizes}")

@@ -2,12 +2,14 @@
 
 import copy
 import warnings
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from mjx_dher.envs.goals import Goal
 from mjx_dher.envs.kinematics import HINGE, SLIDE, Place, names_of
+from mjx_dher.envs.simulated import Range
 
 _SECONDS = 1.0  # most seconds to simulate
 _OVERLAP = 0.02  # m
@@ -21,13 +23,6 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
     """
     model = copy.copy(model)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # which would set the numbers of warnings to 0
-    data = _fresh(model, qpos)
-    mujoco.mj_forward(model, data)
-    for contact in data.contact:
-        if contact.dist < -_OVERLAP:
-            names = [model.geom(geom).name or names_of(model, "body")[model.geom_bodyid[geom]] for geom in contact.geom]
-            warnings.warn(f"{names[0]!r} and {names[1]!r} overlap by {-contact.dist:.2g} m at the start", stacklevel=2)
-            break
     rng = np.random.default_rng(0)
     finite = np.isfinite(model.actuator_ctrlrange) & model.actuator_ctrllimited[:, None].astype(bool)
     low, high = np.where(finite, model.actuator_ctrlrange, 0.0).T
@@ -45,6 +40,24 @@ def check_stable(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray, seco
                         f"unstable model: joint {joint!r} diverges, {what}; a smaller timestep, more damping or armature, or"
                         " a start without overlapping geoms can help"
                     )
+
+
+def check_overlaps(model: mujoco.MjModel, qpos: np.ndarray, drawn: Sequence[Range]) -> None:
+    """Warns if geoms overlap by more than 2 cm at the start `qpos` [nq], or in some of 32 that are `drawn`."""
+    rng, data = np.random.default_rng(0), _fresh(model, qpos)
+    deepest, number = None, 0
+    for _ in range(32 if drawn else 1):
+        for at, _, low, high in drawn:
+            data.qpos[at : at + len(low)] = rng.uniform(low, high)
+        mujoco.mj_fwdPosition(model, data)
+        over = [(contact.dist, tuple(contact.geom)) for contact in data.contact if contact.dist < -_OVERLAP]
+        number += bool(over)
+        deepest = min(filter(None, (deepest, min(over, default=None))), default=None)
+    if deepest:
+        dist, geoms = deepest
+        names = [model.geom(geom).name or names_of(model, "body")[model.geom_bodyid[geom]] for geom in geoms]
+        share = f", and geoms do in {number / 32:.0%} of the starts" if drawn else ""
+        warnings.warn(f"{names[0]!r} and {names[1]!r} overlap by {-dist:.2g} m at the start{share}", stacklevel=2)
 
 
 def _fresh(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:

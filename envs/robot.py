@@ -1,5 +1,6 @@
 """A policy on a robot: measurements to targets, with the task's own observation and controls."""
 
+import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_dher.contract import robot_interface
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.wrappers import ActionFilter, FrameStack, Wrapper
@@ -24,7 +26,7 @@ class RobotLoop:
       policy: maps {"observation": [D], "desired_goal": [G]} to an action [A], such as `mjx_dher.load_policy(path)`.
 
     Raises:
-      ValueError: it is no such environment.
+      ValueError: it is no such environment, or the policy was trained with another period, controls or observation.
     """
 
     def __init__(self, env: Any, policy: Callable[[Mapping[str, Any]], np.ndarray]):
@@ -37,6 +39,10 @@ class RobotLoop:
         if not isinstance(task, SimulatedTask):
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
+        trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
+        for name in ("dt", "controls", "layout"):
+            if name in trained and trained[name] != own[name]:
+                raise ValueError(f"env has {name} {own[name]}, and the policy was trained with {trained[name]}")
         model, sensors = task.model, task._rest.sensors
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "goal": task.goal_size}
         self._sizes["sensors"] = 0 if sensors is None else len(sensors)
@@ -86,10 +92,13 @@ class RobotLoop:
         rest = {"warmstart": jnp.zeros(model.nv), "act": jnp.zeros(model.na)}
         physics = Physics(**rest, **measured)
         observation = self.task.observe(physics).astype(jnp.float32)
-        following = []
+        following, of_task = [], getattr(self.task, "rest_of", None)
+        rest_action = jnp.zeros(self.task.action_size) if of_task is None else of_task(physics, measured=True)
         for i, wrapper in enumerate(self._wrappers):
-            seen = wrapper.begin(jax.random.key(0), observation) if memory is None else wrapper.see(memory[i], observation)
-            own, observation = seen
+            if memory is None:
+                own, observation = wrapper.begin(jax.random.key(0), observation, rest_action)
+            else:
+                own, observation = wrapper.see(memory[i], observation)
             following.append(own)
         return following, physics, observation
 

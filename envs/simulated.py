@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.config import plain
 from mjx_dher.envs.base import GoalEnv, State
 from mjx_dher.envs.engines import Controls, Physics, check_shape, make_engine
 from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
@@ -59,7 +60,7 @@ class SimulatedTask(GoalEnv):
         if reward_type not in ("sparse", "dense"):
             raise ValueError(f"reward_type must be 'sparse' or 'dense'; got {reward_type!r}")
         self.reward_type = reward_type
-        self.episode_length = _plain(type(self).episode_length if episode_length is None else episode_length)
+        self.episode_length = plain(type(self).episode_length if episode_length is None else episode_length)
         check_count("episode_length", self.episode_length)
         self.name = getattr(type(self), "name", type(self).__name__)
         self.model = self.load()
@@ -68,8 +69,11 @@ class SimulatedTask(GoalEnv):
         self._ranges = _ranges_of(self.varied if varied is None else varied)
         self._engine_options = engine_options
         self.engine = make_engine(engine, self.model, substeps, varied=tuple(self._ranges), **engine_options)
+        self._asked = plain(distance_threshold)
+        if self._asked is not None:
+            check_number("distance_threshold", self._asked, "(0, inf)", float)
         self.bind()
-        self.distance_threshold = _plain(self.threshold if distance_threshold is None else distance_threshold)
+        self.distance_threshold = plain(self.threshold) if self._asked is None else self._asked
         check_number("distance_threshold", self.distance_threshold, "(0, inf)", float)
 
     @abc.abstractmethod
@@ -235,7 +239,3 @@ def substeps_of(hz: float, timestep: float) -> int:
         nearest = sorted({float(f"{1 / (n * timestep):.9g}") for n in (max(substeps - 1, 1), max(substeps, 1), substeps + 1)})
         raise ValueError(f"hz must make a whole number of the model's timesteps of {timestep:g} s; got {hz}, near {nearest}")
     return substeps
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value

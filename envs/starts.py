@@ -45,9 +45,12 @@ class Start:
             check_name("keyframe", self.keyframe, keys := names_of(model, "key"))
             mujoco.mj_resetDataKeyframe(model, data, keys.index(self.keyframe))
         bound.drawn = []
-        places = _places(model)
+        every = _places(model)
+        places, names = dict(every), [name for name, _ in every]
         for name, ends in self.ranges.items():
             check_name("name in the ranges of start", name, places)
+            if names.count(name) > 1:
+                raise ValueError(f"start: a free body and a joint are called {name!r}; rename one of them to draw it")
             at, dof, low, high = places[name]
             drawn = Range(at, dof, *box(f"start: {name}", len(low), ends))
             if np.any(drawn.low < low) or np.any(drawn.high > high):
@@ -55,7 +58,7 @@ class Start:
             bound.drawn.append(drawn)
             data.qpos[at : at + len(low)] = 0.5 * (drawn.low + drawn.high)
         outside: list[str] = []
-        for name, (at, _, low, high) in places.items():
+        for name, (at, _, low, high) in every:
             # Keyframes have rounded numbers, such as 1.5708, and joints that rest against a stop.
             if len(low) == 1 and not low[0] - 1e-3 <= (value := data.qpos[at]) <= high[0] + 1e-3:
                 outside.append(f"{name!r} at {value:g} with the range {low.round(5)[0]:g} to {high.round(5)[0]:g}")
@@ -65,11 +68,11 @@ class Start:
                 f"start: {pose} has joint {', '.join(outside)}; pass the name of a keyframe within the ranges, or positions of"
                 " these joints in `ranges`"
             )
-        given = data.ctrl.any() or data.act.any()
+        bound._given = bool(data.ctrl.any() or data.act.any())
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_transmission):
             compute(model, data)  # the actuators' lengths
-        bound._holding = None if given else Holding(model, data)
-        ctrl, act = bound._holding.at((), data.qpos, np) if bound._holding else (data.ctrl, data.act)
+        bound._holding = Holding(model, data)
+        ctrl, act = (data.ctrl, data.act) if bound._given else bound._holding.at(data.qpos, np)
         mocap = np.concatenate([data.mocap_pos, data.mocap_quat], axis=1)
         # NumPy arrays become constants of the programs that use them, on any device.
         arrays: Any = [np.array(x, np.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv), act, ctrl, mocap)]
@@ -87,26 +90,31 @@ class Start:
     def held(self, physics: Physics) -> tuple[Physics, Controls]:
         """A drawn start with activations, and inputs, that hold it: the keyframe's if it has inputs or activations."""
         hold = jax.tree.map(jnp.asarray, self.hold)
-        if self._holding is None:
+        if self._given:
             return physics, hold
-        ctrl, act = self._holding.at(self.drawn, physics.qpos)
+        ctrl, act = self._holding.at(physics.qpos)
         return dataclasses.replace(physics, act=act), dataclasses.replace(hold, ctrl=ctrl)
+
+    def inputs_at(self, qpos: Array) -> Array:
+        """Inputs [nu] with which servos hold any configuration; others are those of the start."""
+        return jnp.where(self._holding.servos, self._holding.at(qpos)[0], self.hold.ctrl)
 
     physics: Physics  # the start, with the middle of each range
     hold: Controls  # inputs that hold it
     drawn: list[Range]
-    _holding: Holding | None
+    _holding: Holding
+    _given: bool  # whether the keyframe has inputs or activations
 
 
-def _places(model: mujoco.MjModel) -> dict[str, tuple[int, int, np.ndarray, np.ndarray]]:
-    """For each name of a free body, hinge or slide: first index in qpos and in qvel, and limits (3 numbers, or 1)."""
-    places, free = {}, mujoco.mjMAXVAL * np.array([[-1.0], [1.0]])  # MuJoCo takes larger positions for a divergence
+def _places(model: mujoco.MjModel) -> list[tuple[str, tuple[int, int, np.ndarray, np.ndarray]]]:
+    """Name of each free body, hinge and slide, with its first index in qpos and in qvel, and limits (3 numbers, or 1)."""
+    places, free = [], mujoco.mjMAXVAL * np.array([[-1.0], [1.0]])  # MuJoCo takes larger positions for a divergence
     unlimited = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_LIMIT
     for i in range(model.njnt):
         kind, at = int(model.jnt_type[i]), (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i]))
         if kind == FREE:
-            places[names_of(model, "body")[model.jnt_bodyid[i]]] = (*at, *np.repeat(free, 3, axis=1))
+            places.append((names_of(model, "body")[model.jnt_bodyid[i]], (*at, *np.repeat(free, 3, axis=1))))
         elif kind in (HINGE, SLIDE):
             low, high = model.jnt_range[i, :, None] if model.jnt_limited[i] and not unlimited else free
-            places[names_of(model, "joint")[i]] = (*at, low - 1e-6, high + 1e-6)
+            places.append((names_of(model, "joint")[i], (*at, low - 1e-6, high + 1e-6)))
     return places

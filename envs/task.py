@@ -74,11 +74,13 @@ class MujocoTask(SimulatedTask):
         moved = [name for part in self.parts for name in part.moved]
         if len(set(moved)) < max(1, len(moved)):
             raise ValueError(f"control must move something, and nothing twice; got {moved}")
-        self.goal = _checked("goal", getattr(self, "goal", None), Goal).bind(self.model)
+        goal = copy.copy(_checked("goal", getattr(self, "goal", None), Goal))
+        goal.threshold = goal.threshold if self._asked is None else self._asked
+        self.goal = goal.bind(self.model)
         self.goal_size, self.goal_distance, self.threshold = self.goal.size, self.goal.distance, self.goal.threshold
         self.start = _checked("start", self.start, Start).bind(self.model)
         self._rest, self._hold = self.start.physics, self.start.hold
-        self.rest_action = np.concatenate([part.rest(np.asarray(self._hold.ctrl)) for part in self.parts])  # keeps the start
+        self.rest_action = np.asarray(self._rest_of(self._hold.ctrl))  # keeps the start
         self._object = next((each for each in self.start.drawn if len(each.low) == 3), None)
         given = self.observations
         texts = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Sequence) else ()
@@ -95,6 +97,7 @@ class MujocoTask(SimulatedTask):
         check_number("max_speed", self.max_speed, "(0, inf)", float)
         rest = np.asarray(self._rest.qpos)
         probes.check_stable(self.model, rest, np.asarray(self._hold.ctrl), self.dt * self.episode_length)
+        probes.check_overlaps(self.model, rest, self.start.drawn)
         probes.check_reachable(self.model, rest, self.goal)
 
     @property
@@ -103,7 +106,7 @@ class MujocoTask(SimulatedTask):
         entries = list(zip(self.layout, self._entries))
         return {
             "controls": [part.describe() for part in self.parts],
-            "goal": self.goal.describe() | {"threshold": self.distance_threshold},
+            "goal": self.goal.describe(),
             "layout": {name: [part.start, part.stop] for name, part in self.layout.items()},
             "joints": {name: entry.joints for name, entry in entries if entry.joints},
             "sensors": {name: entry.sensors for name, entry in entries if entry.sensors},
@@ -142,6 +145,13 @@ class MujocoTask(SimulatedTask):
             if isinstance(part, Mocap) and any(joint.qpos in drawn for joint in part.place.joints):
                 hold = part.apply(physics, jnp.zeros(part.size, jnp.float32), hold)
         return physics, hold
+
+    def rest_of(self, physics: Physics, measured: bool = False) -> Array:
+        """Action [A] that holds a start, or a robot at `measured` positions."""
+        return self._rest_of(self.start.inputs_at(physics.qpos) if measured else self._held(physics)[1].ctrl)
+
+    def _rest_of(self, ctrl: Array) -> Array:
+        return jnp.concatenate([part.rest(jnp.asarray(ctrl)) for part in self.parts])
 
     def sample_goal(self, key: PRNGKey) -> Array:
         """Draws a goal [G]."""

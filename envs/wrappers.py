@@ -53,8 +53,8 @@ class Wrapper:
         own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
-    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
-        """Memory and observation after a reset with `observation`."""
+    def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
+        """Memory and observation after a reset with `observation`. The action `rest` [A] holds the first state."""
         return (), observation
 
     def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
@@ -68,7 +68,9 @@ class Wrapper:
     def reset(self, key: PRNGKey) -> WrapperState:
         """Initial state. `key` draws the same start as without the wrapper."""
         inner = self.env.reset(key)
-        memory, observation = self.begin(jax.random.fold_in(key, self._number), inner.obs["observation"])
+        rest_of = getattr(self.env, "rest_of", None)
+        rest = jnp.asarray(self._rest) if rest_of is None else rest_of(inner.physics)
+        memory, observation = self.begin(jax.random.fold_in(key, self._number), inner.obs["observation"], rest)
         return WrapperState(inner, _observed(inner, observation), memory)
 
     def step(self, state: WrapperState, action: Array) -> WrapperState:
@@ -118,7 +120,7 @@ class ObservationNoise(Wrapper):
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(spec.observation)):
             raise ValueError(f"obs_noise needs float observations; got {spec.observation}")
 
-    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+    def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
         return self.see(key, observation)
 
     def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
@@ -130,7 +132,8 @@ class ObservationNoise(Wrapper):
 
 
 class ActionDelay(Wrapper):
-    """Applies actions some steps late. Before the first one arrives, it applies the environment's `rest_action`, or 0.
+    """Applies actions some steps late. Before the first one arrives, it applies the action that holds the first state.
+    An environment says it by `rest_of(physics)` or `rest_action`; otherwise it is 0.
 
     Args:
       action_delay: steps, at most 1000, or (low, high) or "low-high" to draw a number at each reset.
@@ -144,9 +147,9 @@ class ActionDelay(Wrapper):
         check_number("action_delay", self._least, "[0, 1000]")
         check_number("action_delay", self._most, f"[{self._least}, 1000]")
 
-    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+    def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
         steps = jax.random.randint(key, (), self._least, self._most + 1, jnp.int32)
-        return (steps, jnp.tile(self._rest, (self._most, 1))), observation
+        return (steps, jnp.tile(rest, (self._most, 1))), observation
 
     def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
         steps, earlier = memory  # earlier actions, latest first
@@ -155,7 +158,7 @@ class ActionDelay(Wrapper):
 
 
 class ActionFilter(Wrapper):
-    """Applies y_t = c y_(t-1) + (1 - c) a_t in place of the action a_t. Initially y is `rest_action`, or 0.
+    """Applies y_t = c y_(t-1) + (1 - c) a_t in place of the action a_t. Initially y is as in `ActionDelay`.
 
     Args:
       action_filter: c in [0, 1). 0 filters nothing.
@@ -166,8 +169,8 @@ class ActionFilter(Wrapper):
         check_number("action_filter", action_filter, "[0, 1)", float)
         self._kept = float(action_filter)
 
-    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
-        return jnp.asarray(self._rest), observation
+    def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
+        return rest, observation
 
     def act(self, memory: PyTree, action: Array) -> tuple[PyTree, Array]:
         filtered = self._kept * memory + (1.0 - self._kept) * action
@@ -199,7 +202,7 @@ class FrameStack(Wrapper):
         joined = jax.eval_shape(self._join, (self.env.spec.observation,) * self._frames)
         return dataclasses.replace(self.env.spec, observation=joined)
 
-    def begin(self, key: PRNGKey, observation: PyTree) -> tuple[PyTree, PyTree]:
+    def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
         return self.see((observation,) * self._frames, observation)
 
     def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:

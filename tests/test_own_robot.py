@@ -66,7 +66,7 @@ CONTROLS = [
     (task.Actuators("c *"), [1.0, 1.0, 1.0], [4.0, 1.5, 4.0], None),
     (task.JointPosition("servo b", together=True), [-1.0], [-2.0, -1.0, 0], None),
     (task.Mocap("hand", scale=0.1), [1.0, 0.0, -1.0], [0, 0, 0], [3.1, 0, -0.1, 1, 0, 0, 0]),
-    (task.Mocap("hand", turn=2.0), [0, 0, 0, 0, 0, 1.0], [0, 0, 0], [3, 0, 0, 2**-0.5, 0, 0, 2**-0.5]),
+    (task.Mocap("hand", turn=np.pi / 2), [0, 0, 0, 0, 0, 1.0], [0, 0, 0], [3, 0, 0, 2**-0.5, 0, 0, 2**-0.5]),
     ((task.Torque(), task.Mocap("hand", scale=1.0)), [0.5, 0, 1.0, 0], [0, 0, 2.0], [3, 1, 0, 1, 0, 0, 0]),
 ]
 
