@@ -278,7 +278,7 @@ class Holding:
         and free bodies are left out. `xp` is NumPy or jax.numpy.
         """
         nominal, lengths, moments, lines, inputs, held = (xp.asarray(array, qpos.dtype) for array in self._arrays)
-        lengths = lengths + xp.sum(moments * (qpos[self._at] - nominal), axis=1)
+        lengths = lengths + xp.sum(moments * (qpos[self._at] - nominal)[None], axis=1)
         targets = xp.clip(lines[0] * lengths + lines[1], lines[2], lines[3])
         return inputs * targets, held * targets[self._owners]
 

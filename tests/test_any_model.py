@@ -149,6 +149,24 @@ def test_what_mjx_ignores_is_rejected_with_the_element():
         make_engine("jax", model, SUBSTEPS)
 
 
+@pytest.mark.parametrize("is_chain", [True, False])
+def test_mjx_has_inertia_of_tendons_along_one_chain_only(is_chain):
+    body = '<body pos="0 0 {}"><joint name="{}" axis="0 1 0"/><geom size=".05" mass="1" pos=".1 0 0" contype="0"/>'
+    first, second = body.format(1, "a"), body.format(0.2, "b")
+    bodies = f"{first}{second}</body></body>" if is_chain else f"{first}</body>{second}</body>"
+    joints = '<joint joint="b" coef=".5"/><joint joint="a" coef=".5"/>'
+    tendon = f'<tendon><fixed name="both" armature="0.3">{joints}</fixed></tendon><actuator><motor joint="a"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody>{tendon}</mujoco>")
+    if not is_chain:
+        with refuses("engine jax", "armature", "both"):
+            make_engine("jax", model, SUBSTEPS)
+        return
+    physics, controls = start(model)
+    controls = jax.tree.map(lambda x: x[0] + 1, controls)
+    here, there = (jax.jit(make_engine(engine, model, SUBSTEPS).advance)(physics, controls) for engine in ("jax", "native"))
+    np.testing.assert_allclose(here.qvel, there.qvel, atol=1e-5)
+
+
 def test_arrays_of_another_shape_are_rejected():
     model = mujoco.MjModel.from_xml_string(MODELS["nothing but a ball"])
     physics, controls = start(model)

@@ -161,7 +161,7 @@ def test_a_hand_moves_the_goal(port):
 class Turn(MujocoTask):
     """A box that lies in front of a servo; the goal is its orientation."""
 
-    model = """<mujoco><worldbody><body><joint name="a" range="-1 1"/><geom size=".1"/></body>
+    model = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="a" range="-1 1"/><geom size=".1"/></body>
     <body name="box" pos="1 0 0"><freejoint/><geom type="box" size=".1 .2 .3"/></body></worldbody>
     <actuator><position joint="a" kp="1" ctrlrange="-1 1"/></actuator></mujoco>"""
     goal = Rotation("body:box", threshold=0.2)

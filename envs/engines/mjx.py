@@ -38,6 +38,8 @@ def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     yield from beyond_defaults(model, _IGNORED.__contains__)
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         yield "flags that disable springs or dampers"
+    if apart := [i for i in np.flatnonzero(model.tendon_armature).tolist() if not _is_in_one_chain(model, i)]:
+        yield with_names("armature of tendons beyond one chain of joints", model, "tendon", apart)
     unseen = np.isin(model.geom_type, (int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD)))
     rays = (model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)).any()
     if sensors and rays and (unseen.any() or not model.nmat):
@@ -45,6 +47,19 @@ def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
     if len(muscles) and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         yield with_names("damping of muscles with the integrator implicitfast", model, "actuator", muscles)
+
+
+def _is_in_one_chain(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether a fixed tendon's joints lie on one path from the world. MuJoCo C leaves out inertia between others."""
+    wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
+    if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+        return False
+    dofs, path = model.jnt_dofadr[model.wrap_objid[wraps]], []
+    last = int(dofs.max())
+    while last >= 0:
+        path.append(last)
+        last = int(model.dof_parentid[last])
+    return set(dofs) <= set(path)
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:
