@@ -75,8 +75,11 @@ def test_the_rest_of_a_keyframe_with_inputs_is_its_inputs_and_of_a_robot_its_pos
     np.testing.assert_allclose(env.rest_of(physics, measured=True), [0.75, (0.6 - 0.75) / 1.75], atol=1e-6)
 
 
-def test_a_robot_s_first_filtered_target_is_where_it_is():
-    env = Reach("native")
+@pytest.mark.parametrize("inputs", ["", 'ctrl="0.5 1" '])
+def test_a_robot_s_first_filtered_target_is_where_it_is(inputs):
+    env = type("Given", (Reach,), {"model": XML.replace('qpos="0 0.6', f'{inputs}qpos="0 0.6'), "start": Start("home")})(
+        "native"
+    )
     still = JointPosition("*").bind(env.model)
 
     def policy(obs):
@@ -163,7 +166,7 @@ def test_units_and_overlaps_of_drawn_starts_are_told():
     with pytest.warns(UserWarning, match="a_yaw.*same unit"):
         JointPosition("*").bind(mujoco.MjModel.from_xml_string(degrees))
     low = type("Low", (Reach,), {"start": Start("home", ranges={"box": ((0.3, -0.15, -0.09), (0.45, 0.15, 0.15))})})
-    with pytest.warns(UserWarning, match=r"overlap by .* at the start, and geoms do in \d+% of the starts"):
+    with pytest.warns(UserWarning, match=r"overlap by .* at the start, and geoms do in [3-6]\d% of the starts"):
         low("native")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
