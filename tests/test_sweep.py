@@ -304,7 +304,7 @@ def test_a_metric_with_a_setting_s_name_has_its_own_column(tmp_path):
 def test_lanes_are_as_many_as_memory_holds_as_the_compiler_counts_it(tmp_path, monkeypatch):
     """All four rings would fit; four whole programs do not."""
     trials = make_grid(("future",), seeds=range(4))
-    monkeypatch.setattr(machine, "available_bytes", lambda: 250_000)
+    monkeypatch.setattr(machine, "available_bytes", lambda: 200_000)
     told, sizes = [], []
     run(tmp_path, trials, lanes=4, report=told.append, on_epoch=lambda specs, _: sizes.append(len(specs)))
     assert "compiling for 4 parallel runs of 4" in told[0]
