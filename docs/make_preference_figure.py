@@ -38,7 +38,7 @@ class Point(NamedTuple):
 
 
 def points(own: bool = False) -> list[Point]:
-    """The thirteen settings on Push that choose goals by distance, by share; or the ten that have the paper's `own` cycles."""
+    """Settings on Push that choose goals by distance, by share: thirteen, or ten with the paper's `own` cycles."""
     way, push = SITUATIONS["on the way"], paper_set.load_set(paper_set.FOLDER)["push"]
     made = {("samplers", "closest"): ("closest", total_variation(samplers.make("closest"), way))}
     for epsilon in EPSILONS:  # draws at random differ from nothing

@@ -72,14 +72,18 @@ def reach(curves: Curves, threshold: float) -> NDArray:
     return stats.first_reach(np.arange(1, curves.success.shape[1] + 1), curves.success, threshold)
 
 
+def t_interval(scores: NDArray) -> tuple[float, float, float]:
+    """Mean of scores [S], and the ends of its Student's t interval at 95 %."""
+    mean, half = scores.mean(), t.ppf(0.975, len(scores) - 1) * scores.std(ddof=1) / math.sqrt(len(scores))
+    return float(mean), float(mean - half), float(mean + half)
+
+
 def difference(a: NDArray, b: NDArray) -> Difference:
     """Difference a - b of scores [S] that are paired by seed."""
     each = a - b
     if not np.isfinite(each).all():
         return Difference(each, math.nan, math.nan, math.nan, math.nan)
-    mean = float(each.mean())
-    half = float(t.ppf(0.975, len(each) - 1) * each.std(ddof=1) / math.sqrt(len(each)))
-    return Difference(each, mean, mean - half, mean + half, stats.paired_p_value(a, b))
+    return Difference(each, *t_interval(each), stats.paired_p_value(a, b))
 
 
 def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str, epochs: int | None = None) -> Difference:
@@ -140,9 +144,8 @@ def number(p: float) -> str:
 
 
 def mean_of(scores: NDArray) -> str:
-    """Mean of scores [S] with its Student's t interval at 95 %."""
-    half = t.ppf(0.975, len(scores) - 1) * scores.std(ddof=1) / math.sqrt(len(scores))
-    return f"{scores.mean():.3f} ({scores.mean() - half:.3f} to {scores.mean() + half:.3f})"
+    """Mean of scores [S] with its 95 % interval, as text."""
+    return "{:.3f} ({:.3f} to {:.3f})".format(*t_interval(scores))
 
 
 def median_of(epochs: NDArray) -> str:

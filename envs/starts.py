@@ -96,7 +96,7 @@ class Start:
         return dataclasses.replace(physics, act=act), dataclasses.replace(hold, ctrl=ctrl)
 
     def inputs_at(self, qpos: Array) -> Array:
-        """Inputs [nu] with which servos hold any configuration; others are those of the start."""
+        """Inputs [nu] with which servos hold a configuration. Other actuators get their inputs at the start."""
         return jnp.where(self._holding.servos, self._holding.at(qpos)[0], self.hold.ctrl)
 
     physics: Physics  # the start, with the middle of each range
