@@ -176,7 +176,7 @@ class Size:
 # The fast sweeps of docs/results.md, cut when `future` has learned: 7.0, 16.1 and 39.9 s per run of 50, 50 and 200 epochs.
 _FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
 # The preset until 2026-11-27, which the plans name.
-_HAND = {"cycles_per_epoch": 1, "updates_per_cycle": 1000, "learner_dtype": "float32"}
+_HAND = {"cycles_per_epoch": 1, "updates_per_cycle": 1000, "learner_dtype": "float32", "renewals": 5}
 # From five parallel runs in bench/README.md: 4.4, 11.8 and 40.2 s per run of 1.54, 1.02 and 8.19 million steps. The hand:
 # four runs of 4.1 million steps took 198 s, and five of `hand_reach` 55 s (docs/experiments/preset_hands.md).
 SIZES = {

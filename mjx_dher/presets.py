@@ -140,13 +140,13 @@ def _entropy(env: str, **changes: Any) -> Settings:
 def _gpu_hand(env: str) -> Settings:
     steps = {"block_rotate_z": 2_000_000, "block": 8_000_000, "egg": 8_000_000, "pen": 8_000_000}.get(env, 4_000_000)
     k = 1.0 if env == "block_rotate_z" else 4.0
-    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=2000, total_steps=steps, renewals=5, her_k=k)
+    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=3500, total_steps=steps, her_k=k)
     return _with(base, replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16", gamma=0.98, lr_end=0.05)
 
 
 def _cpu_hand(env: str) -> Settings:
     base = _small(_gpu_hand(env), num_envs=64, cycles_per_epoch=16, updates_per_cycle=250, policy_delay=2, critic_lr=2e-3)
-    return _kept(base, 1_024_000, her_k=4.0)
+    return _kept(base, 1_024_000, her_k=4.0, renewals=5)
 
 
 def _gpu_arm(env: str) -> Settings:
@@ -195,7 +195,7 @@ _DDPG = _Best("ddpg", "mlp", None)
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
 _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
-    ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand, {"priority": "td_error"}),
+    ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand),
     ("cpu", "arms"): _Best("sac", "layer_norm", _cpu_arm, {"sampler": "final"}),
     ("gpu", "arms"): _Best("sac", "layer_norm", _gpu_arm, {"sampler": "final"}),
     ("cpu", "hand_reach"): _Best(

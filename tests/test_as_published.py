@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 
+import make_comparison_tables
 import numpy as np
 from conftest import ROOT, refuses
 
@@ -104,6 +105,38 @@ def test_the_tuned_k_has_the_largest_mean_success(monkeypatch, tmp_path):
     assert as_published.best_k.__wrapped__("push", "hgg") == 8
     with refuses("hgg", "slide"):
         as_published.best_k.__wrapped__("slide", "hgg")
+
+
+def test_runs_that_are_kept_are_those_of_the_arms_as_they_are():
+    """Else `--runs` would train them again: a preset that changes must not change what was compared."""
+    import as_published
+    import bakeoff_runs
+
+    kept = {page.data: page.experiment for page in make_comparison_tables.PAGES}
+    kept[as_published.TUNED] = as_published.EXPERIMENTS["tune"]
+    for other_precision in ("crl_rewards", "td_controls"):  # in part, which is a setting
+        del kept[ROOT / "docs" / f"{other_precision}_runs.csv"]
+    for path, experiment in kept.items():
+        assert bakeoff_runs.load(path, experiment)
+
+
+def test_the_page_has_the_means_of_the_tuning_runs_and_the_k_that_test_would_use():
+    text = (ROOT / "docs" / "experiments" / "as_published.md").read_text().split("### The tuning of k")[1].split("###")[0]
+    with (ROOT / "docs" / "as_published_tune_runs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    shown = 0
+    for method, *tasks in (
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| `")
+    ):
+        for task, cell in zip(("push", "pick_and_place", "slide"), tasks, strict=True):
+            own = [[row for row in rows if (row["task"], row["arm"]) == (task, f"{method[1:-1]}_k{k}")] for k in (4, 8, 16)]
+            assert [len(runs) for runs in own] == ([5, 5, 5] if cell else [0, 0, 0])
+            means = [sum(float(row["mean_success"]) for row in runs) / 5 for runs in own]
+            marked = [f"**{mean:.3f}**" if cell and mean == max(means) else f"{mean:.3f}" for mean in means]
+            assert cell in (", ".join(marked), "")
+            shown += sum(map(len, own))
+    assert shown == len(rows)
+    assert f"{shown} of 450 runs" in text
 
 
 def test_curves_of_both_are_compared_over_the_steps_that_both_have(monkeypatch, tmp_path):

@@ -185,17 +185,6 @@ def test_arms_of_several_tasks_can_be_corrected_together(report, arms):
     assert np.isnan([first.p_corrected, second.p_corrected]).all()
 
 
-def test_runs_that_are_kept_are_those_of_the_arms_as_they_are(arms, ablation):
-    """Else `--runs` would train them again: a preset that changes must not change what was compared."""
-    import as_published
-    import bakeoff_runs
-
-    ours = [(name, arms.BAKEOFF) for name in ("bakeoff", "bakeoff_repeat", "bakeoff_third")]
-    published = [(f"as_published_{name}", as_published.EXPERIMENTS[name]) for name in ("cher", "next_future", "ebp")]
-    for name, experiment in [*ours, *published, ("ablation", ablation.ABLATION)]:
-        assert bakeoff_runs.load(ROOT / "docs" / f"{name}_runs.csv", experiment)
-
-
 def test_only_seeds_that_both_have_are_paired(report, arms):
     base, other = scores(report, [0.1, 0.2, 0.3]), scores(report, [0.5, 0.6, 0.7], first=1)
     _, row = report.compare("best", "slide", {"future": base, "dpp": other}, arms.ARMS)

@@ -1,8 +1,10 @@
 """Presets of the hand and the arm tasks, and what the pages say of them and of JaxGCRL's own code."""
 
 import csv
+import itertools
 
 import numpy as np
+import pytest
 import scipy.stats
 from conftest import ROOT
 from test_pages import cells
@@ -44,6 +46,27 @@ def test_tables_of_hands_and_arms_are_those_of_the_file():
         assert ", ".join(row["success"] for row in rows) in row, task
         assert median in row, task
         assert median in " ".join(field), task
+
+
+def test_what_the_page_says_of_the_hands_and_slides_candidates_follows_from_its_table():
+    text = (ROOT / "docs" / "experiments" / "preset_hands.md").read_text().split("## Fewer errors")[1].split("## Results")[0]
+    rows = [[cell.strip() for cell in cells(line)] for line in text.splitlines() if line.startswith("| ")]
+    pairs = {}
+    for before, after in itertools.pairwise(rows):
+        if (before[1], after[1]) == ("preset", "candidate"):
+            measure = 3 if before[0] == "Slide" else 2
+            old, new = (np.array([float(number) for number in row[measure].split(", ")]) for row in (before, after))
+            pairs[before[0].strip("`")] = new - old
+    blocks = (pairs["block_rotate_parallel"], pairs["block_rotate_xyz"])
+    for change in (np.concatenate(blocks), pairs["Slide"]):
+        found = scipy.stats.ttest_1samp(change, 0)
+        low, high = found.confidence_interval()
+        row = f"| {change.mean():+.3f} ({low:.3f} to {high:.3f}), p {found.pvalue:.1g} | "
+        assert float(text.split(row)[1][:5]) == pytest.approx(change.std(ddof=1), abs=6e-4)
+    for change in blocks:
+        low, high = scipy.stats.ttest_1samp(change, 0).confidence_interval()
+        assert f"{change.mean():.3f} ({low:.3f} to {high:.3f})" in text
+    assert np.concatenate(blocks).size == 10
 
 
 def test_curves_of_jaxgcrls_own_code_are_those_of_the_file(monkeypatch):
@@ -94,11 +117,11 @@ def test_success_at_any_step_is_that_of_the_file():
 
 
 def paired(file, task, arm, base):
-    """Mean gain in mean success and its interval, from a file of runs."""
+    """Mean gain in mean success and its interval, from a file of runs, with learners other than `paper`."""
     runs = {}
     with (ROOT / "docs" / file).open() as rows:
         for row in csv.DictReader(rows):
-            if row["task"] == task:
+            if row["task"] == task and row["learner"] != "paper":
                 runs.setdefault(row["arm"], {})[row["seed"]] = float(row["mean_success"])
     return interval(np.array([x - runs[base][seed] for seed, x in runs[arm].items()]))
 
