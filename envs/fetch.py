@@ -118,7 +118,7 @@ class FetchEnv(SimulatedTask):
         entries = _WITH_OBJECT if self.has_object else _WITHOUT_OBJECT
         ends = np.cumsum([0, *entries.values()]).tolist()
         fingers = {"kind": "JointDelta", "moves": ["finger_r", "finger_l"] if self.drives_fingers else [], "scale": 1.0}
-        controls = [{"kind": "Mocap", "moves": ["gripper"], "scale": ACTION_SCALE}, fingers]
+        controls = [{"kind": "Mocap", "moves": ["gripper"], "scale": ACTION_SCALE, "size": 3}, {**fingers, "size": 1}]
         layout = {name: [begin, end] for name, begin, end in zip(entries, ends, ends[1:])}
         return {"controls": controls, "layout": layout, "joints": {"finger_pos": ["finger_r", "finger_l"]}}
 

@@ -40,9 +40,12 @@ class RobotLoop:
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
         trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
-        for name in ("dt", "controls", "layout"):
-            if name in trained and trained[name] != own[name]:
-                raise ValueError(f"env has {name} {own[name]}, and the policy was trained with {trained[name]}")
+        for name in ("dt", "controls", "layout", "joints", "sensors"):
+            if name in trained and not _agree(trained[name], own.get(name)):
+                raise ValueError(f"env has {name} {own.get(name)}, and the policy was trained with {trained[name]}")
+        goals = [{name: each.get("goal", {}).get(name) for name in ("kind", "of")} for each in (trained, own)]
+        if "goal" in trained and goals[0] != goals[1]:
+            raise ValueError(f"env has the goal {goals[1]}, and the policy was trained with {goals[0]}")
         model, sensors = task.model, task._rest.sensors
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "goal": task.goal_size}
         self._sizes["sensors"] = 0 if sensors is None else len(sensors)
@@ -71,19 +74,21 @@ class RobotLoop:
           `ctrl` [nu] for the actuators and `mocap` [nmocap, 7], in NumPy.
 
         Raises:
-          ValueError: a measurement or the policy's action has another size, or is not finite.
+          ValueError: a measurement or the policy's action has another size, or is not finite. Frames and filter are then as
+            before the call.
         """
         measured = {"qpos": qpos, "qvel": qvel} | ({"sensors": sensors} if self._senses else {})
         arrays = {name: _checked(name, value, self._sizes[name]) for name, value in measured.items()}
         desired = _checked("goal", goal, self._sizes["goal"])
         with jax.default_device(jax.local_devices(backend="cpu")[0]):
-            self._memory, physics, observation = self._see(self._memory, arrays)
+            memory, physics, observation = self._see(self._memory, arrays)
+            _check_finite("the observation is", observation, qpos)
             action = self.policy({"observation": np.asarray(observation), "desired_goal": desired})
             action = _checked("action of the policy", action, self.task.action_size)
-            self._memory, controls = self._act(self._memory, physics, action)
+            memory, controls = self._act(memory, physics, action)
         controls = jax.tree.map(np.asarray, controls)
-        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(controls)):
-            raise ValueError(f"the controls are not finite; qpos must have quaternions of length 1; got {qpos}")
+        _check_finite("the controls are", controls, qpos)
+        self._memory = memory  # only now, so that the call can be repeated after an error
         return controls
 
     def _observe(self, memory: list[PyTree] | None, measured: dict[str, Array]) -> tuple[list[PyTree], Physics, PyTree]:
@@ -118,3 +123,18 @@ def _checked(name: str, value: Any, size: int) -> np.ndarray:
     if array.shape != (size,) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be {size} finite numbers; got {value}")
     return array
+
+
+def _check_finite(what: str, values: PyTree, qpos: Any) -> None:
+    """Raises ValueError if one of the `values` is not finite."""
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(values)):
+        raise ValueError(f"{what} not finite; qpos must have quaternions of length 1; got {qpos}")
+
+
+def _agree(trained: Any, own: Any) -> bool:
+    """Whether two JSON descriptions agree in all entries that both have. Policies of older versions have fewer."""
+    if isinstance(trained, dict) and isinstance(own, dict):
+        return all(_agree(trained[name], own[name]) for name in trained.keys() & own.keys())
+    if isinstance(trained, list) and isinstance(own, list):
+        return len(trained) == len(own) and all(map(_agree, trained, own))
+    return bool(trained == own)

@@ -65,6 +65,10 @@ class Wrapper:
         """Memory, and the observation in place of `observation`."""
         return memory, observation
 
+    def see_moved(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+        """`see` after the object was set elsewhere."""
+        return self.see(memory, observation)
+
     def reset(self, key: PRNGKey) -> WrapperState:
         """Initial state. `key` draws the same start as without the wrapper."""
         inner = self.env.reset(key)
@@ -93,7 +97,9 @@ class Wrapper:
         return WrapperState(inner, _observed(inner, state.obs["observation"]), state.memory)
 
     def _with_object(self, state: WrapperState, position: Array) -> WrapperState:
-        return self._seen(self.env.with_object(state.inner, position), state.memory)
+        inner = self.env.with_object(state.inner, position)
+        memory, observation = self.see_moved(state.memory, inner.obs["observation"])
+        return WrapperState(inner, _observed(inner, observation), memory)
 
 
 def _observed(inner: Any, observation: PyTree) -> GoalObs:
@@ -208,6 +214,9 @@ class FrameStack(Wrapper):
     def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
         frames = (observation, *memory[:-1])
         return frames, self._join(frames)
+
+    def see_moved(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
+        return self.see((observation,) * self._frames, observation)
 
     @staticmethod
     def _join(frames: tuple[PyTree, ...]) -> PyTree:

@@ -67,7 +67,7 @@ class Config:
     num_bins: Annotated[int, Number("[2, 10000]")] = 101
     """Values into which a categorical critic classifies the return."""
     reset_every: Annotated[int, Number("[0, 2000000000]")] = 0
-    """Updates after which actor, critics and their targets are drawn again, a multiple of updates_per_cycle. 0: never."""
+    """Updates after which networks and the entropy weight start again, a multiple of updates_per_cycle. 0: never."""
     energy: Literal["norm", "l2", "dot", "cosine"] = "norm"
     """Similarity of phi(s, a) and psi(g): minus their distance, minus its square, their product, or its cosine."""
     contrastive_loss: Literal["forward", "backward", "symmetric"] = "forward"
@@ -128,7 +128,7 @@ class HParams(NamedTuple):
     """Fraction of each batch drawn in proportion to episode priority. The rest is uniform."""
     epsilon: Share = 0.2
     """Probability that epsilon_closest draws a uniform future goal instead of the closest."""
-    temperature: Annotated[float, Number("[1e-30, inf]")] = 1.0
+    temperature: Annotated[float, Number("[1e-6, inf]")] = 1.0
     """Temperature of weighted. Larger values give more even weights; inf equals future."""
     weight_scale: Annotated[float, Number("[1e-6, 1e6]")] = 0.05
     """Distance in metres that counts as 1, for weighted with weight_normalization none."""
@@ -146,7 +146,7 @@ class HParams(NamedTuple):
     """Reward factor of relabelled transitions. Below 1, hindsight counts as a better outcome (ARCHER)."""
     obs_clip: Positive = 200.0
     """Observations and goals are clipped to +- this before normalization."""
-    norm_clip: Positive = 5.0
+    norm_clip: Annotated[float, Number("[1e-37, 1e9]")] = 5.0
     """Normalized observations and goals are clipped to +- this."""
     norm_eps: Positive = 0.01
     """Smallest standard deviation that the normalizers divide by."""
@@ -168,7 +168,7 @@ def episodes_capacity(config: Config, episode_length: int) -> int:
 
 def steps_per_epoch(config: Config, episode_length: int) -> int:
     """Training steps of an epoch."""
-    return config.num_envs * config.cycles_per_epoch * episode_length
+    return config.num_envs * config.cycles_per_epoch * int(episode_length)  # which may be NumPy's
 
 
 def num_epochs(config: Config, episode_length: int) -> int:

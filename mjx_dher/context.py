@@ -33,7 +33,11 @@ class Values(NamedTuple):
 
 
 class Context(NamedTuple):
-    """Inputs of a method in addition to the data. To relabel by hand, you need only the first two fields."""
+    """Inputs of a method in addition to the data. `of_env` takes the fields from an environment.
+
+    By hand, `relabel` needs only the first two. Returns of several steps, priorities and generators also need `reward_range`:
+    by default they take a reward of 0 for a goal that is reached.
+    """
 
     compute_reward: RewardFn
     hparams: HParams
@@ -94,7 +98,8 @@ def return_bounds(reward_range: tuple[float, float], gamma: Array | float) -> tu
     The bounds include 0, because a return that ends early counts as if rewards of 0 followed.
     """
     low, high = (min(reward_range[0], 0.0), max(reward_range[1], 0.0))
-    return low / (1.0 - gamma), high / (1.0 - gamma)
+    tail = jnp.maximum(1.0 - jnp.asarray(gamma), jnp.finfo(jnp.float32).tiny)  # 0 / 0 at gamma = 1 would be NaN
+    return low / tail, high / tail
 
 
 def pick(results: Sequence[Any], number: Array) -> Array:

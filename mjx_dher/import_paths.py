@@ -52,7 +52,7 @@ def load(field: str, value: str) -> Any:
         raise ValueError(f"{field} {value!r}: importing it failed: {reason}") from error
     if not hasattr(module, attribute):
         nearest = hint(attribute, [name for name in dir(module) if not name.startswith("_")])
-        raise ValueError(f"{field} {value!r}: module {name} has no {attribute!r}{nearest}")
+        raise ValueError(f"{field} {value!r}: module {name} ({module_file(value)}) has no {attribute!r}{nearest}")
     component = getattr(module, attribute)
     made_by = component.func if isinstance(component, functools.partial) else component
     if inspect.isclass(made_by) or inspect.isroutine(made_by):  # and not an instance of a library's class
@@ -84,7 +84,10 @@ def module_file(value: str) -> Path | None:
 
 def _check_origin(field: str, value: str, module: str) -> None:
     if module.partition(".")[0] in NO_COMPONENTS:
-        raise ValueError(f"{field} must be a component; {value!r} is from {module}, which has none")
+        raise ValueError(
+            f"{field} must be a component; {value!r} is from {module}, a module of Python or of a library, which has none;"
+            " give a file of your own another name"
+        )
 
 
 def _place(error: BaseException) -> str:

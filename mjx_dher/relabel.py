@@ -122,7 +122,7 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
         reward=check.array("compute_reward: rewards [B]", reward, (batch_size,), jnp.number),
         discount=jnp.where(terminal, 0.0, jnp.asarray(hparams.gamma, jnp.float32)),
         row=sample.row,
-        hindsight_goal=hindsight.goals,
+        hindsight_goal=jnp.where(hindsight.offered[:, None], hindsight.goals, achieved_goal),
     )
     missed = jnp.sum(relabelled & ~hindsight.offered, dtype=jnp.float32)
     return Relabelled(batch, missed / jnp.maximum(jnp.sum(relabelled, dtype=jnp.float32), 1.0))

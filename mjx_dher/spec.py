@@ -15,7 +15,7 @@ from typing_extensions import Doc
 
 from mjx_dher import validation
 from mjx_dher.components import COMPONENTS, doc
-from mjx_dher.config import Config, HParams
+from mjx_dher.config import Config, HParams, plain
 from mjx_dher.lookup import check_name, is_import_path, require_extra
 
 Engine = Literal["auto", "native", "jax", "warp"]
@@ -56,6 +56,7 @@ class RunSpec:
     """Numbers of the algorithm."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "seed", plain(self.seed))
         with contextlib.suppress(ValueError, TypeError):  # `validate` reports the problem
             object.__setattr__(self, "env_kwargs", to_texts(to_arguments(self.env_kwargs)))
 
@@ -125,8 +126,8 @@ class Options:
 
     def is_reached(self, success_rates: Sequence[float]) -> bool:
         """Whether a run with these success rates per epoch has reached `stop_at`."""
-        last = success_rates[-3:]
-        return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at
+        last = [float(f"{rate:.6g}") for rate in success_rates[-3:]]  # as a resumed run reads them from metrics.csv
+        return self.stop_at is not None and len(last) == 3 and sum(last) / 3 >= self.stop_at - 1e-9
 
 
 def custom_components(spec: RunSpec) -> dict[str, str]:

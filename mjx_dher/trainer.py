@@ -122,12 +122,13 @@ def make_train(
       sampler: sampler of hindsight goals, or a function like `Sampler.log_weights`. Default: `future`.
       priority: priority, for `hparams.priority_fraction` of each batch. Default: `eventful`.
       generator: generator of the goals of training episodes. Default: the reset's goals.
-      learner: the learner, or the name of a built-in one, made from `config`. Default: `ddpg`.
+      learner: a learner made from the same `config`, or the name of a built-in one. Default: `ddpg`.
       axis_name: axis of the devices that share the run. They call `init` and `epoch` inside `jax.shard_map` over it with the
         same key, and average gradients and metrics. Each has its own environments, ring and batches.
 
     Raises:
-      ValueError: invalid argument. `epoch` raises it for arrays of the wrong shape while it is traced.
+      ValueError: invalid argument. `init` raises it for invalid numbers that are not traced, and `epoch`, while it is traced,
+        for arrays of the wrong shape.
     """
     spec, template = spec_and_template(env)
     if not isinstance(config, Config):
@@ -160,6 +161,7 @@ def make_train(
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
+    validation.validate(loop.config, hparams, loop.spec.episode_length)  # traced numbers are not checked
     key, learner_key = jax.random.split(key)
     return TrainState(
         learner=loop.learner.init(learner_key),

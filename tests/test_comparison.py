@@ -23,6 +23,7 @@ def cell(sampler, seed, success, env="push", final=None, **numbers):
         "settings": settings,
         "seed": seed,
         "status": "finished",
+        "asked_engine": "auto",
         "curve": curve,
         "final": final,
         "lanes": 1,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import refuses
 
+from mjx_dher import envs
 from mjx_dher.envs import wrappers
 from mjx_dher.envs.kinematics import pick, rounded
 from mjx_dher.envs.observations import Entry
@@ -101,6 +102,65 @@ def test_a_loop_has_the_period_the_controls_and_the_observation_of_its_policy(ch
     RobotLoop(Reach("native"), policy)
     with refuses({"hz": "dt", "control": "controls"}.get(*change, "layout"), "policy"):
         RobotLoop(type("Other", (Reach,), change)("native"), policy)
+
+
+class Tracked(Turn):
+    observations = ("site:ee", "body:box", "rot:box")
+
+
+def test_a_lost_measurement_leaves_the_frames_and_the_call_can_be_repeated():
+    env, asked = wrappers.FrameStack(Tracked("native"), 3), []
+
+    def policy(obs):
+        asked.append(np.array(obs["observation"]))
+        if len(asked) == failing:
+            raise TimeoutError
+        return np.full(2, len(asked) / 10)
+
+    failing = 0
+    loop, still = RobotLoop(env, policy), np.zeros(env.model.nv)
+    first = np.array(env.env.start.physics.qpos)
+    lost = np.append(first[:5], np.zeros(4))  # the tracker has lost the box
+    second = first + np.array([0.1, 0, 0, 0, 0, 0, 0, 0, 0])
+    loop(first, still, np.zeros(env.goal_size))
+    with refuses("observation", "qpos"):
+        loop(lost, still, np.zeros(env.goal_size))
+    failing = len(asked) + 1
+    with pytest.raises(TimeoutError):
+        loop(second, still, np.zeros(env.goal_size))
+    loop(second, still, np.zeros(env.goal_size))
+    failed, repeated = asked[-2:]
+    np.testing.assert_array_equal(failed, repeated)
+    assert np.isfinite(repeated).all()
+
+
+class Joint(Reach):
+    observations = ("qpos:*", "qvel:*")
+
+
+def test_a_loop_has_the_joints_and_the_goal_of_its_policy():
+    def policy(obs):
+        return np.zeros(2)
+
+    own = Joint("native").robot_interface
+    trained = {**own, "joints": {name: list(reversed(joints)) for name, joints in own["joints"].items()}}
+    for policy.interface, name in ((trained, "joints"), ({**own, "goal": {**own["goal"], "of": "site:ee - x"}}, "goal")):
+        with refuses(name, "policy"):
+            RobotLoop(Joint("native"), policy)
+    older = {name: own[name] for name in ("controls", "layout")}
+    older["controls"] = [{name: each[name] for name in ("kind", "moves")} for each in own["controls"]]
+    policy.interface = older  # of a version that described less
+    RobotLoop(Joint("native"), policy)
+    policy.interface = {**own, "goal": {**own["goal"], "threshold": 0.5}}
+    RobotLoop(Joint("native"), policy)
+
+
+def test_frames_begin_anew_where_the_object_is_set():
+    env = envs.make("push", engine="native", frame_stack=3)
+    state = env.with_object(env.reset(jax.random.key(3)), jnp.array([1.4, 0.8, 0.425]))
+    frames = np.asarray(state.obs["observation"]).reshape(3, -1)
+    np.testing.assert_array_equal(frames[0], frames[1])
+    np.testing.assert_array_equal(frames[0], frames[2])
 
 
 def test_a_threshold_of_a_pose_leaves_its_angle():

@@ -24,7 +24,7 @@ TINY = """
 """.split()  # noqa: SIM905
 OWN = ["--env", "my_tasks:MyTask", "--sampler", "my_tasks:soon", *TINY]
 PARTS = ("metric", "priority", "generator", "learner", "networks")
-OWN_PARTS = [*OWN, "--sampler", "weighted", *(word for part in PARTS for word in (f"--{part}", f"my_tasks:{part}"))]
+OWN_PARTS = [*OWN[:2], *TINY, "--sampler", "weighted", *(word for part in PARTS for word in (f"--{part}", f"my_tasks:{part}"))]
 MY_TASKS = """
 import dataclasses, os, signal
 import flax.linen as nn
@@ -216,9 +216,9 @@ def test_a_sweep_takes_them(folder, monkeypatch):
     _, (trial,) = cli_sweep.parse_sweep_args([*OWN, "--seeds", "1", "--out", "sweep"])
     assert (trial.env, trial.sampler) == ("my_tasks:MyTask", "my_tasks:soon")
     assert fingerprint.trial_name(trial).startswith("my_tasks-mytask-my_tasks-soon-s0-")
-    _, trials = cli_sweep.parse_sweep_args(
-        [*OWN_PARTS, "--learner", "ddpg", "my_tasks:learner", "--seeds", "1", "--out", "sweep"]
-    )
+    words = [*OWN_PARTS, "--seeds", "1", "--out", "sweep"]
+    words.insert(words.index("--learner") + 1, "ddpg")
+    _, trials = cli_sweep.parse_sweep_args(words)
     assert [trial.learner for trial in trials] == ["ddpg", "my_tasks:learner"]
     assert {trial.networks for trial in trials} == {"my_tasks:networks"}
 

@@ -172,6 +172,16 @@ def test_physics_that_blows_up_is_told_and_begins_anew():
     assert (player.qpos[0], player.is_own) == (0.0, True)
 
 
+def test_physics_that_blows_up_is_shown_without_a_value():
+    """The contract lets the observation of a failed state be NaN, for which no policy has an action."""
+    asked = []
+    player = Player(GAME, lambda obs: np.array([10.0]), value=lambda obs, action: asked.append(obs) or 1.0)
+    player.step()
+    assert "diverged" in panel.score(player)
+    assert len(asked) == 1  # of the start
+    assert np.isnan(player.history[-1][2])
+
+
 def test_curves_show_the_last_steps():
     player = Player(GAME, follow, value=lambda obs, action: 10 * action[0])
     player.step()

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
@@ -170,6 +171,15 @@ def test_what_is_written_can_be_read(tmp_path, suffix, count):
     render.write_frames(tmp_path / f"out{suffix}", moving(count), 25.0)
     assert frames_in(tmp_path / f"out{suffix}", 96, 64) == count
     assert os.listdir(tmp_path) == [f"out{suffix}"]
+
+
+@pytest.mark.parametrize("name", ["12:30.gif", "-x.gif", "pic%d.png"])
+def test_names_that_ffmpeg_would_read_otherwise_are_names(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pic1.png.partial").write_text("mine")
+    render.write_frames(Path(name), moving(1), 25.0)
+    assert sorted(os.listdir(tmp_path)) == sorted([name, "pic1.png.partial"])
+    assert (tmp_path / "pic1.png.partial").read_text() == "mine"
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])

@@ -159,9 +159,10 @@ def test_what_a_later_program_cannot_train_is_refused_before_the_first_one_train
     """A cycle of the second task does not fit into its ring."""
     monkeypatch.setattr(point_mass_module, "Long", lambda: point_mass_module.PointMass(60), raising=False)
     monkeypatch.setitem(COMPONENTS["env"], "long", Component("point_mass:Long", ""))
-    own = ["--env", "point_mass", "long", "--seeds", "1", "--out", str(tmp_path / "new" / "sweep")]
+    command = [*COMMAND, "--seeds", "1", "--out", str(tmp_path / "new" / "sweep")]
+    command.insert(command.index("point_mass") + 1, "long")
     for more in ([], ["--dry-run"]):
-        assert cli.main([*COMMAND, *own, *more]) == 2
+        assert cli.main([*command, *more]) == 2
         assert re.search("replay_size must hold at least one cycle of 8 episodes x 60 steps", capsys.readouterr().err)
         assert not any(tmp_path.iterdir())
 

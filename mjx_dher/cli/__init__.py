@@ -5,6 +5,7 @@ Standard output may fail without stopping a command.
 
 import atexit
 import contextlib
+import dataclasses
 import errno
 import gc
 import importlib
@@ -15,7 +16,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from rich.console import Console
 from rich.text import Text
@@ -149,16 +150,18 @@ def run(name: str, argv: Sequence[str], console: Console) -> int:
 
 
 def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
-    """Parses the words after a command's name into `kind`, such as EvalArgs. `options` go to `tyro.cli`. Raises
-    ValueError for a flag of another library. The message names ours.
+    """Parses the words after a command's name into `kind`, such as EvalArgs. `options` go to `tyro.cli`. Raises ValueError for
+    a flag of another library, with our name for it, and for a list in two parts. Of other flags, the last one counts.
     """
     import tyro
 
-    for argument in argv:
-        flag = argument.partition("=")[0].replace("_", "-")
+    flags = [argument.partition("=")[0].replace("_", "-") for argument in argv if argument.startswith("--")]
+    for flag in flags:
         if flag in FOREIGN_FLAGS:
             name, comma, rest = FOREIGN_FLAGS[flag].partition(",")
             raise ValueError(f"{flag} is called {name} here{comma}{rest}")
+        if flags.count(flag) > 1 and flag.rpartition(".")[2].lstrip("-").replace("-", "_") in _lists(kind):
+            raise ValueError(f"{flag} is given {flags.count(flag)} times; give it once, with all of its values")
     command = kind.__name__.removesuffix("Args").lower()
     prog = lookup.command_name() + ("" if command == "train" else f" {command}")
     try:
@@ -167,6 +170,17 @@ def parse(kind: type[Args], argv: Sequence[str], **options: Any) -> Args:
         raise Answered(error.code if isinstance(error.code, int | None) else 1) from None
     lookup.trusts_files = getattr(args, "trust", False)
     return args
+
+
+def _lists(kind: type) -> set[str]:
+    """Names of the fields of a dataclass, and of those inside it, that hold several values."""
+    fields = set()
+    for name, hint in get_type_hints(kind).items():
+        if any(get_origin(one) is tuple for one in (hint, *get_args(hint))):
+            fields.add(name)
+        elif dataclasses.is_dataclass(hint):
+            fields |= _lists(hint)  # type: ignore[arg-type]
+    return fields
 
 
 def printable(text: str) -> str:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from mjx_dher import cli
 from mjx_dher.cli.common import Trust, print_table
-from mjx_dher.runs.folder import run_folder
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
@@ -50,7 +50,8 @@ class PlotArgs:
     folders: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders, or the folder of one sweep."""
     out: Path | None = None
-    """Folder for the pictures. Default: the folder of the run or sweep, or the current folder for several runs."""
+    """Folder for the pictures and a sweep's comparison.csv, which are replaced there. Default: the folder of the run or sweep,
+    or the current folder for several runs."""
     threshold: float = 0.9
     """Success rate for the time to success (for a sweep)."""
     baseline: str = "future"
@@ -88,9 +89,10 @@ def _plot_sweep(args: PlotArgs, console: Console) -> int:
     out = args.out or folder
     files.make_folder(out)
     rows = compare(out, by_env, args.baseline, args.threshold, console)
+    stems = fingerprint.in_paths(by_env)
     for env, groups in by_env.items():
         own = [row for row in rows if row.env == env]
-        for path in plotting.write(out, groups, own, args.threshold, args.formats):
+        for path in plotting.write(out / stems[env], groups, own, args.threshold, args.formats):
             console.print(f"wrote {path}")
     return 0
 
@@ -152,7 +154,8 @@ def _to_film(folder: Path, sweep: bool) -> list[tuple[Path, Path]]:
         env = trial["settings"]["env"]
         if rate >= 0 and (env not in best or rate > best[env]["final"]["success_rate"]):
             best[env] = trial
+    stems = fingerprint.in_paths(best)
     return [
-        (trial["folder"], folder / f"{run_folder.in_a_path(env)}_{run_folder.in_a_path(trial['settings']['sampler'])}.mp4")
+        (trial["folder"], folder / f"{stems[env]}_{fingerprint.in_a_path(trial['settings']['sampler'])}.mp4")
         for env, trial in best.items()
     ]

@@ -19,7 +19,7 @@ from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet import chunks
 from mjx_dher.fleet.chunks import FleetOptions
-from mjx_dher.runs.folder import fingerprint, run_folder
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.spec import Engine, Options, RunSpec
 from mjx_dher.sweeps import grid
 from mjx_dher.system import files, signals
@@ -121,13 +121,17 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:
-    """Drops sizes and numbers that no trial reads, and reports them."""
+    """Reports components, sizes and numbers that no trial reads, and drops the sizes and numbers."""
     groups: dict[str, Any] = {"changes": args.changes, "sweep": args.sweep}
     read = [fingerprint.settings(run) for run in trials]
-    given = [name for own in groups.values() for name, value in vars(own).items() if value is not None]
+    default = {field.name: field.default for field in dataclasses.fields(args)}
+    given = [name for name in GRID if getattr(args, name) != default[name]]
+    given += [name for own in groups.values() for name, value in vars(own).items() if value is not None]
     unread = {name: None for name in given if not any(components.reads(settings, name) for settings in read)}
     if unread:
         report(f"ignored, because no component of these runs reads it: {', '.join(unread)}")
+    if args.priority and not any(run.hparams.priority_fraction for run in trials):
+        report("priority has no effect at priority_fraction 0; add --sweep.priority-fraction 0.5, for example")
     for group, own in groups.items():
         groups[group] = dataclasses.replace(own, **{name: None for name in unread if hasattr(own, name)})
     return dataclasses.replace(args, **groups)
@@ -224,11 +228,16 @@ def announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[R
     todo = [trial for trial in trials if not grid.is_done(args.out, trial)]
     done = f"; {len(trials) - len(todo)} of them are done already" if len(todo) < len(trials) else ""
     console.print(f"{len(trials)} runs{done}; writing to {args.out}", soft_wrap=True)
+    ended = (reading.read_config(grid.folder_of(args.out, trial)) for trial in set(trials).difference(todo))
+    if other := {content["final_episodes"] for content in ended} - {args.options.final_episodes}:
+        console.print(f"final_episodes: done runs keep theirs, which had {', '.join(map(str, sorted(other)))}", soft_wrap=True)
     return todo
 
 
 def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: int, console: Console) -> int:
-    """Writes the tables of ended trials and reports the others. `number` is the number of a stop signal, or 0."""
+    """Writes the tables of ended trials and reports the others. `number` is the number of a stop signal, or 0. Returns 2 if all
+    trials failed, as `train` does.
+    """
     left = [trial for trial in todo if not grid.is_done(args.out, trial)]
     if left and number:
         ended = len(trials) - len(left)
@@ -249,7 +258,8 @@ def _end(args: SweepArgs, trials: list[RunSpec], todo: list[RunSpec], number: in
             chunks.clear(storage, args.out)
     with contextlib.suppress(OSError):  # it does not exist, or has storages
         unfinished.rmdir()
-    return 0
+    statuses = {results.read_result(grid.folder_of(args.out, trial))["status"] for trial in trials}
+    return 2 if statuses == {run_folder.FAILED} else 0
 
 
 def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:

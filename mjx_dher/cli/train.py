@@ -114,10 +114,11 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
     `report` is called with the origin of the settings, if they come from a file. Raises ValueError for invalid arguments.
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)  # arguments that decide the defaults of the others
-    early.add_argument("--preset", default="auto")
-    early.add_argument("--env", default="push")
-    early.add_argument("--learner")
-    early.add_argument("--config", type=Path)
+    # One without its value is an error of the whole parser.
+    early.add_argument("--preset", default="auto", nargs="?", const="auto")
+    early.add_argument("--env", default="push", nargs="?", const="push")
+    early.add_argument("--learner", nargs="?")
+    early.add_argument("--config", type=Path, nargs="?")
     chosen, _ = early.parse_known_args(argv)
     check_name("preset", chosen.preset, ("auto", *PRESETS))
     if chosen.config is not None:
@@ -129,7 +130,10 @@ def parse_train_args(argv: list[str], report: Callable[[str], None] = lambda tex
         args = _parse(argv, TrainArgs(base, options=options), f"those of {chosen.config}")
         run = args.spec
         if run.env == base.env:
-            run = dataclasses.replace(run, env_kwargs=to_texts({**base.env_arguments, **run.env_arguments}))
+            merged = to_texts({**base.env_arguments, **run.env_arguments})
+            untyped = {text for text in merged if text in base.env_kwargs}.difference(argv)
+            # Arguments of the file need trust, although the environment's name was typed.
+            run = dataclasses.replace(run, env=base.env if untyped else run.env, env_kwargs=merged)
         run, ignored = _without_unread(base, run)
         for line in (*notes, settings.changes(base, run), *ignored):
             report(line)
@@ -167,7 +171,10 @@ def _without_unread(base: RunSpec, run: RunSpec) -> tuple[RunSpec, list[str]]:
     kept = fingerprint.with_unread_of(base, run)
     old, new = fingerprint.settings(kept), fingerprint.settings(run)
     ignored = [f"{name} {fingerprint.text(new[name])}" for name in new if new[name] != old[name]]
-    return kept, [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []
+    lines = [f"ignored, because no component of this run reads it: {', '.join(ignored)}"] if ignored else []
+    if run.priority != base.priority and not run.hparams.priority_fraction:
+        lines.append(f"priority {run.priority} has no effect at priority_fraction 0; add --priority-fraction 0.5, for example")
+    return kept, lines
 
 
 def _claim(stack: contextlib.ExitStack, out: Path | None, spec: RunSpec, resumes: bool) -> Path:

@@ -111,13 +111,16 @@ def split(specs: Sequence[RunSpec], task: Task, slots: int, lanes: int | None, s
 def unfinished(storage: Path | None, specs: Sequence[RunSpec], todo: Sequence[RunSpec]) -> list[tuple[RunSpec, ...]]:
     """Chunks that an earlier driver left in the storage. They stay together, because their runs share checkpoints."""
     by_name, waiting = {fingerprint.trial_name(spec): spec for spec in specs}, set(todo)
-    earlier = []
+    stored = []
     for path in sorted(storage.glob(f"*/{NAMES_FILE}")) if storage is not None else ():
         with contextlib.suppress(OSError, ValueError, TypeError):  # if damaged, its runs start over
             chunk = tuple(by_name[name] for name in files.read_json(path) if name in by_name)
-            if waiting & set(chunk):
-                waiting -= set(chunk)
-                earlier.append(chunk)
+            stored.append(chunk)
+    earlier, taken = [], set[RunSpec]()
+    for chunk in sorted(stored, key=len, reverse=True):  # sweeps of other sizes may have left the same run in two
+        if waiting & set(chunk) and taken.isdisjoint(chunk):
+            earlier.append(chunk)
+            taken |= set(chunk)
     return earlier
 
 

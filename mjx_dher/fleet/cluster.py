@@ -28,7 +28,7 @@ LONG_PATH = 27  # characters; in longer folders, paths of Ray's sockets exceed t
 STORE_BYTES = 200 << 20  # object store of a local cluster; the rest goes to disk
 # Files next to custom code that no node needs, as in .gitignore. Each node has its own package.
 NOT_SENT = ["/mjx_dher", "/envs", ".git", "__pycache__", "/runs", "/sweeps", ".venv", "venv", ".caches"]
-NOT_SENT += ["*.npz", "*.mp4", "*.gif"]
+NOT_SENT += ["*.npz", "*.mp4", "*.gif", "checkpoints"]
 
 Work = Callable[[Chunk, Tell], list[bytes]]
 

@@ -104,10 +104,10 @@ class Policy:
         arrays |= {field: getattr(self, field) for field in (*VECTORS, *SCALARS)}
         return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
 
-    def save(self, path: Path, **extra: Any) -> None:
+    def save(self, path: str | Path, **extra: Any) -> None:
         """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
-        arrays: dict[str, Any] = {**self.arrays(), **extra}
-        with files.atomic_write(path) as partial, partial.open("wb") as file:
+        arrays: dict[str, Any] = {**self.arrays(), **interface_array(self.interface), **extra}
+        with files.atomic_write(Path(path)) as partial, partial.open("wb") as file:
             np.savez(file, **arrays)
 
 
@@ -157,6 +157,11 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
         **{field: float(arrays[field]) for field in SCALARS},
         interface=read_interface(arrays),
     )
+
+
+def interface_array(interface: Mapping[str, Any]) -> dict[str, NDArray]:
+    """The `interface` as an array of a policy file, by name. Nothing if there is none."""
+    return {"interface": np.frombuffer(json.dumps(dict(interface)).encode(), np.uint8)} if interface else {}
 
 
 def read_interface(arrays: Mapping[str, Any]) -> dict[str, Any]:

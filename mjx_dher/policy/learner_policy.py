@@ -13,7 +13,7 @@ import numpy as np
 from mjx_dher import learners
 from mjx_dher.config import HParams
 from mjx_dher.learners import Learner
-from mjx_dher.policy import read_interface
+from mjx_dher.policy import interface_array, read_interface
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import atomic_write
 from mjx_dher.types import Array, EnvSpec, PyTree
@@ -35,9 +35,10 @@ class LearnerPolicy:
         return self.spec.sizes
 
     def __call__(self, obs: Mapping[str, Any]) -> np.ndarray:
-        """Actions [..., A] for observations of one state or a batch. Raises ValueError for a missing key, another structure or
-        shape, or a number that is not finite.
+        """Actions [..., A] for observations of one state or a batch. Tuples may stand for lists, as in gymnasium. Raises
+        ValueError for a missing key, another structure or shape, or a number that is not finite.
         """
+        obs = {key: _with_lists(value, self.spec.observation) if key == "observation" else value for key, value in obs.items()}
         goal = jax.ShapeDtypeStruct((self.spec.goal_size,), jnp.float32)
         leading = {
             key: _leading(key, obs, like) for key, like in (("observation", self.spec.observation), ("desired_goal", goal))
@@ -51,11 +52,12 @@ class LearnerPolicy:
         obs: Any = {"observation": observation, "desired_goal": goal}
         return self.learner.act(self.state, obs, self.hparams)
 
-    def save(self, path: Path, **extra: Any) -> None:
+    def save(self, path: str | Path, **extra: Any) -> None:
         """Writes the policy to `path`. An existing file is replaced only when the new one is complete."""
         arrays: dict[str, Any] = {f"state{i:04d}": _to_plain(leaf) for i, leaf in enumerate(jax.tree.leaves(self.state))}
-        with atomic_write(path) as partial, partial.open("wb") as file:
-            np.savez(file, env_spec=np.array(to_json(self.spec)), **arrays, **extra)
+        arrays |= {"env_spec": np.array(to_json(self.spec)), **interface_array(self.interface), **extra}
+        with atomic_write(Path(path)) as partial, partial.open("wb") as file:
+            np.savez(file, **arrays)
 
 
 def _to_plain(leaf: Any) -> np.ndarray:
@@ -76,6 +78,15 @@ def _from_plain(array: np.ndarray, like: Any) -> Array:
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _with_lists(tree: Any, like: PyTree) -> Any:
+    """The tree with lists and tuples where `like` has them."""
+    if isinstance(tree, Mapping) and isinstance(like, Mapping):
+        return {name: _with_lists(child, like.get(name)) for name, child in tree.items()}
+    if type(tree) in (tuple, list) and type(like) in (tuple, list) and len(tree) == len(like):
+        return type(like)(map(_with_lists, tree, like))
+    return tree
 
 
 def _leading(key: str, obs: Mapping[str, Any], like: PyTree) -> set[tuple[int, ...]]:

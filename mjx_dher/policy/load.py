@@ -41,7 +41,10 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     if not path.is_file():
         from mjx_dher.runs.folder import results
 
-        why = results.failure_of(run_dir) or "the run was stopped before its first epoch ended"
+        if path.exists():
+            raise FolderError(f"{path} is not a file")
+        ended = "the run has ended with a policy, which was removed or not copied" if results.has_result(run_dir) else ""
+        why = results.failure_of(run_dir) or ended or "the run was stopped before its first epoch ended"
         raise FolderError(f"{path} is missing: {why}")
     with reading.checked(path, "is damaged or not a policy of this program"):
         arrays: dict[str, Any] = npz.read(path, ratio=reading.POLICY_RATIO)

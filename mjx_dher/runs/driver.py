@@ -7,7 +7,7 @@ Runs that differ only in `spec._LANE_FIELDS` are *lanes* of one vmapped program.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -141,12 +141,24 @@ def train_runs(
         return []
     if len(waiting) == 1 and not sweep:  # before compilation
         saved = [run_folder.epoch_of(path) for path in run_folder.checkpoints(waiting[0][1])]
-        loop.refuse_ended(specs[0].config, env.episode_length, saved)
+        _is_trained(env, *waiting[0], saved)
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
         program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
         processes.check_equal({"lanes": program.lanes})  # by default they depend on memory
         return _train_in_turn(session, program, claims, waiting)
+
+
+def _is_trained(env: Env, spec: RunSpec, folder: Path, saved: Sequence[int]) -> bool:
+    """Whether a run with `keep_end` was cut after its last checkpoint, so that only the last evaluation is left.
+
+    `saved` are the epochs of its checkpoints. Raises ValueError if it has ended.
+    """
+    last = config_lib.num_epochs(spec.config, env.episode_length)
+    if max(saved, default=0) == last and not (folder / run_folder.RESULT_FILE).exists():
+        return True
+    loop.refuse_ended(spec.config, env.episode_length, saved)
+    return False
 
 
 def _check_runs(env: Env, specs: Sequence[RunSpec], folders: Sequence[Path], options: Options, sweep: bool) -> None:
@@ -196,17 +208,19 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     num_epochs = config_lib.num_epochs(specs[0].config, session.env.episode_length)
     will_save = 0 < options.checkpoint_every < num_epochs
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
-    loop.refuse_ended(specs[0].config, session.env.episode_length, [start.epoch])
+    trained = _is_trained(session.env, specs[0], folders[0], [start.epoch])
     report_once = functools.cache(session.report)
     watch = _Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
         ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = [*zip(ended, specs, folders, runs)] if processes.leads() else []
-        with _kept_unless_opened(folders if own else ()):
+        with run_folder.kept_unless_opened(folders if own else ()):
             logs = [_open(stack, session, program.lanes, *run) for run in own]
         success = processes.broadcast(lambda: _success_rates(folders[0], start.epoch))  # for stop_at, which needs a single run
         schedule = Schedule(options.checkpoint_every)
-        for progress in loop.run(session.env, specs[0].config, program.compiled, start):
+        trained |= options.is_reached(success)
+        progress = loop.resumed(session.env, specs[0].config, start)
+        for progress in () if trained else loop.run(session.env, specs[0].config, program.compiled, start):
             rows = _rows(progress, len(specs))
             watch.look(progress, rows)
             for lane, (row, opened) in enumerate(zip(rows, logs)):
@@ -246,22 +260,6 @@ def _success_rates(folder: Path, ended: int) -> list[float]:
     from mjx_dher.runs.folder import results
 
     return [row["success_rate"] for row in results.read_metrics(folder)]
-
-
-@contextlib.contextmanager
-def _kept_unless_opened(folders: Sequence[Path]) -> Iterator[None]:
-    """Removes results, because what they describe will change. If an exception ends the block, the folders are as before."""
-    names = (run_folder.RESULT_FILE, run_folder.CONFIG_FILE, run_folder.METRICS_FILE)
-    before = {path: path.read_bytes() if path.exists() else None for folder in folders for path in map(folder.joinpath, names)}
-    try:
-        for folder in folders:
-            (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
-            files.flush(folder)
-        yield
-    except Exception:
-        for path, content in before.items():
-            path.unlink(missing_ok=True) if content is None else files.write(path, content)
-        raise
 
 
 def _open(

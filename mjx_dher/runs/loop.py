@@ -122,10 +122,7 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
             metrics, finite = processes.fetch(told)
             now = time.perf_counter()
             yield Progress(
-                epoch=number,
-                num_epochs=num_epochs,
-                env_steps=number * config_lib.steps_per_epoch(config, env.episode_length),
-                updates=number * config.cycles_per_epoch * config.updates_per_cycle,
+                *_counts(env, config, number),
                 wall_seconds=now - started,
                 epoch_seconds=now - previous,
                 metrics=metrics,
@@ -133,6 +130,18 @@ def run(env: Env, config: Config, compiled: Compiled, start: Start) -> Iterator[
                 finite=np.asarray(finite),
             )
             previous = time.perf_counter()
+
+
+def resumed(env: Env, config: Config, start: Start) -> Progress:
+    """Progress of a run at its start or checkpoint, without metrics."""
+    return Progress(*_counts(env, config, start.epoch), start.wall_seconds, 0.0, {}, start.state, np.asarray(True))
+
+
+def _counts(env: Env, config: Config, epoch: int) -> tuple[int, int, int, int]:
+    """The first four fields of `Progress`."""
+    steps = epoch * config_lib.steps_per_epoch(config, env.episode_length)
+    updates = epoch * config.cycles_per_epoch * config.updates_per_cycle
+    return epoch, config_lib.num_epochs(config, env.episode_length), steps, updates
 
 
 def compile_program(program: Train, key: PRNGKey, hparams: HParams, updates: int = 0, layout: Layout = ONE) -> Compiled:

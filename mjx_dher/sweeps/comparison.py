@@ -70,13 +70,13 @@ def _label(trial: dict[str, Any], own: dict[str, Any], form: Callable[[str, Any]
 
 
 def _once_a_seed(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """One trial per seed of a setting. Runs that differ only in settings that they do not read are equal. Raises FolderError if
-    two folders hold the same run, for example after a copy.
+    """One trial per seed of a setting. Runs that differ only in settings that they do not read, or in whether their engine was
+    named or chosen, are equal. Raises FolderError if two folders hold the same run, for example after a copy.
     """
     by_seed: dict[int, dict[str, Any]] = {}
     for trial in trials:
         first = by_seed.setdefault(trial["seed"], trial)
-        if first is not trial and first["settings"] == trial["settings"]:
+        if first is not trial and all(first[name] == trial[name] for name in ("settings", "asked_engine")):
             raise FolderError(f"{first['folder']} and {trial['folder']} hold the same run: remove one of them")
     return list(by_seed.values())
 
@@ -154,6 +154,7 @@ def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]
 
     Success, area and epochs have bootstrap intervals over seeds. `better` is the probability of improvement. Gain and
     p-value, which comes from a permutation test, are paired by seed. They need two seeds or more that both settings have.
+    All three are NaN if the two settings differ in steps by more than an epoch, because areas are means over all epochs.
 
     Args:
       settings: settings of one environment.
@@ -173,13 +174,14 @@ def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | 
     """Setting to compare `group` with, or None if there is none or `group` is the baseline."""
 
     def fits(other: Group) -> bool:
-        # The baseline may lack the files of this setting's own components.
-        files_of = [set(filter(None, str(each.others.get("source", "")).split(", "))) for each in (other, group)]
+        # The baseline may lack the files of this setting's own components, and no JAX flags.
+        base, own = (set(filter(None, str(each.others.get("source", "")).split(", "))) for each in (other, group))
         rest = ((name, value) for name, value in other.others.items() if name != "source")
-        return files_of[0] <= files_of[1] and all(group.others.get(name, value) == value for name, value in rest)
+        same = base <= own and not any(text.startswith("JAX_") for text in own - base)
+        return same and all(group.others.get(name, value) == value for name, value in rest)
 
-    labelled = [other for other in settings if other.label == baseline]
-    likely = labelled or [other for other in settings if other.sampler == baseline and fits(other)]
+    of_sampler = [other for other in settings if other.sampler == baseline]
+    likely = list(filter(fits, of_sampler)) if of_sampler else [other for other in settings if other.label == baseline]
     return likely[0] if len(likely) == 1 and likely[0] is not group else None
 
 
@@ -190,7 +192,7 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
     steps_per_epoch = group.env_steps[0] / group.epoch[0]
     nan = math.nan
     better, gain, p_value = (nan, nan, nan), nan, nan
-    if base is not None:
+    if base is not None and _as_long(group, base):
         others = areas_of(base)
         better = (stats.probability_of_improvement(areas, others), *stats.improvement_interval(areas, others))
         own, theirs = np.nonzero(np.equal.outer(group.seeds, base.seeds))  # places of the seeds that both have
@@ -216,6 +218,12 @@ def _row(group: Group, base: Group | None, threshold: float) -> Row:
         p_value,
         p_value,
     )
+
+
+def _as_long(group: Group, base: Group) -> bool:
+    """Whether two settings have the same steps, up to an epoch. One that failed at once has none, and is always compared."""
+    ends = [each.env_steps[-1] for each in (group, base)]
+    return 0 in ends or abs(ends[0] - ends[1]) <= max(group.env_steps[0], base.env_steps[0])
 
 
 def areas_of(group: Group) -> NDArray:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from mjx_dher import stats
-from mjx_dher.runs.folder import run_folder
 from mjx_dher.sweeps.comparison import Group, Row
 from mjx_dher.tools import figures
 
@@ -101,12 +100,12 @@ def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict
     }
 
 
-def write(folder: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
-    """Writes the three figures of an environment into `folder`. Returns their paths."""
+def write(stem: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
+    """Writes the three figures of an environment as `stem`_curves.png and so on. Returns their paths."""
     written = []
     for name, figure in draw(groups, rows, threshold).items():
         for ending in formats:
-            path = folder / f"{run_folder.in_a_path(groups[0].env)}_{name}.{ending}"
+            path = stem.with_name(f"{stem.name}_{name}.{ending}")
             figures.write(figure, path)
             written.append(path)
     return written

@@ -117,8 +117,8 @@ def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[st
     for number, (env, groups) in enumerate(comparison.groups(trials).items()):
         rows = comparison.compare(groups, baseline, threshold)
         body += [_element("h2", env), _table(*comparison.table(rows))]
-        compared = f"P(better) and p: against {baseline}" if any(row.better == row.better for row in rows) else "no baseline"
-        body.append(_element("p", f"epochs to a success rate of {threshold:g}; {compared}"))
+        against = "P(better) and p: against" if any(row.better == row.better for row in rows) else "there is no baseline"
+        body.append(_element("p", f"epochs to a success rate of {threshold:g}; {against} {baseline}"))
         for place, (name, figure) in enumerate(plotting.draw(groups, rows, threshold).items()):
             body.append(_figure(figures.to_svg(figure, 10 * number + place), name))
     body += [_element("h2", "Runs"), _details(f"all {len(trials)} runs", _runs(trials))]

@@ -1,6 +1,7 @@
 """Tables of a sweep: reads its finished trials and writes results.csv, results.npz and finals.csv."""
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,10 @@ _FINAL = ("success_rate", "reset_success_rate", "return_mean", "episodes")
 def read(folder: Path) -> list[dict[str, Any]]:
     """Finished trials of a sweep, each a dict.
 
-    Keys: folder, settings, seed, lanes, status, reason, curve and final. The settings include the engine used and `source`, the
-    custom source files. The curve has lists by column. The last evaluation, final, is empty if the run failed. Raises
-    FolderError if it is not a sweep, no run has ended, a link leads out of the folder, or a trial is invalid
-    (`results.read`).
+    Keys: folder, settings, seed, asked_engine, lanes, status, reason, curve and final. The settings include the engine used
+    and `source`: custom source files, JAX flags, and the number of devices if several share the run. The curve has lists
+    by column. The last evaluation, final, is empty if the run failed. Raises FolderError if it is not a sweep, no run has
+    ended, a link leads out of the folder, or a trial is invalid (`results.read_trial`).
     """
     cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
     paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]
@@ -36,11 +37,13 @@ def read(folder: Path) -> list[dict[str, Any]]:
 
 def _read_trial(path: Path) -> dict[str, Any]:
     try:
-        _, content, spec, rows, result = results.read(path)
+        _, content, spec, rows, result = results.read_trial(path)
     except FolderError as error:
         raise FolderError(f"{error}; run the sweep's command to train it again, or remove the folder") from error
     failed = result["status"] == FAILED
     flags = [f"{name} {value}" for name, value in content.get("jax_flags", {}).items()]
+    if (sharers := content.get("devices", 1) // content.get("lanes", 1)) > 1:  # other first states, noise and batches
+        flags.append(f"{sharers} devices")
     try:
         columns = [name for name in (rows[0] if rows else ()) if name != loggers.DIGEST]
         return {
@@ -51,6 +54,7 @@ def _read_trial(path: Path) -> dict[str, Any]:
                 "source": ", ".join([*dict.fromkeys(content["sources"].values()), *flags]),
             },
             "seed": spec.seed,
+            "asked_engine": spec.engine,
             "status": result["status"],
             "reason": result["reason"],
             "lanes": result["lanes"],
@@ -61,9 +65,9 @@ def _read_trial(path: Path) -> dict[str, Any]:
         raise FolderError(f"{path} is not a finished run of a sweep ({type(error).__name__}: {error})") from error
 
 
-def _short(value: float) -> float:
-    """Rounds a number to the digits of metrics.csv."""
-    return value if isinstance(value, int) else float(f"{value:.6g}")
+def _short(value: float | None) -> float:
+    """Rounds a number to the digits of metrics.csv. None, which result.json has for NaN, is NaN."""
+    return value if isinstance(value, int) else float(f"{math.nan if value is None else value:.6g}")
 
 
 def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
@@ -73,7 +77,8 @@ def write(folder: Path, trials: Sequence[dict[str, Any]]) -> None:
     for trial in trials:
         sizes = "x".join(map(str, trial["settings"]["hidden_sizes"]))
         own = {"hidden_sizes": sizes, "env_kwargs": " ".join(trial["settings"]["env_kwargs"])}
-        head = {**trial["settings"], **own, "seed": trial["seed"], "lanes": trial["lanes"]}
+        head = {name: "" if value is None else value for name, value in {**trial["settings"], **own}.items()}
+        head |= {"seed": trial["seed"], "lanes": trial["lanes"]}
         curve = {f"metric_{name}" if name in head else name: values for name, values in trial["curve"].items()}
         epochs = range(len(curve.get("epoch", ())))
         results += [{**head, **{name: values[i] for name, values in curve.items()}} for i in epochs]

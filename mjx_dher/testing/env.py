@@ -1,6 +1,8 @@
 """Conformance test for environments, which tests everything that the library relies on."""
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,7 +28,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     - `reset` and `step` are pure. Traced or called twice, alone and under `jax.vmap`, equal arguments give equal results and
       stay unchanged.
     - Starts or goals differ between keys, and the goal is constant in an episode.
-    - Actions outside [-1, 1] are accepted.
+    - Actions outside [-1, 1] are accepted. Observations do not depend on the desired goal.
     - `compute_reward`, and `reached` and `goal_distance` if present, take any leading axes and are pure. `step` gives the same
       reward. Rewards of desired and of achieved goals lie in the spec's `reward_range`. An exactly achieved goal has the
       greatest reward and is reached. Distances are not negative.
@@ -157,7 +159,9 @@ def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tol
     beyond = program(keys[0], at(0, 0), 3.0 * np.sign(actions[0, 0]))["step"]
     for name, value in beyond.items():
         expect(np.all(np.isfinite(value)), f"step with an action of +-3: {name} must be finite; it is {value}")
-    if not hasattr(env, "with_goal"):
+    if not callable(getattr(env, "with_goal", None)):
+        following = lambda state: program(keys[0], state, actions[0, 0])["step"]  # noqa: E731
+        _check_goal_is_apart(following, at(0, 0), states.obs["achieved_goal"][1, 0], tolerance)
         return
     first, goals = jax.tree.map(lambda x: x[0], states), states.obs["achieved_goal"][1]  # reached after the first step
     changed = run("with_goal", jax.vmap(env.with_goal), first, goals)
@@ -169,6 +173,18 @@ def _check_alone(env: Any, keys: jax.Array, actions: jax.Array, states: Any, tol
     ):
         own = {name: value for name, value in {**_outputs(given), "desired_goal": goal}.items() if name not in DERIVED}
         expect_same(what, {name: result[name] for name in own}, own, allowed)
+
+
+def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal: jax.Array, tolerance: float) -> None:
+    """Checks that the observation of the next state stays the same with another desired goal [G]."""
+    obs, fields = state.obs, dataclasses.is_dataclass(state)
+    if not fields or type(obs) is not dict:
+        return
+    other = dataclasses.replace(state, obs={**obs, "desired_goal": goal})
+    own, changed = step(state), step(other)
+    for name in (name for name in own if name.startswith("observation")):
+        same = np.allclose(own[name], changed[name], rtol=tolerance, atol=tolerance, equal_nan=True)
+        expect(same, f"{name} must not depend on the desired goal, because relabelling replaces the goal alone; it does")
 
 
 def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:

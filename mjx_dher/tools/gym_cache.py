@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_dher import envs
+from mjx_dher import envs, import_paths
 from mjx_dher.lookup import is_import_path
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Programs:
 
     def __reduce__(self) -> Any:
         """Copies and pickles make or share the functions again, because compiled functions cannot be copied."""
-        return _compile, (self.name, self.options)
+        return programs, (self.name, dict(self.options))
 
 
 def programs(name: str, options: dict[str, Any]) -> Programs:
@@ -58,11 +58,15 @@ def programs(name: str, options: dict[str, Any]) -> Programs:
             raise ValueError(f"option {key} must be a single value; got {value!r}")
     if "engine" in options or not is_import_path(name):  # auto shares the programs of its engine
         options = {**options, "engine": resolve_engine(options.get("engine", "auto"))}
-    return _compile(name, tuple(sorted(options.items())))
+    made_by = import_paths.load("env", name) if is_import_path(name) else None  # another one after a reload
+    given = tuple(sorted(options.items()))
+    return _compile(name, given, (made_by, *(type(value) for _, value in given)))
 
 
 @functools.lru_cache(maxsize=16)  # a living environment keeps its own
-def _compile(name: str, options: tuple[tuple[str, Any], ...]) -> Programs:
+def _compile(name: str, options: tuple[tuple[str, Any], ...], differs: Hashable) -> Programs:
+    """Programs of an environment. `differs` tells equal arguments apart, such as 1 and True."""
+    del differs
     import jax
 
     from mjx_dher import context, rollout

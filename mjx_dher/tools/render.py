@@ -35,7 +35,7 @@ _PALETTE = "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=dither
 FORMATS = {
     ".mp4": ["-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"],
     ".gif": ["-filter_complex", _PALETTE, "-f", "gif"],
-    ".png": ["-frames:v", "1", "-c:v", "png", "-f", "image2"],
+    ".png": ["-frames:v", "1", "-c:v", "png", "-f", "image2pipe"],
 }
 
 
@@ -261,7 +261,7 @@ def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}", "-r", str(fps), "-i", "-"]
     kept = ["-r", str(MOST_FPS)] if fps > MOST_FPS else []
     with files.atomic_write(out) as partial:
-        command = [ffmpeg(), "-v", "error", *source, *kept, *FORMATS[out.suffix.lower()], "-y", str(partial)]
+        command = [ffmpeg(), "-v", "error", *source, *kept, *FORMATS[out.suffix.lower()], "-y", f"file:{partial.absolute()}"]
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdin=pipe, stderr=pipe, start_new_session=True) as process:
             assert process.stdin is not None

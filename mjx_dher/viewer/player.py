@@ -231,7 +231,9 @@ class Player:
     def _look(self) -> None:
         """Records the observation, distance and value of the state."""
         self.obs = jax.tree.map(np.asarray, dict(self._state.obs))
-        value = float("nan") if self.value is None else self.value(self.obs, self.act(self.obs))
+        value = float("nan")
+        if self.value is not None and not self._flag("failed"):  # a failed state's observation need not be finite
+            value = self.value(self.obs, self.act(self.obs))
         now = self._steps * self.game.dt
         if self.history and self.history[-1][0] == now:  # moved or restarted since the last step
             self.history.pop()

@@ -13,6 +13,7 @@ from mjx_dher.system.files import FolderError
 FOLDER = Path(__file__).resolve().parent
 FACTS, CARD = "card.json", "README.md"  # a policy's measurements, and the card made from them
 _CONFIG = "config.json"  # every run folder has one
+_OF_A_RUN = (_CONFIG, "policy.npz", "result.json")  # without its config.json, a run is an error and not another policy
 
 
 def names() -> tuple[str, ...]:
@@ -27,7 +28,7 @@ def find(run: str | Path) -> Path:
     message lists the bundled policies and suggests the nearest.
     """
     path = Path(run)
-    if path.is_file() or (path / _CONFIG).exists():
+    if path.is_file() or any((path / name).exists() for name in _OF_A_RUN):
         return path
     known = names()
     if str(run) in known:

@@ -46,7 +46,7 @@ def save(
     Checkpoints of later epochs are deleted too. If the disk is too full, all but the newest one are deleted first.
 
     Args:
-      state: a TrainState, or any pytree of arrays.
+      state: a TrainState, or any pytree of JAX arrays.
       keep: number of checkpoints to keep, at least 1.
       runs: `fingerprint.identity` of each run.
       refused: unusable checkpoints to delete.

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +158,7 @@ def trial_name(spec: RunSpec) -> str:
     values, defaults = settings(spec), settings(RunSpec())
     kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]} | REMOVED
     kept.pop("demonstrations", None)
-    numbers = {name: kept.pop(name) for name in HParams._fields if name in kept}
+    numbers = {name: float(kept.pop(name)) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests
     beside = [own for own in (sources(spec), jax_flags()) if own]
     hashed = sha256_of([1, kept, numbers, spec.seed, *beside])
@@ -168,6 +168,13 @@ def trial_name(spec: RunSpec) -> str:
 def in_a_path(name: str) -> str:
     """Name of an environment or sampler as part of a file name: "Tasks:Mine" becomes tasks-mine."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower())
+
+
+def in_paths(names: Iterable[str]) -> dict[str, str]:
+    """`in_a_path` of each name, with a digest where several would be equal."""
+    short = {name: in_a_path(name) for name in names}
+    same = [stem for stem in short.values() if list(short.values()).count(stem) > 1]
+    return {name: f"{stem}-{sha256_of(name)[:6]}" if stem in same else stem for name, stem in short.items()}
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, str]:

@@ -114,7 +114,7 @@ def read_versioned(file: Path, schema: int) -> dict[str, Any]:
 def read_config(path: Path) -> dict[str, Any]:
     """Reads config.json of the run in `path`. Raises FolderError if it is not a run folder, or has another schema."""
     if not path.is_dir():
-        raise FolderError(f"{path} is not a run folder: no such folder")
+        raise FolderError(f"{path} is not a run folder: {'it is a file' if path.exists() else 'no such folder'}")
     try:
         return read_config_file(path / run_folder.CONFIG_FILE)
     except FileNotFoundError:

@@ -178,13 +178,23 @@ def result_problem(folder: Path, with_policy: bool = True) -> str | None:
     return None
 
 
+def read_trial(folder: Path) -> Record:
+    """`read` for a trial of a sweep. Raises FolderError also if it was resumed alone with `stop_at` and so has fewer steps."""
+    record = read(folder)
+    total = record.spec.config.total_steps
+    if record.result.get("status") == FINISHED and (steps := record.rows[-1]["env_steps"]) < total:
+        raise FolderError(f"{folder} has ended after {steps:,.0f} of {total:,} steps ({record.result['reason']})")
+    return record
+
+
 def trial_problem(folder: Path, spec: RunSpec) -> str | None:
     """Reason why a trial with a result is invalid, or its folder holds another trial. None if it is valid."""
     try:
         reading.check_same(folder, spec, ("physics",))
+        read_trial(folder)
     except FolderError as error:
         return str(error)
-    return result_problem(folder)
+    return None
 
 
 def is_done(folder: Path, spec: RunSpec) -> bool:

@@ -147,6 +147,22 @@ def save_policy(path: Path, policy: Any, run: Mapping[str, Any], interface: Mapp
     policy.save(path / POLICY_FILE, **{name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()})
 
 
+@contextlib.contextmanager
+def kept_unless_opened(folders: Sequence[Path]) -> Iterator[None]:
+    """Removes results, because what they describe will change. If an exception ends the block, the folders are as before."""
+    names = (RESULT_FILE, CONFIG_FILE, METRICS_FILE)
+    before = {path: path.read_bytes() if path.exists() else None for folder in folders for path in map(folder.joinpath, names)}
+    try:
+        for folder in folders:
+            (folder / RESULT_FILE).unlink(missing_ok=True)
+            files.flush(folder)
+        yield
+    except Exception:
+        for path, content in before.items():
+            path.unlink(missing_ok=True) if content is None else files.write(path, content)
+        raise
+
+
 @dataclasses.dataclass(frozen=True)
 class Claims:
     """One process's claims on runs."""
