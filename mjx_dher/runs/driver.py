@@ -249,7 +249,8 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     ended_runs = _finish(session, program, progress, specs, folders, runs, watch.failed)
     if len(watch.failed) < len(specs):
         checkpoints.clear(options.keep_end)
-    session.on_epoch(specs, progress)
+    if not trained:
+        session.on_epoch(specs, progress)
     return ended_runs
 
 
