@@ -156,7 +156,10 @@ def _is_trained(env: Env, spec: RunSpec, folder: Path, saved: Sequence[int]) -> 
     """
     last = config_lib.num_epochs(spec.config, env.episode_length)
     if max(saved, default=0) == last and not (folder / run_folder.RESULT_FILE).exists():
-        return True
+        from mjx_dher.runs.folder import reading
+
+        if reading.read_spec(folder).config.total_steps == spec.config.total_steps:  # and not shortened for this resume
+            return True
     loop.refuse_ended(spec.config, env.episode_length, saved)
     return False
 
