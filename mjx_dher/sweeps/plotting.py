@@ -101,7 +101,7 @@ def draw(groups: Sequence[Group], rows: Sequence[Row], threshold: float) -> dict
 
 
 def write(stem: Path, groups: Sequence[Group], rows: Sequence[Row], threshold: float, formats: Sequence[str]) -> list[Path]:
-    """Writes the three figures of an environment as `stem`_curves.png and so on. Returns their paths."""
+    """Writes the three figures of an environment: STEM_curves.png and so on, for a `stem` with its folder. Returns paths."""
     written = []
     for name, figure in draw(groups, rows, threshold).items():
         for ending in formats:
