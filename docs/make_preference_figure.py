@@ -30,7 +30,7 @@ BELOW = {"sum": -13, "far": 1, "mean, softmax": -16, "minmax": -6, "closest": -1
 
 
 class Point(NamedTuple):
-    """A setting: its share of draws that differ, and its mean success less that of `future`."""
+    """A setting: its share of draws that differ, and its mean success less the mean of `future`."""
 
     name: str
     share: float

@@ -149,7 +149,7 @@ def mean_of(scores: NDArray) -> str:
 
 
 def median_of(epochs: NDArray) -> str:
-    """Median of epochs [S], some of which may be infinite ("never"), with its bootstrap interval."""
+    """Median of epochs [S] with its bootstrap interval. Infinite epochs are "never"."""
     values = (np.median(epochs), *stats.bootstrap_interval(epochs, np.median))
     middle, low, high = ("never" if math.isinf(value) else f"{value:g}" for value in values)
     return f"{middle} ({low} to {high})" if middle != "never" or low != "never" else "never"

@@ -209,7 +209,7 @@ class FrameStack(Wrapper):
         return dataclasses.replace(self.env.spec, observation=joined)
 
     def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
-        return self.see((observation,) * self._frames, observation)
+        return self.see_moved((), observation)
 
     def see(self, memory: PyTree, observation: PyTree) -> tuple[PyTree, PyTree]:
         frames = (observation, *memory[:-1])

@@ -150,9 +150,7 @@ def test_a_file_carries_what_a_robot_needs(name, tmp_path):
     started = RunSpec(env="my_arm:Reach", env_kwargs=("obs_noise=0.01",))
     path, out = tmp_path / "run", tmp_path / f"policy.{name}"
     run_folder.write_config(path, started, "native", {})
-    content = reading.read_config(path)
-    identity = reading.identity_of(content, reading.to_spec(path, content))
-    run_folder.save_policy(path, random_policy(), identity, contract.robot_interface(env))
+    save_policy(path, dataclasses.replace(random_policy(), interface=contract.robot_interface(env)))
     assert mjx_dher.load_policy(path / "policy.npz").interface == contract.robot_interface(env)  # without the folder, too
     assert cli.main(["export", str(path), "--format", name, "--out", str(out)]) == 0
     about = export.FORMATS[name][1](out).about

@@ -229,9 +229,8 @@ def announce(args: SweepArgs, trials: list[RunSpec], console: Console) -> list[R
     done = f"; {len(trials) - len(todo)} of them are done already" if len(todo) < len(trials) else ""
     console.print(f"{len(trials)} runs{done}; writing to {args.out}", soft_wrap=True)
     ended = (reading.read_config(grid.folder_of(args.out, trial)) for trial in set(trials).difference(todo))
-    if other := {content.get("final_episodes", args.options.final_episodes) for content in ended} - {
-        args.options.final_episodes
-    }:
+    own = args.options.final_episodes
+    if other := {content.get("final_episodes", own) for content in ended} - {own}:
         console.print(f"final_episodes: done runs keep theirs, which had {', '.join(map(str, sorted(other)))}", soft_wrap=True)
     return todo
 

@@ -160,7 +160,7 @@ def from_arrays(arrays: Mapping[str, Any]) -> Policy:
 
 
 def interface_array(interface: Mapping[str, Any]) -> dict[str, NDArray]:
-    """The `interface` as an array of a policy file, by name. Nothing if there is none."""
+    """The `interface` as the array "interface" of a policy file. An empty dict if there is none."""
     return {"interface": np.frombuffer(json.dumps(dict(interface)).encode(), np.uint8)} if interface else {}
 
 

@@ -38,7 +38,8 @@ class LearnerPolicy:
         """Actions [..., A] for observations of one state or a batch. Tuples may stand for lists, as in gymnasium. Raises
         ValueError for a missing key, another structure or shape, or a number that is not finite.
         """
-        obs = {key: _with_lists(value, self.spec.observation) if key == "observation" else value for key, value in obs.items()}
+        if "observation" in obs:
+            obs = {**obs, "observation": _with_lists(obs["observation"], self.spec.observation)}
         goal = jax.ShapeDtypeStruct((self.spec.goal_size,), jnp.float32)
         leading = {
             key: _leading(key, obs, like) for key, like in (("observation", self.spec.observation), ("desired_goal", goal))

@@ -306,7 +306,7 @@ def _save_policy(env: Env, program: Program, learner: Any, spec: RunSpec, folder
         from mjx_dher.policy.learner_policy import LearnerPolicy
 
         policy = LearnerPolicy(program.learner, learner, spec.hparams, program.spec)
-    run_folder.save_policy(folder, policy, run, robot_interface(env))
+    run_folder.save_policy(folder, dataclasses.replace(policy, interface=robot_interface(env)), run)
 
 
 def _finish(

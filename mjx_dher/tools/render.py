@@ -122,7 +122,7 @@ def geom_rgba(model: Any, geom: int) -> np.ndarray:
 
 
 def ghost_rgba(own: np.ndarray) -> np.ndarray:
-    """Colour [4] of a geom as a goal: translucent, and its own, so that the sides of an object can be told apart."""
+    """Colour [4] of a geom as a goal: its own, and translucent, so that the sides of an object differ."""
     return np.array([*own[:3], GHOST_OPACITY])
 
 
@@ -170,7 +170,7 @@ def film(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int,
 
 def stills(env: Any, qpos: np.ndarray, goals: np.ndarray, width: int, height: int) -> np.ndarray:
     """Draws pictures of the first episode side by side, from start to end: [height, STILLS * width, 3] uint8. Configurations
-    are [N, T+1, nq] and goals [N, G]. Width and height, in pixels, are those of one picture.
+    are [N, T+1, nq] and goals [N, G]. Each picture has this width and height, in pixels.
     """
     # Closer together at the start, where a trained policy moves most.
     chosen = (np.linspace(0, 1, STILLS) ** 2 * (qpos.shape[1] - 1)).round().astype(int)

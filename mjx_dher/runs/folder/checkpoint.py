@@ -43,7 +43,7 @@ def save(
 ) -> Path:
     """Writes a checkpoint of a run. Keeps this one and the newest `keep` - 1 before it, and deletes the others.
 
-    Checkpoints of later epochs are deleted too. If the disk is too full, all but the newest one are deleted first.
+    Checkpoints of later epochs are deleted too. If the disk is too full, only the newest one is kept while this one is written.
 
     Args:
       state: a TrainState, or any pytree of JAX arrays.
@@ -130,7 +130,7 @@ def _to_arrays(state: Any) -> dict[str, np.ndarray]:
 
 
 def to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shapes of a checkpoint's arrays by name, for a state or its shapes."""
+    """Name and shape of each array in a checkpoint, for a state or its shapes."""
     shape_of = lambda x: jax.eval_shape(jax.random.key_data, x) if is_key(x) else x  # noqa: E731
     return {name: shape_of(leaf) for name, leaf in _named(template).items()}
 

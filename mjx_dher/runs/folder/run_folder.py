@@ -141,10 +141,9 @@ def epoch_of(checkpoint: Path) -> int:
     return int(checkpoint.name[6:])
 
 
-def save_policy(path: Path, policy: Any, run: Mapping[str, Any], interface: Mapping[str, Any] | None = None) -> None:
-    """Writes policy.npz of the run in `path`, with the run's `identity` and its environment's `contract.robot_interface`."""
-    texts = {name: json.dumps(part) for name, part in (("settings", run), ("interface", interface)) if part}
-    policy.save(path / POLICY_FILE, **{name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()})
+def save_policy(path: Path, policy: Any, run: Mapping[str, Any]) -> None:
+    """Writes policy.npz of the run in `path`, with the run's `identity`."""
+    policy.save(path / POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
 
 
 @contextlib.contextmanager
