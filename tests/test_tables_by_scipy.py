@@ -150,7 +150,7 @@ def test_effects_of_what_helps(curves):
     of_paper = {
         "k 8 in place of 4, one cycle per epoch": ("k_{}", "future, her_k 8", None),
         "k 16 in place of 4 (over 30 epochs +0.094 and +0.059)": ("k_{}", "future, her_k 16", None),
-        "k 16 in place of 4, paper's cycles": ("k_own_{}", "future, her_k 16", "own_{}"),
+        "k 16 in place of 4, paper's cycles, 30 epochs": ("k_own_{}", "future, her_k 16", "own_{}"),
         "`closest` in place of `future`, paper's cycles, ten pairs": ("own_methods", "closest", "own_{}"),
     }
     for change, (sweep, setting, base) in of_paper.items():
@@ -170,3 +170,12 @@ def test_effects_of_what_helps(curves):
             if cell.strip().startswith(("+", "-")):
                 gains = [runs[task, arm][seed] - runs[task, "preset"][seed] for seed in runs[task, arm]]
                 assert cell.strip() == f"{np.mean(gains):+.3f}", (change, task)
+    with (ROOT / "docs" / "td_controls_runs.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["learner"] == "best"]
+    best = {(row["task"], row["arm"], row["seed"]): float(row["mean_success"]) for row in rows}
+    [change] = [change for change in cells if change.startswith("the same, learners of `best`")]
+    for task, cell in list(zip(NAMES, cells[change]))[1:]:
+        seeds = sorted(seed for of, arm, seed in best if (of, arm) == (task, "uniform"))
+        gains = [best[task, "future", seed] - best[task, "uniform", seed] for seed in seeds]
+        assert len(seeds) == 20
+        assert cell.strip() == f"{np.mean(gains):+.3f}"
